@@ -1,0 +1,103 @@
+"""Configuration: frozen, hashable dataclasses and the named presets.
+
+What fixes an array shape or a branch of a compiled program is *static* and lives in `PairShape`;
+numeric thresholds are *traced* (`Thresholds` in `jaxsfm.core.types`), so sweeping them does not
+recompile. Imports neither jax nor cv2.
+"""
+
+import dataclasses
+from typing import Literal
+
+Keypoints = Literal["relocalized", "grid"]
+OneToOne = Literal["first", "similarity"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PairShape:
+    """Static part of the pair program; changing any field recompiles it."""
+
+    max_planes: int = 5
+    """Homographies peeled from one pair (paper, section 4)."""
+    max_hypotheses: int = 10_000
+    """Upper bound of minimal samples per plane."""
+    hypotheses_per_step: int = 64
+    """Samples solved and scored together before the stopping rule is looked at."""
+    two_way: bool = False
+    """Inlier test in both images instead of image 1 only."""
+    local_refits: int = 1
+    """Least-squares refits on the inliers of each new best hypothesis."""
+    one_to_one: OneToOne = "first"
+    """Which match survives when a cell has several: the first in index order, or the most similar."""
+    coarse_tile: int = 1024
+    """Rows of the coarse similarity matrix held at once."""
+    fine_chunk: int = 128
+    """Coarse matches whose windows are compared at once."""
+    score_chunk: int = 2048
+    """Correspondences scored at once: small enough to stay in cache."""
+    correspondences_per_cell: float = 2.0
+    """Capacity of the correspondence list, per fine cell."""
+
+    def __post_init__(self) -> None:
+        for name in (
+            "max_planes",
+            "max_hypotheses",
+            "hypotheses_per_step",
+            "local_refits",
+            "coarse_tile",
+            "fine_chunk",
+            "score_chunk",
+        ):
+            if getattr(self, name) < 1:
+                raise ValueError(f"PairShape.{name} must be at least 1; got {getattr(self, name)}")
+        if self.correspondences_per_cell <= 0:
+            raise ValueError(
+                "PairShape.correspondences_per_cell must be positive; "
+                f"got {self.correspondences_per_cell}"
+            )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Everything that decides which matches a pair of images has."""
+
+    max_size: int = 1600
+    """Longer side of the working image, pixels; larger images are reduced, never enlarged."""
+    keypoints: Keypoints = "relocalized"
+    """Where a fine cell's keypoint lies: at its relocalized pixel, or at the cell's centre."""
+    threshold_px: float = 10.0
+    """Inlier radius of a homography, pixels of the working image."""
+    min_inliers: int = 26
+    """Fewest inliers of an accepted plane."""
+    confidence: float = 0.999
+    """RANSAC stops when a better plane has been missed with less than 1 - confidence."""
+    pair: PairShape = dataclasses.field(default_factory=PairShape)
+
+    def __post_init__(self) -> None:
+        if self.max_size < MIN_SIDE:
+            raise ValueError(f"max_size must be at least {MIN_SIDE} pixels; got {self.max_size}")
+        if self.keypoints not in ("relocalized", "grid"):
+            raise ValueError(f"keypoints must be 'relocalized' or 'grid'; got {self.keypoints!r}")
+        if not self.threshold_px > 0:
+            raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
+        if self.min_inliers < 4:
+            raise ValueError(f"min_inliers must be at least 4; got {self.min_inliers}")
+        if not 0 < self.confidence < 1:
+            raise ValueError(f"confidence must lie in (0, 1); got {self.confidence}")
+
+
+MIN_SIDE = 48
+"""Shortest usable side, pixels: three coarse cells, one full window of the coarse-to-fine step."""
+
+PRESETS: dict[str, Config] = {
+    "paper": Config(),
+    "default": Config(pair=PairShape(two_way=True, local_refits=4, one_to_one="similarity")),
+}
+"""`paper`: the constants of the authors' code. `default`: two-way inlier test, iterated local
+refits, and the most similar of several matches; docs/results.md has both rows."""
+
+
+def preset(name: str) -> Config:
+    """The named preset; ValueError names the ones there are."""
+    if name not in PRESETS:
+        raise ValueError(f"preset must be one of {sorted(PRESETS)}; got {name!r}")
+    return PRESETS[name]

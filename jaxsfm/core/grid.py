@@ -1,0 +1,41 @@
+"""The pixel convention, in one place.
+
+(x, y) in pixels; the centre of the top-left pixel is (0, 0). Cell (u, v) of stride s covers the
+pixels s*u .. s*u + s - 1 and has its centre at (u + 0.5) s - 0.5. Resizing is per axis with
+half-pixel centres. COLMAP's files put the same point at (0.5, 0.5); the adapter adds that half.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+COARSE_STRIDE = 16
+FINE_STRIDE = 8
+
+
+def cell_to_px(cell_xy: Float[Array, "*n 2"], *, stride: int) -> Float[Array, "*n 2"]:
+    """Centre of a feature cell, pixels."""
+    return (cell_xy + 0.5) * stride - 0.5
+
+
+def rescale(xy: Float[Array, "*n 2"], scale_xy: Float[Array, " 2"]) -> Float[Array, "*n 2"]:
+    """Coordinates after resizing an image by `scale_xy` (new size / old size, per axis)."""
+    return (xy + 0.5) * scale_xy - 0.5
+
+
+def rescale_matrix(scale_xy: Float[Array, " 2"]) -> Float[Array, "3 3"]:
+    """`rescale` as a 3 x 3 matrix on homogeneous (x, y, 1)."""
+    sx, sy = scale_xy[0], scale_xy[1]
+    zero, one = jnp.zeros_like(sx), jnp.ones_like(sx)
+    return jnp.stack(
+        [
+            jnp.stack([sx, zero, 0.5 * sx - 0.5]),
+            jnp.stack([zero, sy, 0.5 * sy - 0.5]),
+            jnp.stack([zero, zero, one]),
+        ]
+    )
+
+
+def cell_rows_cols(capacity: int, columns: Int[Array, ""]) -> tuple[Array, Array]:
+    """Row and column of cells 0 .. capacity - 1 of a grid with `columns` columns."""
+    index = jnp.arange(capacity, dtype=jnp.int32)
+    return index // columns, index % columns

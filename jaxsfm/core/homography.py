@@ -1,0 +1,162 @@
+"""Homographies: four-point solution, least squares, transfer test.
+
+h maps image 0 to image 1: (x1, y1, 1) ~ h (x0, y0, 1). Everything is float32 on coordinates that
+were centred and scaled (`normalisation`); at raw pixel coordinates the normal equations would
+lose all of float32's digits.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsfm.core.numerics import HIGHEST, squared_norm
+
+MIN_AREA = 1e-4
+"""Twice the triangle area, in normalised units squared, below which three points are collinear."""
+
+
+def homogeneous(xy: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
+    """Append 1."""
+    return jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+
+
+def normalisation(xy: Float[Array, "k 2"], weight: Float[Array, " k"]) -> Float[Array, "3 3"]:
+    """Similarity that moves weighted points to mean 0 and root mean square radius sqrt(2).
+
+    One scale for both axes, so that a radius in pixels stays a radius.
+    Source: Hartley 1997, section 5.
+    """
+    total = jnp.maximum(weight.sum(), 1.0)
+    mean = (weight[:, None] * xy).sum(0) / total
+    spread = (weight * squared_norm(xy - mean)).sum() / total
+    scale = jnp.sqrt(2.0 / jnp.where(spread > 0, spread, 2.0))
+    return jnp.asarray([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]]) * scale + jnp.zeros((3, 3)).at[
+        :, 2
+    ].set(jnp.stack([-scale * mean[0], -scale * mean[1], jnp.ones_like(scale)]))
+
+
+def apply_affine(t: Float[Array, "3 3"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """Map points by a similarity or affinity; precise on every backend (no matrix product)."""
+    return jnp.stack(
+        [
+            t[0, 0] * xy[..., 0] + t[0, 1] * xy[..., 1] + t[0, 2],
+            t[1, 0] * xy[..., 0] + t[1, 1] * xy[..., 1] + t[1, 2],
+        ],
+        axis=-1,
+    )
+
+
+def adjugate(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    """adj(m) m = det(m) I: the inverse up to scale, defined for singular m too."""
+    a, b, c = m[..., :, 0], m[..., :, 1], m[..., :, 2]
+    return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-2)
+
+
+def _basis(xy: Float[Array, "*b 4 2"]) -> tuple[Array, Array, Array]:
+    """Columns of the first three points, their adjugate, and the fourth point's coordinates.
+
+    The coordinates are twice the signed areas of the triangles with the fourth point.
+    """
+    points = homogeneous(xy)
+    columns = jnp.swapaxes(points[..., :3, :], -1, -2)
+    adj = adjugate(columns)
+    return columns, adj, jnp.sum(adj * points[..., 3, None, :], axis=-1)
+
+
+def from_four_points(
+    xy0: Float[Array, "*b 4 2"], xy1: Float[Array, "*b 4 2"]
+) -> tuple[Float[Array, "*b 3 3"], Bool[Array, "*b"]]:
+    """The homography through four correspondences, and whether they determine one.
+
+    Closed form by projective bases (no linear solver: batches of 8 x 8 systems run one by one on
+    CPUs). With a_k, b_k the first three points as columns of A, B and l, m the coordinates of the
+    fourth point in them, h = B diag(m / l) adj(A). Not valid: three collinear points, or a triangle
+    that one image sees from the other side (no camera can).
+
+    Source: Hartley and Zisserman, 2nd ed., section 2.3 and table 22.1 (chirality).
+    """
+    _, adj0, area0 = _basis(xy0)
+    columns1, adj1, area1 = _basis(xy1)
+    # Signs of all four triangles: three with the fourth point, and the first three themselves.
+    whole0 = area0.sum(-1, keepdims=True)
+    whole1 = area1.sum(-1, keepdims=True)
+    all0 = jnp.concatenate([area0, whole0], axis=-1)
+    all1 = jnp.concatenate([area1, whole1], axis=-1)
+    valid = jnp.all((jnp.abs(all0) > MIN_AREA) & (jnp.abs(all1) > MIN_AREA), axis=-1)
+    valid &= jnp.all(all0 * all1 > 0, axis=-1)
+    ratio = area1 / jnp.where(area0 == 0, 1.0, area0)
+    h = jnp.sum((columns1 * ratio[..., None, :])[..., :, :, None] * adj0[..., None, :, :], axis=-2)
+    return orient(h), valid
+
+
+def orient(h: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    """Scale to Frobenius norm 1 and positive determinant: then w > 0 in front of both cameras."""
+    det = jnp.sum(h[..., 0] * jnp.cross(h[..., 1], h[..., 2]), axis=-1)
+    norm = jnp.sqrt(jnp.maximum(jnp.sum(h * h, axis=(-1, -2)), 1e-30))
+    return h * (jnp.where(det < 0, -1.0, 1.0) / norm)[..., None, None]
+
+
+def least_squares(
+    xy0: Float[Array, "k 2"], xy1: Float[Array, "k 2"], weight: Float[Array, " k"]
+) -> Float[Array, "3 3"]:
+    """Weighted direct linear transform: the smallest eigenvector of the 9 x 9 normal matrix.
+
+    Points of zero weight do not count. Normalises internally.
+    Source: Hartley and Zisserman, 2nd ed., algorithm 4.2.
+    """
+    t0, t1 = normalisation(xy0, weight), normalisation(xy1, weight)
+    p = homogeneous(apply_affine(t0, xy0))
+    q = apply_affine(t1, xy1)
+    zero = jnp.zeros_like(p)
+    rows = jnp.concatenate(
+        [
+            jnp.concatenate([p, zero, -q[:, :1] * p], axis=1),
+            jnp.concatenate([zero, p, -q[:, 1:] * p], axis=1),
+        ]
+    )
+    weights = jnp.concatenate([weight, weight])
+    normal = jnp.einsum("ki,k,kj->ij", rows, weights, rows, precision=HIGHEST)
+    _, vectors = jnp.linalg.eigh(normal)
+    h = vectors[:, 0].reshape(3, 3)
+    return orient(compose(adjugate(t1), compose(h, t0)))
+
+
+def compose(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The product a b at full float32 precision."""
+    return jnp.matmul(a, b, precision=HIGHEST)
+
+
+def transfer_inliers(
+    h: Float[Array, "*b 3 3"],
+    xy0: Float[Array, "k 2"],
+    xy1: Float[Array, "k 2"],
+    threshold: Float[Array, ""],
+) -> Bool[Array, "*b k"]:
+    """|xy1 - h xy0| < threshold, with the point in front of the camera (w > 0).
+
+    One-way: the distance is measured in image 1. Without division: both sides times w.
+    """
+    x, y = xy0[:, 0], xy0[:, 1]
+    m = h[..., None]
+    w = m[..., 2, 0, :] * x + m[..., 2, 1, :] * y + m[..., 2, 2, :]
+    du = m[..., 0, 0, :] * x + m[..., 0, 1, :] * y + m[..., 0, 2, :] - w * xy1[:, 0]
+    dv = m[..., 1, 0, :] * x + m[..., 1, 1, :] * y + m[..., 1, 2, :] - w * xy1[:, 1]
+    reach = threshold * w
+    return (du * du + dv * dv < reach * reach) & (w > 0)
+
+
+def inliers(
+    h: Float[Array, "*b 3 3"],
+    xy0: Float[Array, "k 2"],
+    xy1: Float[Array, "k 2"],
+    threshold0: Float[Array, ""],
+    threshold1: Float[Array, ""],
+    *,
+    two_way: bool,
+) -> Bool[Array, "*b k"]:
+    """Inliers in image 1, and also in image 0 by the inverse map where `two_way`."""
+    forward = transfer_inliers(h, xy0, xy1, threshold1)
+    if not two_way:
+        return forward
+    return forward & transfer_inliers(orient(adjugate(h)), xy1, xy0, threshold0)
+
+

@@ -1,0 +1,102 @@
+"""One pair = one program: coarse matches, fine correspondences, planes, one-to-one.
+
+`match_pairs` is the batch; `batch_size` pairs run side by side (vmapped), the rest in turn. One at
+a time is best on a CPU, where a vmapped `while_loop` runs every pair as long as the slowest.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from jaxsfm.config import PairShape
+from jaxsfm.core import coarse_to_fine as c2f
+from jaxsfm.core.matching import mutual_nn
+from jaxsfm.core.numerics import HIGHEST
+from jaxsfm.core.ransac import peel_planes
+from jaxsfm.core.types import DenseFeatures, PairMatches, PRNGKey, Status, Thresholds
+
+
+def pair_key(root: PRNGKey, identity0: int | Array, identity1: int | Array) -> PRNGKey:
+    """The key of a pair from the identities (uint32) of its images, whichever comes first.
+
+    It does not depend on the pair's place in a batch, on the other pairs or on the machine.
+    """
+    a, b = jnp.uint32(identity0), jnp.uint32(identity1)
+    return jax.random.fold_in(jax.random.fold_in(root, jnp.minimum(a, b)), jnp.maximum(a, b))
+
+
+def _match_pair(
+    key: PRNGKey,
+    features0: DenseFeatures,
+    features1: DenseFeatures,
+    thresholds: Thresholds,
+    *,
+    shape: PairShape,
+) -> PairMatches:
+    num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
+    capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
+    coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
+    windows = c2f.match_windows(features0, features1, coarse, chunk=shape.fine_chunk)
+    cells, found = c2f.correspondences(c2f.candidates(windows, features0), capacity=capacity)
+    valid = jnp.arange(cells.shape[0]) < found
+    xy0, xy1 = features0.keypoints[cells[:, 0]], features1.keypoints[cells[:, 1]]
+    planes = peel_planes(key, xy0, xy1, valid, thresholds, shape=shape)
+    if shape.one_to_one == "similarity":
+        score = jnp.einsum(
+            "kd,kd->k",
+            features0.fine[cells[:, 0]],
+            features1.fine[cells[:, 1]],
+            precision=HIGHEST,
+        )
+    else:
+        score = jnp.zeros((cells.shape[0],), jnp.float32)
+    kept = c2f.one_to_one(cells, planes.plane >= 0, score, num_cells=num_fine)
+    floor = jnp.asarray(thresholds.min_inliers, jnp.int32)
+    status = jnp.where(
+        planes.num_inliers[0] > 0,
+        Status.VERIFIED,
+        jnp.where(found < floor, Status.TOO_FEW_MATCHES, Status.NO_PLANE),
+    )
+    return PairMatches(
+        cells=cells,
+        plane=jnp.where(kept, planes.plane, -1),
+        homographies=planes.homographies,
+        num_inliers=planes.num_inliers,
+        num_coarse=jnp.sum(coarse >= 0, dtype=jnp.int32),
+        num_tentative=found,
+        num_dropped=jnp.maximum(found - cells.shape[0], 0),
+        status=status.astype(jnp.int32),
+    )
+
+
+match_pair = functools.partial(jax.jit, static_argnames=("shape",))(_match_pair)
+"""PairMatches of one pair (paper, section 3). Jitted: one compilation per feature capacity and
+`PairShape`; thresholds and grid sizes are traced."""
+
+
+@functools.partial(jax.jit, static_argnames=("shape", "batch_size"))
+def match_pairs(
+    keys: PRNGKey,
+    features0: DenseFeatures,
+    features1: DenseFeatures,
+    thresholds: Thresholds,
+    *,
+    shape: PairShape,
+    batch_size: int = 1,
+) -> PairMatches:
+    """`match_pair` over a leading axis of keys and features.
+
+    Args:
+      batch_size: pairs computed side by side; the results do not depend on it.
+    """
+
+    def one(item):
+        key, f0, f1 = item
+        return _match_pair(key, f0, f1, thresholds, shape=shape)
+
+    return lax.map(
+        one, (keys, features0, features1), batch_size=batch_size if batch_size > 1 else None
+    )

@@ -1,0 +1,194 @@
+"""Homography RANSAC: vmapped hypotheses, chunked scoring, adaptive stop, planes peeled in turn.
+
+The loop structure is the authors' (at most 10 000 samples, confidence 0.999, one least-squares
+refit at each new best, up to five planes of at least 26 inliers on what the earlier ones left);
+the minimal solution is the true one, where their code takes the wrong singular vector.
+
+Correspondences are compacted first, so the work follows their number and not the list's capacity.
+Random numbers come from (key, plane, step): the result does not depend on the capacity.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsfm.config import PairShape
+from jaxsfm.core import homography as hg
+from jaxsfm.core.numerics import compact
+from jaxsfm.core.types import Planes, PRNGKey, Thresholds
+
+
+class _Problem(NamedTuple):
+    """Normalised correspondences of one plane search: the first `count` rows are live."""
+
+    xy0: Float[Array, "k 2"]
+    xy1: Float[Array, "k 2"]
+    count: Int[Array, ""]
+    threshold0: Float[Array, ""]
+    threshold1: Float[Array, ""]
+
+
+def sample_indices(key: PRNGKey, num: int, count: Int[Array, ""]) -> Int[Array, "num 4"]:
+    """`num` draws of four different indices below `count` (>= 4), uniform, in any order.
+
+    The i-th index is drawn below count - i and moved past the ones already drawn.
+    """
+    drawn: list[Array] = []
+    for i in range(4):
+        x = jax.random.randint(jax.random.fold_in(key, i), (num,), 0, jnp.maximum(count - i, 1))
+        earlier = jnp.sort(jnp.stack(drawn, axis=1), axis=1) if drawn else None
+        for j in range(i):
+            assert earlier is not None
+            x = x + (x >= earlier[:, j])
+        drawn.append(x)
+    return jnp.stack(drawn, axis=1)
+
+
+def hypotheses_needed(
+    num_inliers: Int[Array, ""], count: Int[Array, ""], confidence: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """Samples after which an all-inlier one has been drawn with `confidence`.
+
+    The probability of an all-inlier sample is the hypergeometric prod (i - k) / (n - k), k = 0..3.
+    """
+    k = jnp.arange(4, dtype=jnp.float32)
+    i, n = num_inliers.astype(jnp.float32), count.astype(jnp.float32)
+    p = jnp.prod(jnp.maximum(i - k, 0.0) / jnp.maximum(n - k, 1.0))
+    # log1p keeps p far below float32's epsilon; p = 1 needs one sample.
+    miss = jnp.log1p(-jnp.minimum(p, 1.0 - 1e-6))
+    return jnp.where(p > 0, jnp.log(1.0 - confidence) / jnp.where(p > 0, miss, -1.0), jnp.inf)
+
+
+def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
+    xy0, xy1 = problem.xy0, problem.xy1
+    live = jnp.arange(xy0.shape[0]) < problem.count
+    return live & hg.inliers(
+        h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way
+    )
+
+
+def count_inliers(
+    h: Float[Array, "s 3 3"], problem: _Problem, *, shape: PairShape
+) -> Int[Array, " s"]:
+    """Inliers of every hypothesis, a chunk of correspondences at a time."""
+    k = problem.xy0.shape[0]
+    chunk = min(shape.score_chunk, k)
+
+    def body(state):
+        i, counts = state
+        start = jnp.minimum(i * chunk, k - chunk)
+        xy0 = lax.dynamic_slice(problem.xy0, (start, 0), (chunk, 2))
+        xy1 = lax.dynamic_slice(problem.xy1, (start, 0), (chunk, 2))
+        index = start + jnp.arange(chunk)
+        # The last chunk is moved back to fit: count only what no earlier chunk has counted.
+        live = (index >= i * chunk) & (index < problem.count)
+        hit = hg.inliers(
+            h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way
+        )
+        return i + 1, counts + jnp.sum(hit & live, axis=1, dtype=jnp.int32)
+
+    start = (jnp.int32(0), jnp.zeros((h.shape[0],), jnp.int32))
+    return lax.while_loop(lambda s: s[0] * chunk < problem.count, body, start)[1]
+
+
+def _refit(h: Array, num: Array, problem: _Problem, shape: PairShape) -> tuple[Array, Array]:
+    """Least squares on the inliers, kept while it gains; at most `local_refits` times."""
+
+    def body(state):
+        i, h, num, _ = state
+        weight = _inliers(h, problem, shape).astype(jnp.float32)
+        candidate = hg.least_squares(problem.xy0, problem.xy1, weight)
+        count = _inliers(candidate, problem, shape).sum(dtype=jnp.int32)
+        better = count > num
+        return i + 1, jnp.where(better, candidate, h), jnp.maximum(count, num), better
+
+    def more(state):
+        return (state[0] < shape.local_refits) & state[3]
+
+    _, h, num, _ = lax.while_loop(more, body, (jnp.int32(0), h, num, jnp.bool_(True)))
+    return h, num
+
+
+def _one_plane(
+    key: PRNGKey, problem: _Problem, thresholds: Thresholds, active: Array, shape: PairShape
+) -> tuple[Array, Array, Array]:
+    """Best homography (normalised), its inlier count, hypotheses used."""
+    step_size = shape.hypotheses_per_step
+
+    def more(state):
+        step, _, _, needed = state
+        used = (step * step_size).astype(jnp.float32)
+        return active & (used < jnp.minimum(needed, shape.max_hypotheses))
+
+    def body(state):
+        step, h, num, needed = state
+        index = sample_indices(jax.random.fold_in(key, step), step_size, problem.count)
+        batch, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
+        counts = jnp.where(valid, count_inliers(batch, problem, shape=shape), 0)
+        best = jnp.argmax(counts)
+        h, num, needed = lax.cond(
+            counts[best] > jnp.maximum(num, 4),
+            lambda: _improve(batch[best], counts[best]),
+            lambda: (h, num, needed),
+        )
+        return step + 1, h, num, needed
+
+    def _improve(h, num):
+        h, num = _refit(h, num, problem, shape)
+        return h, num, hypotheses_needed(num, problem.count, thresholds.confidence)
+
+    start = (jnp.int32(0), jnp.eye(3), jnp.int32(0), jnp.float32(jnp.inf))
+    step, h, num, _ = lax.while_loop(more, body, start)
+    return h, num, step * step_size
+
+
+def peel_planes(
+    key: PRNGKey,
+    xy0: Float[Array, "k 2"],
+    xy1: Float[Array, "k 2"],
+    valid: Bool[Array, " k"],
+    thresholds: Thresholds,
+    *,
+    shape: PairShape,
+) -> Planes:
+    """Up to `max_planes` homographies, each on the correspondences the earlier ones left.
+
+    Stops at the first with fewer than `min_inliers` inliers (paper, section 3.3; authors' code).
+
+    Args:
+      key: the pair's key.
+      xy0, xy1: pixels of the working images.
+      valid: which rows are correspondences.
+    """
+    k = xy0.shape[0]
+    weight = valid.astype(jnp.float32)
+    t0, t1 = hg.normalisation(xy0, weight), hg.normalisation(xy1, weight)
+    n0, n1 = hg.apply_affine(t0, xy0), hg.apply_affine(t1, xy1)
+    reach0 = jnp.asarray(thresholds.threshold_px, jnp.float32) * t0[0, 0]
+    reach1 = jnp.asarray(thresholds.threshold_px, jnp.float32) * t1[0, 0]
+    floor = jnp.maximum(jnp.asarray(thresholds.min_inliers, jnp.int32), 4)
+
+    def peel(state, p):
+        left, going = state
+        index, count = compact(left, size=k)
+        going = going & (count >= floor)
+        problem = _Problem(n0[index], n1[index], count, reach0, reach1)
+        h, num, used = _one_plane(jax.random.fold_in(key, p), problem, thresholds, going, shape)
+        going = going & (num >= floor)
+        member = going & left & hg.inliers(h, n0, n1, reach0, reach1, two_way=shape.two_way)
+        pixels = hg.orient(hg.compose(hg.adjugate(t1), hg.compose(h, t0)))
+        out = (
+            jnp.where(going, pixels, 0.0),
+            member.sum(dtype=jnp.int32),
+            used,
+            member,
+        )
+        return (left & ~member, going), out
+
+    planes = jnp.arange(shape.max_planes, dtype=jnp.int32)
+    _, (h, num, used, member) = lax.scan(peel, (valid, jnp.bool_(True)), planes)
+    plane = jnp.where(member.any(0), jnp.argmax(member, axis=0), -1).astype(jnp.int32)
+    return Planes(h, num, used, plane)

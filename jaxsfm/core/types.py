@@ -1,0 +1,86 @@
+"""The containers that flow through the core: NamedTuples of arrays, no methods that compute.
+
+Axis letters: h w image rows and columns, c channels, n coarse (pool4) cells, m fine (pool3) cells,
+k correspondences (capacity), p planes, s samples. Padded rows are marked by a mask, an index of -1
+or, for descriptors, by being all zero; they never match.
+"""
+
+import enum
+from typing import NamedTuple
+
+import jax
+from jaxtyping import Array, Float, Int
+
+
+class Pyramid(NamedTuple):
+    """Feature maps, each half the size of the one before; the first has the image's size."""
+
+    conv1_2: Float[Array, "b h w 64"]
+    """Before the rectifier, as the authors' code uses it (algorithm notes, section 1)."""
+    pool1: Float[Array, "b h2 w2 64"]
+    pool2: Float[Array, "b h4 w4 128"]
+    pool3: Float[Array, "b h8 w8 256"]
+    pool4: Float[Array, "b h16 w16 512"]
+    pool5: Float[Array, "b h32 w32 512"]
+
+
+class DenseFeatures(NamedTuple):
+    """What one image brings to every pair. Cell (row, col) is entry row * columns + col."""
+
+    coarse: Float[Array, "n c"]
+    """L2-normalised pool4 descriptors; rows past the grid are zero."""
+    fine: Float[Array, "m d"]
+    """L2-normalised pool3 descriptors; rows past the grid are zero."""
+    keypoints: Float[Array, "m 2"]
+    """(x, y) of every fine cell's keypoint, pixels of the working image."""
+    coarse_grid: Int[Array, " 2"]
+    """(rows, columns) of the pool4 grid."""
+    fine_grid: Int[Array, " 2"]
+    """(rows, columns) of the pool3 grid."""
+
+
+class Thresholds(NamedTuple):
+    """Traced scalars of the verification: changing them does not recompile."""
+
+    threshold_px: Float[Array, ""] | float
+    min_inliers: Int[Array, ""] | int
+    confidence: Float[Array, ""] | float
+
+
+class Status(enum.IntEnum):
+    """How a pair ended."""
+
+    VERIFIED = 0
+    TOO_FEW_MATCHES = 1
+    NO_PLANE = 2
+
+
+class Planes(NamedTuple):
+    """Homographies peeled from a set of correspondences."""
+
+    homographies: Float[Array, "p 3 3"]
+    """Image 0 to image 1, pixels, Frobenius norm 1; zero where there is no plane."""
+    num_inliers: Int[Array, " p"]
+    """Members when the plane was peeled; 0 where there is no plane."""
+    num_hypotheses: Int[Array, " p"]
+    """Minimal samples that were scored."""
+    plane: Int[Array, " k"]
+    """The plane of each correspondence, -1 for none."""
+
+
+class PairMatches(NamedTuple):
+    """The verified matches of one pair; row i is a match only where plane[i] >= 0."""
+
+    cells: Int[Array, "k 2"]
+    """Fine cell in image 0 and in image 1; one-to-one among the matches."""
+    plane: Int[Array, " k"]
+    homographies: Float[Array, "p 3 3"]
+    num_inliers: Int[Array, " p"]
+    num_coarse: Int[Array, ""]
+    num_tentative: Int[Array, ""]
+    num_dropped: Int[Array, ""]
+    """Correspondences beyond the list's capacity, lost."""
+    status: Int[Array, ""]
+
+
+PRNGKey = jax.Array

@@ -1,0 +1,87 @@
+"""From image files to DenseFeatures: shape buckets, so that few programs are compiled.
+
+An image is padded to a multiple of `SIDE_BUCKET` pixels per side and its cells to a menu of
+capacities. Both follow from the image's own size alone, so what is computed for an image never
+depends on the other images.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.core.features import extract
+from jaxsfm.core.types import DenseFeatures
+from jaxsfm.host.images import ImageFile, WorkingImage, read_image
+from jaxsfm.host.weights import Weights
+
+SIDE_BUCKET = 128
+"""Padding costs at most 8 % of a 1600 px side."""
+_MENU = tuple(1024 * n // 2 for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
+"""Coarse capacities: 512 .. 32768, half an octave apart."""
+
+
+class ImageFeatures(NamedTuple):
+    """Features of one image and the way back to its original pixels."""
+
+    image: ImageFile
+    scale: tuple[float, float]
+    """Original pixels per working pixel, (x, y)."""
+    dense: DenseFeatures
+    """numpy arrays."""
+
+
+def capacity(num_coarse: int) -> int:
+    """The smallest capacity of the menu that holds `num_coarse` cells (multiples of its largest
+    beyond that)."""
+    for size in _MENU:
+        if num_coarse <= size:
+            return size
+    return -(-num_coarse // _MENU[-1]) * _MENU[-1]
+
+
+def compute_features(weights: Weights, working: WorkingImage, *, config: Config) -> DenseFeatures:
+    """DenseFeatures (numpy) of an image at working size."""
+    height, width = working.rgb.shape[:2]
+    padded = tuple(-(-side // SIDE_BUCKET) * SIDE_BUCKET for side in (height, width))
+    image = np.zeros((*padded, 3), np.uint8)
+    image[:height, :width] = working.rgb
+    # 4 cells of pool3 to one of pool4, and the odd last row and column.
+    odd = height // 8 * (width // 8) - 4 * (height // 16) * (width // 16)
+    num_coarse = capacity(height // 16 * (width // 16) + -(-odd // 4))
+    dense = extract(
+        weights.params,
+        image,
+        np.asarray([height, width], np.int32),
+        preprocessing=weights.preprocessing,
+        num_coarse=num_coarse,
+        num_fine=4 * num_coarse,
+        relocalized=config.keypoints == "relocalized",
+    )
+    return jax.device_get(dense)
+
+
+def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
+    """The same features with room for `num_coarse` coarse and 4 x as many fine cells."""
+
+    def pad(array: np.ndarray, rows: int) -> np.ndarray:
+        return np.pad(array, ((0, rows - array.shape[0]), (0, 0)))
+
+    if dense.coarse.shape[0] == num_coarse:
+        return dense
+    return dense._replace(
+        coarse=pad(np.asarray(dense.coarse), num_coarse),
+        fine=pad(np.asarray(dense.fine), 4 * num_coarse),
+        keypoints=pad(np.asarray(dense.keypoints), 4 * num_coarse),
+    )
+
+
+def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
+    """Read one image and compute its features.
+
+    Raises:
+      ImageError: the image cannot be used.
+    """
+    working = read_image(image, max_size=config.max_size)
+    return ImageFeatures(image, working.scale, compute_features(weights, working, config=config))
