@@ -22,19 +22,6 @@ def rescale(xy: Float[Array, "*n 2"], scale_xy: Float[Array, " 2"]) -> Float[Arr
     return (xy + 0.5) * scale_xy - 0.5
 
 
-def rescale_matrix(scale_xy: Float[Array, " 2"]) -> Float[Array, "3 3"]:
-    """`rescale` as a 3 x 3 matrix on homogeneous (x, y, 1)."""
-    sx, sy = scale_xy[0], scale_xy[1]
-    zero, one = jnp.zeros_like(sx), jnp.ones_like(sx)
-    return jnp.stack(
-        [
-            jnp.stack([sx, zero, 0.5 * sx - 0.5]),
-            jnp.stack([zero, sy, 0.5 * sy - 0.5]),
-            jnp.stack([zero, zero, one]),
-        ]
-    )
-
-
 def cell_rows_cols(capacity: int, columns: Int[Array, ""]) -> tuple[Array, Array]:
     """Row and column of cells 0 .. capacity - 1 of a grid with `columns` columns."""
     index = jnp.arange(capacity, dtype=jnp.int32)

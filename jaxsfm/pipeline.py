@@ -1,0 +1,172 @@
+"""The stages composed: extract -> match -> reconstruct; the only module that runs core and host.
+
+Every stage is a function of its inputs and a config. `jaxsfm.run` strings them together in a work
+folder.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.core.grid import rescale
+from jaxsfm.core.pair import match_pair, pair_key
+from jaxsfm.core.types import PairMatches, Status, Thresholds
+from jaxsfm.errors import UserError
+from jaxsfm.host.features import ImageFeatures, image_features, pad_features
+from jaxsfm.host.images import ImageFile, find_images, inspect_image
+from jaxsfm.host.pairs import Pair, PairResult, describe, make_pair
+from jaxsfm.host.weights import Weights
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from jaxsfm.host.colmap import MapOptions
+    from jaxsfm.host.intrinsics import Intrinsics
+
+
+def open_images(folder: Path) -> tuple[list[ImageFile], dict[str, str]]:
+    """The usable images below a folder, and why each of the others is not.
+
+    Raises:
+      UserError: no such folder, or no image files in it.
+    """
+    images, lost = [], {}
+    for name in find_images(folder):
+        try:
+            images.append(inspect_image(folder / name, name=name))
+        except UserError as error:
+            lost[name] = str(error)
+    return images, lost
+
+
+def extract(
+    weights: Weights, images: Iterable[ImageFile], *, config: Config
+) -> dict[str, ImageFeatures]:
+    """Dense features of images, by name; all of them in memory (38 MB for 1536 x 1024).
+
+    Raises:
+      ImageError: an image cannot be decoded.
+    """
+    weights = on_device(weights)
+    return {image.name: image_features(weights, image, config=config) for image in images}
+
+
+def on_device(weights: Weights) -> Weights:
+    """The same weights with their arrays on the accelerator, copied once instead of per image."""
+    return dataclasses.replace(weights, params=jax.device_put(weights.params))
+
+
+def match(
+    features: Mapping[str, ImageFeatures],
+    pairs: Iterable[tuple[str, str]],
+    *,
+    config: Config,
+    seed: int = 0,
+) -> dict[Pair, PairResult]:
+    """Verified matches of pairs of images, by pair (the lesser name first).
+
+    A pair's result depends on the two images, the config and the seed; not on other pairs.
+    """
+    results = {}
+    for a, b in pairs:
+        pair = make_pair(a, b)
+        results[pair] = match_features(
+            features[pair[0]], features[pair[1]], config=config, seed=seed
+        )
+    return results
+
+
+def match_features(
+    features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int = 0
+) -> PairResult:
+    """Verified matches of two images, in the order given."""
+    room = max(features0.dense.coarse.shape[0], features1.dense.coarse.shape[0])
+    key = pair_key(jax.random.key(seed), features0.image.identity, features1.image.identity)
+    found = match_pair(
+        key,
+        pad_features(features0.dense, room),
+        pad_features(features1.dense, room),
+        thresholds(config),
+        shape=config.pair,
+    )
+    return to_original_pixels(jax.device_get(found), features0, features1)
+
+
+def thresholds(config: Config) -> Thresholds:
+    """The config's traced half."""
+    return Thresholds(
+        np.float32(config.threshold_px),  # pyright: ignore[reportArgumentType]
+        np.int32(config.min_inliers),  # pyright: ignore[reportArgumentType]
+        np.float32(config.confidence),  # pyright: ignore[reportArgumentType]
+    )
+
+
+def to_original_pixels(
+    found: PairMatches, features0: ImageFeatures, features1: ImageFeatures
+) -> PairResult:
+    """From the program's padded output to lists in original pixels."""
+    keep = np.asarray(found.plane) >= 0
+    cells = np.asarray(found.cells)[keep]
+
+    def keypoints(features: ImageFeatures, side: int) -> np.ndarray:
+        xy = np.asarray(features.dense.keypoints, np.float64)[cells[:, side]]
+        return np.asarray(rescale(xy, np.asarray(features.scale))).astype(np.float32)
+
+    # In float64 on the host: 1600 px coordinates squared leave float32 no digits to invert with.
+    present = np.asarray(found.num_inliers) > 0
+    to0, to1 = _scale_matrix(features0.scale), _scale_matrix(features1.scale)
+    h = to1 @ np.asarray(found.homographies, np.float64)[present] @ np.linalg.inv(to0)
+    norms = np.linalg.norm(h, axis=(1, 2), keepdims=True)
+    return PairResult(
+        pair=(features0.image.name, features1.image.name),
+        cells=cells,
+        keypoints0=keypoints(features0, 0),
+        keypoints1=keypoints(features1, 1),
+        plane=np.asarray(found.plane)[keep],
+        homographies=h / norms,
+        num_tentative=int(found.num_tentative),
+        num_dropped=int(found.num_dropped),
+        status=Status(int(found.status)),
+    )
+
+
+def _scale_matrix(scale: tuple[float, float]) -> np.ndarray:
+    """`rescale` on homogeneous (x, y, 1), float64."""
+    sx, sy = scale
+    return np.asarray([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1.0]])
+
+
+def reconstruct(
+    images: list[ImageFile],
+    matches: Mapping[Pair, PairResult],
+    database: Path,
+    *,
+    intrinsics: "Intrinsics | None" = None,
+    options: "MapOptions | None" = None,
+    on_image: Callable[[], None] = lambda: None,
+) -> "list[pycolmap.Reconstruction]":
+    """COLMAP models from verified matches, the one with most images first; empty if none.
+
+    Args:
+      matches: as from `match`.
+      database: where to write the COLMAP database; replaced.
+      intrinsics: one known camera for all images; None takes one camera per photo.
+      options: default: incremental, refining the intrinsics unless they are given.
+    """
+    from jaxsfm.host import colmap
+    from jaxsfm.host.intrinsics import check_fits
+
+    if options is None:
+        options = colmap.MapOptions(refine_intrinsics=intrinsics is None)
+    if intrinsics is not None:
+        check_fits(intrinsics, {image.name: image.size for image in images})
+    for pair in matches:
+        if matches[pair].pair != pair:
+            raise ValueError(f"matches of {describe(pair)} are those of {matches[pair].pair}")
+    colmap.write_database(database, images, matches, intrinsics)
+    return colmap.build_models(database, options, on_image=on_image)
