@@ -1,0 +1,303 @@
+"""The command line: a thin skin over `jaxsfm.run_folder` and the API.
+
+Heavy modules are imported inside the commands, so that --help is quick.
+"""
+
+import dataclasses
+import json
+import logging
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from jaxsfm.config import Config, Keypoints, preset
+from jaxsfm.errors import UserError
+
+Positional = tyro.conf.Positional
+Preset = Literal["paper", "default"]
+
+DEMO_MAX_POSITION = 0.02
+"""Stated mean position error of the demo, units (metres) of its room."""
+DEMO_MAX_ROTATION_DEG = 0.25
+
+
+def _config(name: str, max_size: int, keypoints: Keypoints) -> Config:
+    try:
+        return dataclasses.replace(preset(name), max_size=max_size, keypoints=keypoints)
+    except ValueError as error:
+        raise UserError(f"--{str(error).replace('_', '-', 1)}") from error
+
+
+def _check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
+    """Fail before the work, not after it."""
+    if path is None:
+        return
+    if path.suffix.lower() not in suffixes:
+        raise UserError(f"{option} {path}: the name must end in {' or '.join(suffixes)}")
+    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise UserError(f"{option} {path}: cannot be written there")
+
+
+def reconstruct(
+    images: Positional[Path],
+    *,
+    out: Path,
+    preset: Preset = "default",
+    intrinsics: str | None = None,
+    refine_intrinsics: Literal["auto", "yes", "no"] = "auto",
+    pairs: str = "exhaustive",
+    best_pairs: int | None = None,
+    max_size: int = 1600,
+    keypoints: Keypoints = "relocalized",
+    mapper: Literal["incremental", "global"] = "incremental",
+    seed: int = 0,
+    threads: int = -1,
+    reference: Path | None = None,
+) -> int:
+    """A folder of photos to a COLMAP model.
+
+    Args:
+      images: Folder with the photos; sub-folders are included.
+      out: Folder for the results; a run that was interrupted goes on there.
+      preset: paper: the constants of the authors' code. default: two-way inlier test, iterated
+        refits, the most similar of several matches.
+      intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
+        model, COLMAP's pixels) for all photos; without it one camera per photo.
+      refine_intrinsics: Whether mapping refines them; auto: unless they are given.
+      pairs: exhaustive, or a file with two image names a line.
+      best_pairs: Hand on only each image's N pairs with the most inliers.
+      max_size: Longer side of the working images, pixels.
+      keypoints: relocalized, or grid: cell centres (for the ablation).
+      mapper: COLMAP's incremental or global mapper.
+      seed: Of everything random.
+      threads: Of COLMAP's part; 1 makes the model repeatable to the last byte; -1: all.
+      reference: Reference poses (Strecha .camera files or a COLMAP model) to evaluate against.
+    """
+    config = _config(preset, max_size, keypoints)
+    from jaxsfm.report import summary_lines
+    from jaxsfm.run import RunOptions, run_folder
+
+    options = RunOptions(
+        pairs=pairs,
+        best_pairs=best_pairs,
+        intrinsics=intrinsics,
+        refine_intrinsics=refine_intrinsics,
+        mapper=mapper,
+        seed=seed,
+        threads=threads,
+        reference=reference,
+        progress=True,
+    )
+    report = run_folder(images, out, config=config, options=options)
+    print("\n".join(summary_lines(report)))
+    if not report["models"]:
+        print(
+            f"jaxsfm: no model: see the lost images above and {out / 'report.json'}",
+            file=sys.stderr,
+        )
+        return 1
+    return 0
+
+
+def match(
+    image0: Positional[Path],
+    image1: Positional[Path],
+    *,
+    out: Path,
+    plot: Path | None = None,
+    preset: Preset = "default",
+    max_size: int = 1600,
+    keypoints: Keypoints = "relocalized",
+    seed: int = 0,
+) -> int:
+    """Match two images; writes keypoints, planes and homographies.
+
+    Args:
+      image0: The first image.
+      image1: The second image.
+      out: File.npz with keypoints0, keypoints1 (n x 2, original pixels, centre of the top-left
+        pixel (0, 0)), plane (n) and homographies (p x 3 x 3, image 0 to image 1).
+      plot: Picture of the matches, a colour for each plane.
+      preset: See reconstruct.
+      max_size: Longer side of the working images, pixels.
+      keypoints: relocalized, or grid: cell centres.
+      seed: Of the RANSAC draws.
+    """
+    config = _config(preset, max_size, keypoints)
+    _check_writable(out, "--out", (".npz",))
+    _check_writable(plot, "--plot", (".png", ".jpg"))
+    if not 0 <= seed < 2**31:
+        raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
+    import numpy as np
+
+    from jaxsfm.host.features import image_features
+    from jaxsfm.host.images import inspect_image, read_image
+    from jaxsfm.host.weights import load_weights
+    from jaxsfm.pipeline import match_features, on_device
+
+    files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
+    weights = on_device(load_weights())
+    features = [image_features(weights, file, config=config) for file in files]
+    result = match_features(features[0], features[1], config=config, seed=seed)
+    np.savez(
+        out,
+        keypoints0=result.keypoints0,
+        keypoints1=result.keypoints1,
+        plane=result.plane,
+        homographies=result.homographies,
+    )
+    if plot is not None:
+        from jaxsfm.plot import draw_matches, save_figure
+
+        working = [read_image(file, max_size=min(max_size, 1200)) for file in files]
+        figure = draw_matches(
+            working[0].rgb,
+            working[1].rgb,
+            result,
+            scale0=np.asarray(working[0].scale),
+            scale1=np.asarray(working[1].scale),
+        )
+        save_figure(figure, plot)
+    print(
+        f"{result.num_inliers} matches on {len(result.homographies)} planes "
+        f"({result.num_tentative} tentative): {out}"
+    )
+    return 0
+
+
+def evaluate(
+    out: Positional[Path],
+    *,
+    reference: Path,
+    align_on: Path | None = None,
+    json: Path | None = None,
+) -> int:
+    """Compare a model's cameras with reference poses.
+
+    Args:
+      out: A run's folder, or a COLMAP model's.
+      reference: Folder of Strecha .camera files or of a COLMAP model.
+      align_on: Text file: align on these images only (the paper's night protocol).
+      json: Write all figures here.
+    """
+    _check_writable(json, "--json", (".json",))
+    from jaxsfm import evaluation
+    from jaxsfm.host.poses import find_model, model_poses, read_model, read_poses
+    from jaxsfm.report import evaluation_lines
+
+    truth = read_poses(reference)
+    names = evaluation.read_names(align_on) if align_on else None
+    poses = model_poses(read_model(find_model(out)))
+    result = evaluation.evaluate(poses, truth, align_on=names).as_dict()
+    for name, error in result["images"].items():
+        print(f"{name!s:40s} {error['position']:10.4f} {error['rotation_deg']:9.4f} deg")
+    for name in result["missing"]:
+        print(f"{name!s:40s} not in the model")
+    print("\n".join(evaluation_lines(result)))
+    if json is not None:
+        json.write_text(_dump(result), encoding="utf-8")
+    return 0
+
+
+def _dump(value: object) -> str:
+    return json.dumps(value, indent=1)
+
+
+def weights() -> int:
+    """Show which weights are in use, and check them."""
+    from jaxsfm.host.weights import default_path, load_weights
+
+    loaded = load_weights()
+    p = loaded.preprocessing
+    print(f"weights          ImageNet VGG-16, {loaded.source}")
+    print(f"file             {default_path()}")
+    print(f"family           {loaded.family}")
+    print(f"preprocessing    RGB / {p.scale:g}, minus {p.mean}, divided by {p.std}")
+    print(f"sha256           {loaded.sha256} (checked)")
+    return 0
+
+
+def demo(*, out: Path | None = None, seed: int = 0) -> int:
+    """Render a small scene with known cameras, reconstruct it, compare with the truth.
+
+    Ends with 1 if a camera is missing or the mean errors exceed the stated ones.
+
+    Args:
+      out: Folder for the scene and the results; default: a new one under the temporary folder.
+      seed: Of the scene's noise and of the reconstruction.
+    """
+    from jaxsfm.report import summary_lines
+    from jaxsfm.run import RunOptions, run_folder
+    from jaxsfm.synthetic import write_scene
+
+    if out is None:
+        out = Path(tempfile.mkdtemp(prefix="jaxsfm-demo-"))
+    try:
+        truth = write_scene(out / "scene", seed=seed)
+    except OSError as error:
+        raise UserError(f"--out {out}: cannot be written ({error.strerror})") from error
+    options = RunOptions(
+        intrinsics=str(out / "scene" / "K.txt"),
+        reference=out / "scene" / "reference",
+        seed=seed,
+        progress=True,
+    )
+    report = run_folder(out / "scene" / "images", out / "run", config=preset("default"), options=options)
+    print("\n".join(summary_lines(report)))
+    print(f"files            {out}")
+    result = report.get("evaluation")
+    good = (
+        result is not None
+        and result["registered"] == len(truth)
+        and result["position"]["mean"] <= DEMO_MAX_POSITION
+        and result["rotation_deg"]["mean"] <= DEMO_MAX_ROTATION_DEG
+    )
+    print(
+        f"demo {'passed' if good else 'FAILED'}: synthetic scene; required {len(truth)} of "
+        f"{len(truth)} cameras, mean errors at most {DEMO_MAX_POSITION} units and "
+        f"{DEMO_MAX_ROTATION_DEG} deg"
+    )
+    return 0 if good else 1
+
+
+COMMANDS = {
+    "reconstruct": reconstruct,
+    "match": match,
+    "evaluate": evaluate,
+    "demo": demo,
+    "weights": weights,
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns the exit status (2: what was given cannot be used)."""
+    logging.basicConfig(level=logging.INFO, format="jaxsfm: %(message)s", stream=sys.stderr)
+    logging.getLogger("jax").setLevel(logging.ERROR)
+    try:
+        return tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="jaxsfm",
+            description="Structure-from-Motion from dense VGG-16 features with relocalization.",
+            args=argv,
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+    except UserError as error:
+        print(f"jaxsfm: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(
+            "jaxsfm: interrupted; what was finished is kept: the same command goes on from there",
+            file=sys.stderr,
+        )
+        return 130
+    except MemoryError:
+        print("jaxsfm: out of memory; try a smaller --max-size", file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

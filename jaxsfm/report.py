@@ -1,0 +1,128 @@
+"""What a run did, as plain JSON and as the last lines on the screen; why images were lost."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from jaxsfm.core.types import Status
+from jaxsfm.host.images import shown_name
+from jaxsfm.host.pairs import Pair, PairResult
+
+
+def component_of(seeds: Iterable[str], edges: Iterable[Pair]) -> set[str]:
+    """All images reachable from `seeds` over `edges`."""
+    neighbours: dict[str, set[str]] = {}
+    for a, b in edges:
+        neighbours.setdefault(a, set()).add(b)
+        neighbours.setdefault(b, set()).add(a)
+    reached, queue = set(seeds), list(seeds)
+    while queue:
+        for name in neighbours.get(queue.pop(), set()) - reached:
+            reached.add(name)
+            queue.append(name)
+    return reached
+
+
+def lost_images(
+    names: Iterable[str],
+    registered: Iterable[str],
+    results: Mapping[Pair, PairResult],
+    verified: Mapping[Pair, int],
+) -> list[dict[str, str]]:
+    """For every image without a pose, the stage that lost it and the numbers behind that.
+
+    Stages, in the pipeline's order: `pairs` (never paired), `too few matches` (no pair had enough
+    tentative matches), `no plane` (no homography had enough inliers), `not connected` (no chain of
+    COLMAP-verified pairs to the model), `no pose` (connected, but COLMAP found no pose).
+
+    Args:
+      results: every pair tried.
+      verified: COLMAP's inliers of the pairs handed on.
+    """
+    registered = set(registered)
+    connected = component_of(registered, verified)
+    lost = []
+    for name in sorted(set(names) - registered):
+        own = [result for pair, result in results.items() if name in pair]
+        edges = [count for pair, count in verified.items() if name in pair]
+        tentative = max((r.num_tentative for r in own), default=0)
+        inliers = max((r.num_inliers for r in own), default=0)
+        if not own:
+            stage, detail = "pairs", "it is in no pair that was tried"
+        elif all(r.status == Status.TOO_FEW_MATCHES for r in own):
+            stage, detail = "too few matches", f"at most {tentative} tentative matches in a pair"
+        elif not any(r.status == Status.VERIFIED for r in own):
+            stage, detail = "no plane", f"{tentative} tentative matches, no homography among them"
+        elif not edges or name not in connected:
+            stage = "not connected"
+            detail = (
+                f"{inliers} inliers in its best pair, {len(edges)} pairs verified by COLMAP, "
+                "none leads to the model"
+            )
+        else:
+            stage = "no pose"
+            detail = f"{len(edges)} verified pairs with up to {max(edges)} inliers"
+        lost.append({"image": name, "stage": stage, "detail": detail})
+    return lost
+
+
+def model_figures(model: Any) -> dict[str, Any]:
+    """The numbers of one COLMAP model."""
+    return {
+        "registered": model.num_reg_images(),
+        "points": model.num_points3D(),
+        "observations": model.compute_num_observations(),
+        "track_length": model.compute_mean_track_length(),
+        "reprojection_error_px": model.compute_mean_reprojection_error(),
+        "images": sorted(model.image(i).name for i in model.reg_image_ids()),
+    }
+
+
+def evaluation_lines(evaluation: Mapping[str, Any]) -> list[str]:
+    """An evaluation as text."""
+    position, rotation = evaluation["position"], evaluation["rotation_deg"]
+    shares = ", ".join(f"{d}: {100 * s:.0f} %" for d, s in evaluation["within_10deg"].items())
+    return [
+        f"reference        {evaluation['registered']} of {evaluation['reference_images']} images, "
+        f"aligned on {evaluation['aligned_on']}",
+        *(
+            f"{label} mean {e['mean']:.4f}  median {e['median']:.4f}  max {e['max']:.4f} {unit}"
+            for label, e, unit in (
+                ("position error  ", position, "(units of the reference)"),
+                ("rotation error  ", rotation, "deg"),
+            )
+        ),
+        f"within (d; 10 deg)  {shares}",
+    ]
+
+
+def summary_lines(report: Mapping[str, Any]) -> list[str]:
+    """The run's last words."""
+    images, pairs = report["images"], report["pairs"]
+    lines = [
+        f"images           {images['usable']} usable of {images['found']}",
+        f"pairs            {pairs['tried']} tried, {pairs['verified']} verified, "
+        f"{pairs['handed_on']} handed to COLMAP",
+    ]
+    models = report["models"]
+    if models:
+        best = models[0]
+        lines += [
+            f"registered       {best['registered']} of {images['usable']} images"
+            + (f" ({len(models)} separate models)" if len(models) > 1 else ""),
+            f"points           {best['points']}, mean track length {best['track_length']:.2f}, "
+            f"reprojection error {best['reprojection_error_px']:.2f} px",
+        ]
+    else:
+        lines.append("registered       none: no model could be built")
+    seconds = report["seconds"]
+    lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in seconds.items()))
+    if pairs["overflowed"]:
+        lines.append(f"warning          {pairs['overflowed']} pairs had more matches than kept")
+    lines += [f"skipped          {reason}" for reason in images["skipped"].values()]
+    lines += [
+        f"lost             {shown_name(row['image'])}: {row['stage']} ({row['detail']})"
+        for row in report["lost"]
+    ]
+    if report.get("evaluation"):
+        lines += evaluation_lines(report["evaluation"])
+    return lines

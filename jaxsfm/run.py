@@ -1,0 +1,252 @@
+"""A whole run in its work folder: photos in, COLMAP model, database and report out."""
+
+import dataclasses
+import importlib.metadata
+import json
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxsfm.config import Config
+from jaxsfm.errors import UserError
+from jaxsfm.evaluation import evaluate
+from jaxsfm.host import colmap
+from jaxsfm.host.features import image_features
+from jaxsfm.host.images import ImageError, ImageFile, find_images, read_image
+from jaxsfm.host.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.host.pairs import Pair, PairResult, best_pairs, exhaustive_pairs, read_pairs
+from jaxsfm.host.poses import model_poses, read_poses
+from jaxsfm.host.weights import Weights, load_weights
+from jaxsfm.host.workfolder import WorkFolder, open_folder, write_atomic
+from jaxsfm.pipeline import match_features, on_device, open_images, reconstruct
+from jaxsfm.report import lost_images, model_figures
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What to do, beyond the matching `Config`."""
+
+    pairs: str = "exhaustive"
+    """`exhaustive`, or a file with two image names a line."""
+    best_pairs: int | None = None
+    """Hand on only each image's N pairs with the most inliers (a union); None: all."""
+    intrinsics: str | None = None
+    """K.txt or MODEL:p1,p2,..; None: one camera per photo."""
+    refine_intrinsics: Literal["auto", "yes", "no"] = "auto"
+    """`auto` refines them unless they are given."""
+    mapper: colmap.Mapper = "incremental"
+    seed: int = 0
+    threads: int = -1
+    reference: Path | None = None
+    """Reference poses to evaluate the model against."""
+    progress: bool = False
+    """Progress bars on standard error."""
+
+
+def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) -> dict[str, Any]:
+    """Reconstruct a folder of photos; returns the report, also written to `out`/report.json.
+
+    Features and matches are kept in `out` as they are made: after an interruption the same call
+    goes on. `out`/sparse/0 is the best model, `out`/database.db the database.
+
+    Raises:
+      UserError: what was given cannot be used. Nothing already computed is lost.
+    """
+    _check_options(options)
+    reference = read_poses(options.reference) if options.reference else None
+    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
+    usable, skipped = open_images(images)
+    names = find_images(images)
+    pairs = (
+        exhaustive_pairs(image.name for image in usable)
+        if options.pairs == "exhaustive"
+        else read_pairs(Path(options.pairs), names)
+    )
+    if len(usable) < 2:
+        why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
+        raise UserError(f"{images}: {len(usable)} usable image, at least 2 are needed{why}")
+    if intrinsics is not None:
+        check_fits(intrinsics, {image.name: image.size for image in usable})
+    weights = load_weights()
+    identity = {
+        "version": importlib.metadata.version("jaxsfm"),
+        "weights": weights.sha256,
+        "config": dataclasses.asdict(config),
+        "seed": options.seed,
+        "images": {image.name: image.sha256 for image in usable},
+    }
+    seconds: dict[str, float] = {}
+    with open_folder(out, identity) as folder:
+        by_name = {image.name: image for image in usable}
+        pairs = [pair for pair in pairs if pair[0] in by_name and pair[1] in by_name]
+        with _timed(seconds, "extraction"):
+            results = {p: r for p in pairs if (r := folder.load_matches(p)) is not None}
+            missing = [pair for pair in pairs if pair not in results]
+            skipped |= _extract(folder, weights, by_name, missing, config, options)
+            missing = [pair for pair in missing if not skipped.keys() & set(pair)]
+        with _timed(seconds, "matching"):
+            for pair in _bar(missing, "matching", "pair", options):
+                result = _match(folder, weights, by_name, pair, config, options.seed)
+                folder.save_matches(result)
+                results[pair] = result
+        with _timed(seconds, "mapping"):
+            good = [image for image in usable if image.name not in skipped]
+            chosen = _choose(results, options.best_pairs)
+            map_options = colmap.MapOptions(
+                mapper=options.mapper,
+                refine_intrinsics=_refines(options),
+                seed=options.seed,
+                threads=options.threads,
+                scale=_pixel_scale(good, config),
+            )
+            with tqdm(
+                total=len(good), desc="mapping", unit="image", disable=not options.progress
+            ) as bar:
+                models = reconstruct(
+                    good,
+                    {pair: results[pair] for pair in chosen},
+                    folder.path / "database.db",
+                    intrinsics=intrinsics,
+                    options=map_options,
+                    on_image=lambda: bar.update() and None,
+                )
+            for model in models:
+                _colour(model, by_name, config)
+            colmap.write_models(models, folder.path / "sparse")
+        figures = [model_figures(model) for model in models]
+        verified = colmap.verified_counts(folder.path / "database.db")
+        report: dict[str, Any] = {
+            "version": identity["version"],
+            "options": {
+                "config": identity["config"],
+                **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
+            },
+            "images": {"found": len(names), "usable": len(good), "skipped": skipped},
+            "pairs": {
+                "tried": len(results),
+                "verified": sum(r.num_inliers > 0 for r in results.values()),
+                "handed_on": len(chosen),
+                "overflowed": sum(r.num_dropped > 0 for r in results.values()),
+                "each": [_pair_figures(r, chosen, verified) for _, r in sorted(results.items())],
+            },
+            "models": figures,
+            "lost": lost_images(
+                [image.name for image in good],
+                figures[0]["images"] if figures else [],
+                results,
+                verified,
+            ),
+            "seconds": seconds,
+        }
+        if reference is not None and models:
+            report["evaluation"] = evaluate(model_poses(models[0]), reference).as_dict()
+        text = json.dumps(report, indent=1, default=str)
+        write_atomic(folder.path / "report.json", text.encode())
+        folder.drop_features()
+        return report
+
+
+def _check_options(options: RunOptions) -> None:
+    if options.best_pairs is not None and options.best_pairs < 1:
+        raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
+    if not 0 <= options.seed < 2**31:
+        raise UserError(f"--seed must lie in 0 .. 2147483647; got {options.seed}")
+    if options.threads == 0 or options.threads < -1:
+        raise UserError(f"--threads must be positive, or -1 for all; got {options.threads}")
+
+
+def _refines(options: RunOptions) -> bool:
+    if options.refine_intrinsics == "auto":
+        return options.intrinsics is None
+    return options.refine_intrinsics == "yes"
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.monotonic()
+    yield
+    seconds[stage] = time.monotonic() - start
+
+
+def _bar(items: Iterable[T], stage: str, unit: str, options: RunOptions) -> "tqdm[T]":
+    return tqdm(items, desc=stage, unit=unit, disable=not options.progress)
+
+
+def _extract(
+    folder: WorkFolder,
+    weights: Weights,
+    images: dict[str, ImageFile],
+    pairs: list[Pair],
+    config: Config,
+    options: RunOptions,
+) -> dict[str, str]:
+    """Features of every image of `pairs` that has none yet; why some have none."""
+    needed = sorted({name for pair in pairs for name in pair})
+    todo = [images[name] for name in needed if not folder.has_features(images[name])]
+    skipped = {}
+    weights = on_device(weights) if todo else weights
+    for image in _bar(todo, "extraction", "image", options):
+        try:
+            folder.save_features(image_features(weights, image, config=config))
+        except ImageError as error:
+            skipped[image.name] = str(error)
+    return skipped
+
+
+def _match(
+    folder: WorkFolder,
+    weights: Weights,
+    images: dict[str, ImageFile],
+    pair: Pair,
+    config: Config,
+    seed: int,
+) -> PairResult:
+    features = []
+    for name in pair:
+        found = folder.load_features(images[name])
+        if found is None:  # damaged or deleted under us: it is only a cache
+            found = image_features(weights, images[name], config=config)
+            folder.save_features(found)
+        features.append(found)
+    return match_features(features[0], features[1], config=config, seed=seed)
+
+
+def _choose(results: dict[Pair, PairResult], n: int | None) -> set[Pair]:
+    counts = {pair: result.num_inliers for pair, result in results.items()}
+    if n is None:
+        return {pair for pair, count in counts.items() if count}
+    return best_pairs(counts, n)
+
+
+def _pixel_scale(images: list[ImageFile], config: Config) -> float:
+    """Median of original pixels per working pixel: localisation errors grow with it."""
+    return float(np.median([max(1.0, max(i.size) / config.max_size) for i in images]))
+
+
+def _colour(model: Any, images: dict[str, ImageFile], config: Config) -> None:
+    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        working = read_image(images[name], max_size=config.max_size)
+        return working.rgb, working.scale
+
+    colmap.colour_points(model, read)
+
+
+def _pair_figures(
+    result: PairResult, chosen: set[Pair], verified: dict[Pair, int]
+) -> dict[str, Any]:
+    return {
+        "pair": list(result.pair),
+        "status": result.status.name.lower(),
+        "tentative": result.num_tentative,
+        "inliers": result.num_inliers,
+        "planes": len(result.homographies),
+        "handed_on": result.pair in chosen,
+        "colmap_inliers": verified.get(result.pair, 0),
+    }
