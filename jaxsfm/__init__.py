@@ -52,7 +52,6 @@ _HOME = {
     "RunOptions": "run",
     "run_folder": "run",
 }
-__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> Any:
@@ -63,4 +62,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return sorted(_HOME)

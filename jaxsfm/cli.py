@@ -63,8 +63,8 @@ def reconstruct(
     Args:
       images: Folder with the photos; sub-folders are included.
       out: Folder for the results; a run that was interrupted goes on there.
-      preset: paper: the constants of the authors' code. default: two-way inlier test, iterated
-        refits, the most similar of several matches.
+      preset: paper: the constants of the authors' code. default: iterated refits, the most
+        similar of several matches.
       intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
         model, COLMAP's pixels) for all photos; without it one camera per photo.
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.
@@ -246,7 +246,9 @@ def demo(*, out: Path | None = None, seed: int = 0) -> int:
         seed=seed,
         progress=True,
     )
-    report = run_folder(out / "scene" / "images", out / "run", config=preset("default"), options=options)
+    report = run_folder(
+        out / "scene" / "images", out / "run", config=preset("default"), options=options
+    )
     print("\n".join(summary_lines(report)))
     print(f"files            {out}")
     result = report.get("evaluation")

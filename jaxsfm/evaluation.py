@@ -90,7 +90,7 @@ def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, str]:
-    """Our name -> the reference's: equal names, else equal and unique stems (0000.jpg, 0000.png)."""
+    """Our name -> the reference's: equal names, else equal, unique stems (0000.jpg, 0000.png)."""
     pairs = {name: name for name in ours if name in reference}
     stems: dict[str, list[str]] = {}
     for name in reference:
@@ -144,7 +144,9 @@ def align(ours: np.ndarray, reference: np.ndarray) -> pycolmap.Sim3d:
     return sim
 
 
-def evaluate(model: Poses, reference: Poses, *, align_on: Collection[str] | None = None) -> Evaluation:
+def evaluate(
+    model: Poses, reference: Poses, *, align_on: Collection[str] | None = None
+) -> Evaluation:
     """Errors of a model's poses against reference poses.
 
     Args:

@@ -1,7 +1,7 @@
 """The stages composed: extract -> match -> reconstruct; the only module that runs core and host.
 
-Every stage is a function of its inputs and a config. `jaxsfm.run_folder` strings them together in a work
-folder.
+Every stage is a function of its inputs and a config. `jaxsfm.run_folder` strings them together in a
+work folder.
 """
 
 import dataclasses

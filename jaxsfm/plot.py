@@ -21,7 +21,12 @@ MAX_LINES = 400
 
 
 def draw_matches(
-    rgb0: np.ndarray, rgb1: np.ndarray, result: PairResult, *, scale0: np.ndarray, scale1: np.ndarray
+    rgb0: np.ndarray,
+    rgb1: np.ndarray,
+    result: PairResult,
+    *,
+    scale0: np.ndarray,
+    scale1: np.ndarray,
 ) -> Figure:
     """Two images side by side, matches as dots and lines coloured by plane.
 

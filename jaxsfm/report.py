@@ -108,7 +108,11 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
         best = models[0]
         lines += [
             f"registered       {best['registered']} of {images['usable']} images"
-            + (f" ({len(models)} separate models)" if len(models) > 1 else ""),
+            + (
+                f" (and {len(models) - 1} smaller models)"
+                if len(models) > 1 and best["registered"] < images["usable"]
+                else ""
+            ),
             f"points           {best['points']}, mean track length {best['track_length']:.2f}, "
             f"reprojection error {best['reprojection_error_px']:.2f} px",
         ]

@@ -115,7 +115,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     folder.path / "database.db",
                     intrinsics=intrinsics,
                     options=map_options,
-                    on_image=lambda: bar.update() and None,
+                    on_image=lambda: _advance(bar),
                 )
             for model in models:
                 _colour(model, by_name, config)
@@ -160,6 +160,10 @@ def _check_options(options: RunOptions) -> None:
         raise UserError(f"--seed must lie in 0 .. 2147483647; got {options.seed}")
     if options.threads == 0 or options.threads < -1:
         raise UserError(f"--threads must be positive, or -1 for all; got {options.threads}")
+
+
+def _advance(bar: "tqdm[Any]") -> None:
+    bar.update()
 
 
 def _refines(options: RunOptions) -> bool:

@@ -48,7 +48,7 @@ def mosaic(photos: list[np.ndarray], rows: int, cols: int, *, tile: int = 400) -
 
 
 def room() -> list[TexturedPlane]:
-    """Two walls, a floor and a slanted board; x right, y down, z forward; units of about a metre."""
+    """Two walls, a floor and a slanted board; x right, y down, z forward; units of a metre."""
     a = photo_textures()
     v = lambda *xyz: np.asarray(xyz, float)  # noqa: E731
     return [
@@ -125,9 +125,7 @@ def render(planes: list[TexturedPlane], pose: CameraPose, size: tuple[int, int])
         rows, cols = plane.texture.shape[:2]
         u = np.where(hit, a * cols - 0.5, 0).astype(np.float32)
         v = np.where(hit, b * rows - 0.5, 0).astype(np.float32)
-        colour = cv2.remap(
-            plane.texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        colour = cv2.remap(plane.texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         image[hit] = colour[hit]
         nearest[hit] = depth[hit]
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

@@ -25,9 +25,7 @@ RADIUS = 1
 SIDE = 2 * (2 * RADIUS + 1)
 """Fine cells along a window."""
 _WINDOW = tuple((r, c) for r in range(SIDE) for c in range(SIDE))
-_CENTRES = tuple(
-    (dr, dc) for dr in range(-RADIUS, RADIUS + 1) for dc in range(-RADIUS, RADIUS + 1)
-)
+_CENTRES = tuple((dr, dc) for dr in range(-RADIUS, RADIUS + 1) for dc in range(-RADIUS, RADIUS + 1))
 
 
 def window_cells(
@@ -60,9 +58,7 @@ def _match_windows(
     row_score, row_best = argmax_first(s, axis=2)
     _, col_best = argmax_first(s, axis=1)
     partner = jax.vmap(mutual)(row_best, row_score, col_best)
-    return jnp.where(
-        partner >= 0, jnp.take_along_axis(index1, jnp.maximum(partner, 0), axis=1), -1
-    )
+    return jnp.where(partner >= 0, jnp.take_along_axis(index1, jnp.maximum(partner, 0), axis=1), -1)
 
 
 def match_windows(
@@ -91,9 +87,7 @@ def match_windows(
     return lax.while_loop(lambda s: s[0] * chunk < count, body, (jnp.int32(0), table))[1]
 
 
-def candidates(
-    windows: Int[Array, "n w"], f0: DenseFeatures
-) -> Int[Array, "m slots"]:
+def candidates(windows: Int[Array, "n w"], f0: DenseFeatures) -> Int[Array, "m slots"]:
     """The distinct partners of every fine cell of image 0, ascending, then -1.
 
     Args:
@@ -112,9 +106,7 @@ def candidates(
     last = jnp.iinfo(jnp.int32).max
     table = jnp.stack(slots, axis=1)
     table = jnp.sort(jnp.where(table < 0, last, table), axis=1)
-    repeated = jnp.concatenate(
-        [jnp.zeros((m, 1), bool), table[:, 1:] == table[:, :-1]], axis=1
-    )
+    repeated = jnp.concatenate([jnp.zeros((m, 1), bool), table[:, 1:] == table[:, :-1]], axis=1)
     return jnp.where(repeated | (table == last), -1, table)
 
 

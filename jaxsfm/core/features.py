@@ -1,4 +1,4 @@
-"""One image -> DenseFeatures: pyramid, descriptors of two layers, a keypoint for every fine cell."""
+"""One image -> DenseFeatures: descriptors of two layers and a keypoint for every fine cell."""
 
 import functools
 
@@ -53,7 +53,9 @@ def dense_features(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("preprocessing", "num_coarse", "num_fine", "relocalized"))
+@functools.partial(
+    jax.jit, static_argnames=("preprocessing", "num_coarse", "num_fine", "relocalized")
+)
 def extract(
     params: dict,
     image: UInt8[Array, "h w 3"],
@@ -67,6 +69,7 @@ def extract(
     """DenseFeatures of one RGB image, padded at the bottom and on the right beyond `size`."""
     x = preprocess(image, preprocessing)[None]
     pyramid = VGG16().apply(params, x, size[None])
+    assert isinstance(pyramid, Pyramid)
     return dense_features(
         pyramid, size, num_coarse=num_coarse, num_fine=num_fine, relocalized=relocalized
     )

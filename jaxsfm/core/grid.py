@@ -6,6 +6,7 @@ half-pixel centres. COLMAP's files put the same point at (0.5, 0.5); the adapter
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 COARSE_STRIDE = 16
@@ -17,7 +18,9 @@ def cell_to_px(cell_xy: Float[Array, "*n 2"], *, stride: int) -> Float[Array, "*
     return (cell_xy + 0.5) * stride - 0.5
 
 
-def rescale(xy: Float[Array, "*n 2"], scale_xy: Float[Array, " 2"]) -> Float[Array, "*n 2"]:
+def rescale(
+    xy: Float[Array | np.ndarray, "*n 2"], scale_xy: Float[Array | np.ndarray, " 2"]
+) -> Float[Array | np.ndarray, "*n 2"]:
     """Coordinates after resizing an image by `scale_xy` (new size / old size, per axis)."""
     return (xy + 0.5) * scale_xy - 0.5
 

@@ -158,5 +158,3 @@ def inliers(
     if not two_way:
         return forward
     return forward & transfer_inliers(orient(adjugate(h)), xy1, xy0, threshold0)
-
-

@@ -24,7 +24,7 @@ def unit(x: Float[Array, "*batch c"]) -> Float[Array, "*batch c"]:
     return jnp.where(square > 0, x * lax.rsqrt(safe), 0.0)
 
 
-def argmax_first(x: Float[Array, "r c"], *, axis: int) -> tuple[Array, Array]:
+def argmax_first(x: Float[Array, "*shape"], *, axis: int) -> tuple[Array, Array]:
     """Maximum and the lowest index that reaches it.
 
     Two vectorised reductions instead of one (value, index) reduction, which XLA compiles to

@@ -22,11 +22,11 @@ from jaxsfm.core.types import Planes, PRNGKey, Thresholds
 
 
 class _Problem(NamedTuple):
-    """Normalised correspondences of one plane search: the first `count` rows are live."""
+    """Normalised correspondences of one plane search: the first `num_live` rows count."""
 
     xy0: Float[Array, "k 2"]
     xy1: Float[Array, "k 2"]
-    count: Int[Array, ""]
+    num_live: Int[Array, ""]
     threshold0: Float[Array, ""]
     threshold1: Float[Array, ""]
 
@@ -42,7 +42,7 @@ def sample_indices(key: PRNGKey, num: int, count: Int[Array, ""]) -> Int[Array, 
         earlier = jnp.sort(jnp.stack(drawn, axis=1), axis=1) if drawn else None
         for j in range(i):
             assert earlier is not None
-            x = x + (x >= earlier[:, j])
+            x = x + (x >= earlier[:, j]).astype(x.dtype)
         drawn.append(x)
     return jnp.stack(drawn, axis=1)
 
@@ -64,7 +64,7 @@ def hypotheses_needed(
 
 def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
     xy0, xy1 = problem.xy0, problem.xy1
-    live = jnp.arange(xy0.shape[0]) < problem.count
+    live = jnp.arange(xy0.shape[0]) < problem.num_live
     return live & hg.inliers(
         h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way
     )
@@ -84,14 +84,12 @@ def count_inliers(
         xy1 = lax.dynamic_slice(problem.xy1, (start, 0), (chunk, 2))
         index = start + jnp.arange(chunk)
         # The last chunk is moved back to fit: count only what no earlier chunk has counted.
-        live = (index >= i * chunk) & (index < problem.count)
-        hit = hg.inliers(
-            h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way
-        )
+        live = (index >= i * chunk) & (index < problem.num_live)
+        hit = hg.inliers(h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way)
         return i + 1, counts + jnp.sum(hit & live, axis=1, dtype=jnp.int32)
 
     start = (jnp.int32(0), jnp.zeros((h.shape[0],), jnp.int32))
-    return lax.while_loop(lambda s: s[0] * chunk < problem.count, body, start)[1]
+    return lax.while_loop(lambda s: s[0] * chunk < problem.num_live, body, start)[1]
 
 
 def _refit(h: Array, num: Array, problem: _Problem, shape: PairShape) -> tuple[Array, Array]:
@@ -125,7 +123,7 @@ def _one_plane(
 
     def body(state):
         step, h, num, needed = state
-        index = sample_indices(jax.random.fold_in(key, step), step_size, problem.count)
+        index = sample_indices(jax.random.fold_in(key, step), step_size, problem.num_live)
         batch, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
         counts = jnp.where(valid, count_inliers(batch, problem, shape=shape), 0)
         best = jnp.argmax(counts)
@@ -138,7 +136,7 @@ def _one_plane(
 
     def _improve(h, num):
         h, num = _refit(h, num, problem, shape)
-        return h, num, hypotheses_needed(num, problem.count, thresholds.confidence)
+        return h, num, hypotheses_needed(num, problem.num_live, thresholds.confidence)
 
     start = (jnp.int32(0), jnp.eye(3), jnp.int32(0), jnp.float32(jnp.inf))
     step, h, num, _ = lax.while_loop(more, body, start)

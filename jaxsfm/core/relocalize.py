@@ -20,7 +20,7 @@ FACTOR = 2
 
 
 def flat_pyramid(
-    maps: list[Float[Array, "?h ?w ?c"]],
+    maps: list[Float[Array, "_h _w _c"]],
 ) -> tuple[Float[Array, " total"], Int[Array, "levels 2"]]:
     """Squared descriptor norms of feature maps in one vector, and (offset, width) of each map.
 

@@ -70,7 +70,9 @@ def _checked_matches(
     for side, name in enumerate(result.pair):
         cells = tables[name][0]
         index = np.searchsorted(cells, result.cells[:, side])
-        if len(index) and (index.max() >= len(cells) or (cells[index] != result.cells[:, side]).any()):
+        if len(index) and (
+            index.max() >= len(cells) or (cells[index] != result.cells[:, side]).any()
+        ):
             raise ValueError(f"pair {describe(result.pair)}: a match has no keypoint")
         if len(np.unique(index)) != len(index):
             raise ValueError(f"pair {describe(result.pair)}: a keypoint is matched twice")
@@ -250,7 +252,8 @@ def build_models(
     if failure:
         raise failure[0]
     return sorted(
-        models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids()))
+        models.values(),
+        key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
     )
 
 
@@ -268,7 +271,8 @@ def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
 
 
 def colour_points(
-    model: pycolmap.Reconstruction, read_rgb: Callable[[str], tuple[np.ndarray, tuple[float, float]]]
+    model: pycolmap.Reconstruction,
+    read_rgb: Callable[[str], tuple[np.ndarray, tuple[float, float]]],
 ) -> None:
     """Give every 3-D point the mean colour of its observations, in place.
 

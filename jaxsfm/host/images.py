@@ -19,9 +19,7 @@ from jaxsfm.errors import UserError
 
 logger = logging.getLogger(__name__)
 
-SUFFIXES = frozenset(
-    ".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split()
-)
+SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split())
 MAX_DECODED_PIXELS = 250_000_000
 """Decoding more than this (0.75 GB) is refused, or done at reduced size where the format can."""
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION

