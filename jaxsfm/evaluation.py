@@ -7,10 +7,9 @@ the paper's night protocol aligns on day cameras and scores the night camera (se
 import dataclasses
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import pycolmap
 
 from jaxsfm.errors import UserError
 from jaxsfm.host.poses import CameraPose, Poses
@@ -118,8 +117,37 @@ def read_names(path: Path) -> list[str]:
     return names
 
 
-def align(ours: np.ndarray, reference: np.ndarray) -> pycolmap.Sim3d:
-    """The similarity that takes our centres to the reference's (least squares, Umeyama 1991).
+class Similarity(NamedTuple):
+    """x -> scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """The similarity that takes `source` to `target` with least squared error.
+
+    pycolmap 4.2's `estimate_sim3d` gives nothing for points on one plane (measured: none of 200
+    random sets), and cameras carried at one height are such points.
+
+    Args:
+      source, target: float64 (n, 3), not on one line.
+
+    Source: Umeyama 1991, equations 40-43.
+    """
+    mean0, mean1 = source.mean(0), target.mean(0)
+    a, b = source - mean0, target - mean1
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.ones(3)
+    sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / (a**2).sum())
+    return Similarity(scale, rotation, mean1 - scale * rotation @ mean0)
+
+
+def align(ours: np.ndarray, reference: np.ndarray) -> Similarity:
+    """The similarity that takes our centres to the reference's.
 
     Args:
       ours, reference: float64 (n, 3).
@@ -138,10 +166,7 @@ def align(ours: np.ndarray, reference: np.ndarray) -> pycolmap.Sim3d:
                 f"--reference: {whose} camera centres lie on one line (or in one place), "
                 "which leaves the alignment undetermined"
             )
-    sim = pycolmap.estimate_sim3d(ours, reference)
-    if sim is None:
-        raise UserError("--reference: the camera centres do not determine an alignment")
-    return sim
+    return umeyama(ours, reference)
 
 
 def evaluate(
@@ -175,11 +200,13 @@ def evaluate(
         np.asarray([model[n].centre for n in chosen]).reshape(-1, 3),
         np.asarray([reference[names[n]].centre for n in chosen]).reshape(-1, 3),
     )
-    turn = sim.rotation.matrix()
     errors = {}
     for name, other in sorted(names.items()):
         ours, truth = model[name], reference[other]
-        moved = CameraPose(ours.rotation @ turn.T, np.asarray(sim * ours.centre))
+        moved = CameraPose(
+            ours.rotation @ sim.rotation.T,
+            sim.scale * sim.rotation @ ours.centre + sim.translation,
+        )
         errors[name] = ImageError(
             position=float(np.linalg.norm(moved.centre - truth.centre)),
             rotation_deg=rotation_angle_deg(moved.rotation, truth.rotation),

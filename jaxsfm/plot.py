@@ -16,7 +16,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.host.pairs import PairResult
 
 COLOURS = ("#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#42d4f4", "#f032e6", "#bfef45")
-MAX_LINES = 400
+MAX_LINES = 60
 """Lines drawn per plane; every match keeps its dot."""
 
 
@@ -53,12 +53,12 @@ def draw_matches(
             LineCollection(
                 list(np.stack([xy0[some], xy1[some]], axis=1)),
                 colors=colour,
-                linewidths=0.4,
-                alpha=0.35,
+                linewidths=0.5,
+                alpha=0.5,
             )
         )
         for xy in (xy0[member], xy1[member]):
-            axes.scatter(xy[:, 0], xy[:, 1], s=1.5, c=colour, linewidths=0)
+            axes.scatter(xy[:, 0], xy[:, 1], s=2.5, c=colour, linewidths=0)
     axes.set_title(f"{result.num_inliers} matches on {len(result.homographies)} planes")
     return figure
 

@@ -129,4 +129,6 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
     ]
     if report.get("evaluation"):
         lines += evaluation_lines(report["evaluation"])
+    if report.get("evaluation_failed"):
+        lines.append(f"not evaluated    {report['evaluation_failed']}")
     return lines

@@ -146,7 +146,10 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             "seconds": seconds,
         }
         if reference is not None and models:
-            report["evaluation"] = evaluate(model_poses(models[0]), reference).as_dict()
+            try:
+                report["evaluation"] = evaluate(model_poses(models[0]), reference).as_dict()
+            except UserError as error:  # the model is there; only its comparison is not
+                report["evaluation_failed"] = str(error)
         text = json.dumps(report, indent=1, default=str)
         write_atomic(folder.path / "report.json", text.encode())
         folder.drop_features()

@@ -38,3 +38,13 @@ def photos() -> list[np.ndarray]:
     from jaxsfm.synthetic import photo_textures
 
     return photo_textures()
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory) -> Path:
+    """Three small views of the room, the middle one at night; K.txt and reference beside them."""
+    folder = tmp_path_factory.mktemp("scene")
+    from jaxsfm.synthetic import write_scene
+
+    write_scene(folder, num_views=3, size=(320, 240))
+    return folder

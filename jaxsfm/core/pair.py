@@ -28,7 +28,8 @@ def pair_key(root: PRNGKey, identity0: int | Array, identity1: int | Array) -> P
     return jax.random.fold_in(jax.random.fold_in(root, jnp.minimum(a, b)), jnp.maximum(a, b))
 
 
-def _match_pair(
+@functools.partial(jax.jit, static_argnames=("shape",))
+def match_pair(
     key: PRNGKey,
     features0: DenseFeatures,
     features1: DenseFeatures,
@@ -36,6 +37,16 @@ def _match_pair(
     *,
     shape: PairShape,
 ) -> PairMatches:
+    """Verified matches of one pair (paper, section 3).
+
+    One compilation per feature capacity and `PairShape`; thresholds and grid sizes are traced.
+    A pair that fails says why in `status`.
+
+    Args:
+      key: from `pair_key`.
+      features0, features1: of the two working images.
+      thresholds: pixels of the working images.
+    """
     num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
     capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
     coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
@@ -72,11 +83,6 @@ def _match_pair(
     )
 
 
-match_pair = functools.partial(jax.jit, static_argnames=("shape",))(_match_pair)
-"""PairMatches of one pair (paper, section 3). Jitted: one compilation per feature capacity and
-`PairShape`; thresholds and grid sizes are traced."""
-
-
 @functools.partial(jax.jit, static_argnames=("shape", "batch_size"))
 def match_pairs(
     keys: PRNGKey,
@@ -95,7 +101,7 @@ def match_pairs(
 
     def one(item):
         key, f0, f1 = item
-        return _match_pair(key, f0, f1, thresholds, shape=shape)
+        return match_pair(key, f0, f1, thresholds, shape=shape)
 
     return lax.map(
         one, (keys, features0, features1), batch_size=batch_size if batch_size > 1 else None

@@ -11,7 +11,6 @@ import pytest
 from strategies import random_homography, rng_of
 
 from jaxsfm.config import PRESETS, Config
-from jaxsfm.core import pair as pair_module
 from jaxsfm.core.pair import match_pair, match_pairs, pair_key
 from jaxsfm.core.types import Status, Thresholds
 from jaxsfm.host.features import capacity, compute_features, pad_features
@@ -157,7 +156,7 @@ def test_a_blank_image_says_too_few_matches(features, key):
 
 def test_one_compilation_serves_all_values(features, key):
     shape = dataclasses.replace(PRESETS["paper"].pair, max_hypotheses=640)
-    run = pair_module.match_pair
+    run = match_pair
     before = run._cache_size()
     for other in features:
         for px in (5.0, 10.0):

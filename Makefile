@@ -1,0 +1,39 @@
+# Everything from a bare Python: each target makes its own environment first.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+comma := ,
+# With an NVIDIA driver on the machine the same commands use the GPU.
+GPU := $(if $(shell command -v nvidia-smi 2>/dev/null),$(comma)cuda)
+WORKERS ?= 2
+
+.PHONY: demo test check lint clean
+
+demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the truth
+	$(BIN)/jaxsfm demo
+
+test: $(VENV)/.dev ## all tests
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+lint: $(VENV)/.dev ## format, style, layers, types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+check: lint test ## what must pass before a commit
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "jaxsfm needs Python 3.11 or newer")'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[demo$(GPU)]'
+	touch $@
+
+$(VENV)/.dev: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --editable '.[dev,demo$(GPU)]'
+	touch $@ $(VENV)/.demo
+
+clean:
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis

