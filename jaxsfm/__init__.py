@@ -4,6 +4,7 @@ The public names below are loaded on first use: `import jaxsfm.core` needs jax a
 """
 
 import importlib
+import zlib  # noqa: F401  before anyone loads pycolmap, whose own zlib else corrupts deflate
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

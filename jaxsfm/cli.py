@@ -9,6 +9,7 @@ import logging
 import os
 import sys
 import tempfile
+import threading
 from pathlib import Path
 from typing import Literal
 
@@ -38,7 +39,11 @@ def _check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -
         return
     if path.suffix.lower() not in suffixes:
         raise UserError(f"{option} {path}: the name must end in {' or '.join(suffixes)}")
-    if path.is_dir() or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+    try:
+        writable = not path.is_dir() and path.parent.is_dir() and os.access(path.parent, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
         raise UserError(f"{option} {path}: cannot be written there")
 
 
@@ -137,23 +142,25 @@ def match(
     from jaxsfm.host.features import image_features
     from jaxsfm.host.images import inspect_image, read_image
     from jaxsfm.host.weights import load_weights
+    from jaxsfm.host.workfolder import atomic_file
     from jaxsfm.pipeline import match_features, on_device
 
     files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
     weights = on_device(load_weights())
     features = [image_features(weights, file, config=config) for file in files]
     result = match_features(features[0], features[1], config=config, seed=seed)
-    np.savez(
-        out,
-        keypoints0=result.keypoints0,
-        keypoints1=result.keypoints1,
-        plane=result.plane,
-        homographies=result.homographies,
-    )
+    with atomic_file(out) as file:
+        np.savez(
+            file,
+            keypoints0=result.keypoints0,
+            keypoints1=result.keypoints1,
+            plane=result.plane,
+            homographies=result.homographies,
+        )
     if plot is not None:
         from jaxsfm.plot import draw_matches, save_figure
 
-        working = [read_image(file, max_size=min(max_size, 1200)) for file in files]
+        working = [read_image(file, max_size=max_size) for file in files]
         figure = draw_matches(
             working[0].rgb,
             working[1].rgb,
@@ -187,6 +194,7 @@ def evaluate(
     _check_writable(json, "--json", (".json",))
     from jaxsfm import evaluation
     from jaxsfm.host.poses import find_model, model_poses, read_model, read_poses
+    from jaxsfm.host.workfolder import write_atomic
     from jaxsfm.report import evaluation_lines
 
     truth = read_poses(reference)
@@ -199,7 +207,7 @@ def evaluate(
         print(f"{name!s:40s} not in the model")
     print("\n".join(evaluation_lines(result)))
     if json is not None:
-        json.write_text(_dump(result), encoding="utf-8")
+        write_atomic(json, _dump(result).encode())
     return 0
 
 
@@ -277,8 +285,11 @@ COMMANDS = {
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit status (2: what was given cannot be used)."""
-    logging.basicConfig(level=logging.INFO, format="jaxsfm: %(message)s", stream=sys.stderr)
-    logging.getLogger("jax").setLevel(logging.ERROR)
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("jaxsfm: %(message)s"))
+    logger = logging.getLogger("jaxsfm")
+    logger.handlers, logger.propagate = [handler], False
+    logger.setLevel(logging.INFO)
     try:
         return tyro.extras.subcommand_cli_from_dict(
             COMMANDS,
@@ -292,11 +303,24 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print(
-            "jaxsfm: interrupted; what was finished is kept: the same command goes on from there",
+            "jaxsfm: interrupted; what reconstruct had finished is kept: the same command goes on "
+            "from there",
             file=sys.stderr,
         )
+        if any(thread.name == "jaxsfm-colmap" for thread in threading.enumerate()):
+            # Native code that did not stop (the global mapper cannot) must not meet the
+            # interpreter's shutdown: it would abort.
+            sys.stdout.flush()
+            os._exit(130)
         return 130
-    except MemoryError:
+    except OSError as error:
+        named = f"{error.filename}: " if error.filename else ""
+        print(f"jaxsfm: {named}{error.strerror or error}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        # XLA's allocator raises its own type; the rest is a fault of ours and keeps its traceback.
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
         print("jaxsfm: out of memory; try a smaller --max-size", file=sys.stderr)
         return 1
 

@@ -108,10 +108,10 @@ def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, s
 def read_names(path: Path) -> list[str]:
     """Image names, one a line; # starts a comment."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"--align-on {path}: cannot be read as text") from error
-    names = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+    names = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
     if not names:
         raise UserError(f"--align-on {path}: no names in it")
     return names

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
+from tqdm import tqdm
 
 from jaxsfm.config import Config
 from jaxsfm.core.grid import rescale
@@ -18,8 +19,8 @@ from jaxsfm.core.pair import match_pair, pair_key
 from jaxsfm.core.types import PairMatches, Status, Thresholds
 from jaxsfm.errors import UserError
 from jaxsfm.host.features import ImageFeatures, image_features, pad_features
-from jaxsfm.host.images import ImageFile, find_images, inspect_image
-from jaxsfm.host.pairs import Pair, PairResult, describe, make_pair
+from jaxsfm.host.images import ImageFile, find_images, inspect_image, read_image
+from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.weights import Weights
 
 if TYPE_CHECKING:
@@ -29,14 +30,15 @@ if TYPE_CHECKING:
     from jaxsfm.host.intrinsics import Intrinsics
 
 
-def open_images(folder: Path) -> tuple[list[ImageFile], dict[str, str]]:
+def open_images(folder: Path, *, progress: bool = False) -> tuple[list[ImageFile], dict[str, str]]:
     """The usable images below a folder, and why each of the others is not.
 
     Raises:
       UserError: no such folder, or no image files in it.
     """
     images, lost = [], {}
-    for name in find_images(folder):
+    names = find_images(folder)
+    for name in tqdm(names, desc="reading", unit="image", delay=2, disable=not progress):
         try:
             images.append(inspect_image(folder / name, name=name))
         except UserError as error:
@@ -141,20 +143,29 @@ def _scale_matrix(scale: tuple[float, float]) -> np.ndarray:
     return np.asarray([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1.0]])
 
 
+def pixel_scale(images: list[ImageFile], *, max_size: int) -> float:
+    """Median of original pixels per working pixel: localisation errors grow with it."""
+    return float(np.median([max(1.0, max(image.size) / max_size) for image in images]))
+
+
 def reconstruct(
     images: list[ImageFile],
     matches: Mapping[Pair, PairResult],
     database: Path,
     *,
+    config: Config,
     intrinsics: "Intrinsics | None" = None,
     options: "MapOptions | None" = None,
     on_image: Callable[[], None] = lambda: None,
 ) -> "list[pycolmap.Reconstruction]":
     """COLMAP models from verified matches, the one with most images first; empty if none.
 
+    COLMAP's pixel thresholds are multiplied by `pixel_scale`; points get the photos' colours.
+
     Args:
       matches: as from `match`.
       database: where to write the COLMAP database; replaced.
+      config: the one the matches were made with.
       intrinsics: one known camera for all images; None takes one camera per photo.
       options: default: incremental, refining the intrinsics unless they are given.
     """
@@ -163,10 +174,17 @@ def reconstruct(
 
     if options is None:
         options = colmap.MapOptions(refine_intrinsics=intrinsics is None)
+    options = dataclasses.replace(options, scale=pixel_scale(images, max_size=config.max_size))
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in images})
-    for pair in matches:
-        if matches[pair].pair != pair:
-            raise ValueError(f"matches of {describe(pair)} are those of {matches[pair].pair}")
     colmap.write_database(database, images, matches, intrinsics)
-    return colmap.build_models(database, options, on_image=on_image)
+    models = colmap.build_models(database, options, on_image=on_image)
+    by_name = {image.name: image for image in images}
+
+    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        working = read_image(by_name[name], max_size=config.max_size)
+        return working.rgb, working.scale
+
+    for model in models:
+        colmap.colour_points(model, read)
+    return models

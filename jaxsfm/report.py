@@ -52,7 +52,7 @@ def lost_images(
             stage, detail = "too few matches", f"at most {tentative} tentative matches in a pair"
         elif not any(r.status == Status.VERIFIED for r in own):
             stage, detail = "no plane", f"{tentative} tentative matches, no homography among them"
-        elif not edges or name not in connected:
+        elif not edges or (registered and name not in connected):
             stage = "not connected"
             detail = (
                 f"{inliers} inliers in its best pair, {len(edges)} pairs verified by COLMAP, "
@@ -109,7 +109,7 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
         lines += [
             f"registered       {best['registered']} of {images['usable']} images"
             + (
-                f" (and {len(models) - 1} smaller models)"
+                f" (and {len(models) - 1} smaller model{'s' * (len(models) > 2)})"
                 if len(models) > 1 and best["registered"] < images["usable"]
                 else ""
             ),

@@ -7,9 +7,8 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-import numpy as np
 from tqdm import tqdm
 
 from jaxsfm.config import Config
@@ -17,14 +16,17 @@ from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host import colmap
 from jaxsfm.host.features import image_features
-from jaxsfm.host.images import ImageError, ImageFile, find_images, read_image
-from jaxsfm.host.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.host.images import ImageError, ImageFile
+from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.pairs import Pair, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.host.workfolder import WorkFolder, open_folder, write_atomic
 from jaxsfm.pipeline import match_features, on_device, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures
+
+if TYPE_CHECKING:
+    import pycolmap
 
 T = TypeVar("T")
 
@@ -62,16 +64,14 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     _check_options(options)
     reference = read_poses(options.reference) if options.reference else None
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
-    usable, skipped = open_images(images)
-    names = find_images(images)
+    usable, skipped = open_images(images, progress=options.progress)
+    names = [*(image.name for image in usable), *skipped]
     pairs = (
         exhaustive_pairs(image.name for image in usable)
         if options.pairs == "exhaustive"
         else read_pairs(Path(options.pairs), names)
     )
-    if len(usable) < 2:
-        why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
-        raise UserError(f"{images}: {len(usable)} usable image, at least 2 are needed{why}")
+    _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
     weights = load_weights()
@@ -84,76 +84,97 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     }
     seconds: dict[str, float] = {}
     with open_folder(out, identity) as folder:
-        by_name = {image.name: image for image in usable}
+        known_bad = folder.unusable()
+        skipped |= {i.name: known_bad[i.sha256] for i in usable if i.sha256 in known_bad}
+        by_name = {image.name: image for image in usable if image.name not in skipped}
         pairs = [pair for pair in pairs if pair[0] in by_name and pair[1] in by_name]
         with _timed(seconds, "extraction"):
             results = {p: r for p in pairs if (r := folder.load_matches(p)) is not None}
             missing = [pair for pair in pairs if pair not in results]
             skipped |= _extract(folder, weights, by_name, missing, config, options)
             missing = [pair for pair in missing if not skipped.keys() & set(pair)]
+            good = [image for image in usable if image.name not in skipped]
+            _check_enough(images, good, skipped)
         with _timed(seconds, "matching"):
             for pair in _bar(missing, "matching", "pair", options):
                 result = _match(folder, weights, by_name, pair, config, options.seed)
                 folder.save_matches(result)
                 results[pair] = result
-        with _timed(seconds, "mapping"):
-            good = [image for image in usable if image.name not in skipped]
+        with folder.publish() as fresh:
             chosen = _choose(results, options.best_pairs)
-            map_options = colmap.MapOptions(
+            with _timed(seconds, "mapping"):
+                handed_on = {pair: results[pair] for pair in chosen}
+                models = _map(fresh, good, handed_on, intrinsics, config, options)
+            verified = colmap.verified_counts(fresh / "database.db")
+            figures = [model_figures(model) for model in models]
+            report: dict[str, Any] = {
+                "version": identity["version"],
+                "options": {
+                    "config": identity["config"],
+                    **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
+                },
+                "images": {"found": len(names), "usable": len(good), "skipped": skipped},
+                "pairs": {
+                    "tried": len(results),
+                    "verified": sum(r.num_inliers > 0 for r in results.values()),
+                    "handed_on": len(chosen),
+                    "overflowed": sum(r.num_dropped > 0 for r in results.values()),
+                    "each": [
+                        _pair_figures(r, chosen, verified) for _, r in sorted(results.items())
+                    ],
+                },
+                "models": figures,
+                "lost": lost_images(
+                    [image.name for image in good],
+                    figures[0]["images"] if figures else [],
+                    results,
+                    verified,
+                ),
+                "seconds": seconds,
+            }
+            if reference is not None and models:
+                try:
+                    report["evaluation"] = evaluate(model_poses(models[0]), reference).as_dict()
+                except UserError as error:  # the model is there; only its comparison is not
+                    report["evaluation_failed"] = str(error)
+            text = json.dumps(report, indent=1, default=str)
+            write_atomic(fresh / "report.json", text.encode())
+        folder.drop_features()
+        return report
+
+
+def _map(
+    fresh: Path,
+    images: list[ImageFile],
+    matches: dict[Pair, PairResult],
+    intrinsics: Intrinsics | None,
+    config: Config,
+    options: RunOptions,
+) -> "list[pycolmap.Reconstruction]":
+    """Database and models, written into `fresh`."""
+    with tqdm(total=len(images), desc="mapping", unit="image", disable=not options.progress) as bar:
+
+        def on_image() -> None:
+            bar.update(bar.n < len(images))  # several models may share images
+
+        models = reconstruct(
+            images,
+            matches,
+            fresh / "database.db",
+            config=config,
+            intrinsics=intrinsics,
+            options=colmap.MapOptions(
                 mapper=options.mapper,
                 refine_intrinsics=_refines(options),
                 seed=options.seed,
                 threads=options.threads,
-                scale=_pixel_scale(good, config),
-            )
-            with tqdm(
-                total=len(good), desc="mapping", unit="image", disable=not options.progress
-            ) as bar:
-                models = reconstruct(
-                    good,
-                    {pair: results[pair] for pair in chosen},
-                    folder.path / "database.db",
-                    intrinsics=intrinsics,
-                    options=map_options,
-                    on_image=lambda: _advance(bar),
-                )
-            for model in models:
-                _colour(model, by_name, config)
-            colmap.write_models(models, folder.path / "sparse")
-        figures = [model_figures(model) for model in models]
-        verified = colmap.verified_counts(folder.path / "database.db")
-        report: dict[str, Any] = {
-            "version": identity["version"],
-            "options": {
-                "config": identity["config"],
-                **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
-            },
-            "images": {"found": len(names), "usable": len(good), "skipped": skipped},
-            "pairs": {
-                "tried": len(results),
-                "verified": sum(r.num_inliers > 0 for r in results.values()),
-                "handed_on": len(chosen),
-                "overflowed": sum(r.num_dropped > 0 for r in results.values()),
-                "each": [_pair_figures(r, chosen, verified) for _, r in sorted(results.items())],
-            },
-            "models": figures,
-            "lost": lost_images(
-                [image.name for image in good],
-                figures[0]["images"] if figures else [],
-                results,
-                verified,
             ),
-            "seconds": seconds,
-        }
-        if reference is not None and models:
-            try:
-                report["evaluation"] = evaluate(model_poses(models[0]), reference).as_dict()
-            except UserError as error:  # the model is there; only its comparison is not
-                report["evaluation_failed"] = str(error)
-        text = json.dumps(report, indent=1, default=str)
-        write_atomic(folder.path / "report.json", text.encode())
-        folder.drop_features()
-        return report
+            on_image=on_image,
+        )
+        if models:
+            bar.update(models[0].num_reg_images() - bar.n)  # the global mapper tells at the end
+    colmap.write_models(models, fresh / "sparse")
+    return models
 
 
 def _check_options(options: RunOptions) -> None:
@@ -165,8 +186,10 @@ def _check_options(options: RunOptions) -> None:
         raise UserError(f"--threads must be positive, or -1 for all; got {options.threads}")
 
 
-def _advance(bar: "tqdm[Any]") -> None:
-    bar.update()
+def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:
+    if len(images) < 2:
+        why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
+        raise UserError(f"{folder}: {len(images)} usable images, at least 2 are needed{why}")
 
 
 def _refines(options: RunOptions) -> bool:
@@ -203,6 +226,7 @@ def _extract(
         try:
             folder.save_features(image_features(weights, image, config=config))
         except ImageError as error:
+            folder.mark_unusable(image, str(error))
             skipped[image.name] = str(error)
     return skipped
 
@@ -230,19 +254,6 @@ def _choose(results: dict[Pair, PairResult], n: int | None) -> set[Pair]:
     if n is None:
         return {pair for pair, count in counts.items() if count}
     return best_pairs(counts, n)
-
-
-def _pixel_scale(images: list[ImageFile], config: Config) -> float:
-    """Median of original pixels per working pixel: localisation errors grow with it."""
-    return float(np.median([max(1.0, max(i.size) / config.max_size) for i in images]))
-
-
-def _colour(model: Any, images: dict[str, ImageFile], config: Config) -> None:
-    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        working = read_image(images[name], max_size=config.max_size)
-        return working.rgb, working.scale
-
-    colmap.colour_points(model, read)
 
 
 def _pair_figures(

@@ -351,3 +351,69 @@ def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
     assert main(["reconstruct", str(folder), "--out", str(tmp_path / "out")]) == 1
     captured = capsys.readouterr()
     assert "no model" in captured.err and "0.png" in captured.out
+
+
+def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("jaxsfm.host.features.total_memory", lambda: 10_000_000)
+    images = [scene / "images" / n for n in ("view0.png", "view2.png")]
+    refuse(capsys, ["match", *images, "--out", tmp_path / "m.npz"], "view0.png", "--max-size")
+    args = ["match", *map(str, images), "--out", str(tmp_path / "m.npz"), "--max-size", "64"]
+    assert main(args) == 0
+    args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
+    assert main(args) == 2
+    error = capsys.readouterr().err
+    assert "view0.png" in error and "--max-size" in error and "Traceback" not in error
+
+
+def test_running_out_of_memory_is_one_sentence(scene, tmp_path, monkeypatch, capsys):
+    def exhausted(*args, **kwargs):
+        raise RuntimeError("RESOURCE_EXHAUSTED: out of memory allocating 1 TB")
+
+    monkeypatch.setattr("jaxsfm.run.match_features", exhausted)
+    args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
+    assert main(args) == 1
+    error = capsys.readouterr().err
+    assert "--max-size" in error and "Traceback" not in error
+
+
+def test_remapping_without_success_keeps_the_earlier_model(scene, tmp_path, capsys):
+    out = tmp_path / "out"
+    run(scene, out, "--intrinsics", scene / "K.txt")
+    before = {p: p.read_bytes() for p in (out / "sparse").rglob("*.bin")}
+    report = (out / "report.json").read_bytes()
+    args = ["reconstruct", scene / "images", "--out", out, "--intrinsics", "SIMPLE_PINHOLE:9,1,1"]
+    assert main([str(a) for a in args]) == 1
+    assert "the earlier one stays" in capsys.readouterr().err
+    assert {p: p.read_bytes() for p in (out / "sparse").rglob("*.bin")} == before
+    assert (out / "report.json").read_bytes() == report
+    assert json.loads((out / "failed" / "report.json").read_text())["models"] == []
+
+
+def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "photos"
+    shutil.copytree(scene / "images", folder)
+    data = (folder / "view0.png").read_bytes()
+    (folder / "bad.png").write_bytes(data[: len(data) // 2])
+    run(scene, tmp_path / "out", images=folder)
+    monkeypatch.setattr("jaxsfm.run.image_features", None)  # calling it would fail
+    report = run(scene, tmp_path / "out", images=folder)
+    assert list(report["images"]["skipped"]) == ["bad.png"]
+
+
+def test_a_panorama_is_matched_and_drawn(scene, tmp_path):
+    view = cv2.imread(str(scene / "images" / "view0.png"))
+    wide = np.concatenate([view[:60]] * 5, axis=1)
+    cv2.imwrite(str(tmp_path / "wide.png"), wide)
+    images = [str(tmp_path / "wide.png")] * 2
+    out, plot = tmp_path / "m.NPZ", tmp_path / "m.png"
+    assert main(["match", *images, "--out", str(out), "--plot", str(plot)]) == 0
+    assert out.exists() and plot.exists()
+
+
+@pytest.mark.parametrize("option", ["--out", "--intrinsics", "--reference", "--pairs"])
+def test_names_too_long_for_the_system_are_one_sentence(scene, tmp_path, capsys, option):
+    args = {"--out": tmp_path / "out", option: tmp_path / ("x" * 300)}
+    flat = [str(a) for pair in args.items() for a in pair]
+    assert main(["reconstruct", str(scene / "images"), *flat]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("jaxsfm: ") and "x" * 300 in error and "Traceback" not in error

@@ -34,6 +34,7 @@ def test_a_dozen_lines_of_python_do_the_same_as_the_command(tmp_path):
         images,
         matches,
         tmp_path / "database.db",
+        config=config,
         intrinsics=jaxsfm.parse_intrinsics(str(tmp_path / "K.txt")),
     )
     errors = jaxsfm.evaluate(jaxsfm.model_poses(models[0]), truth)
@@ -60,8 +61,8 @@ def test_strecha_cameras_are_recovered_at_half_size(data_folder, tmp_path):
         images,
         matches,
         tmp_path / "database.db",
+        config=config,
         intrinsics=jaxsfm.parse_intrinsics(str(folder / "images" / "K.txt")),
-        options=jaxsfm.MapOptions(refine_intrinsics=False, scale=2.0),
     )
     errors = evaluate(jaxsfm.model_poses(models[0]), jaxsfm.read_poses(folder))
     assert len(errors.images) == len(names)

@@ -127,9 +127,19 @@ def test_poses_that_fix_no_alignment_are_refused(model, truth, message):
         evaluate(model, truth)
 
 
-def test_three_centres_off_a_line_are_enough():
-    truth = on_a_line(3, off=0.1)
+@pytest.mark.parametrize("n", [3, 4, 7])
+@pytest.mark.parametrize("height", [0.0, 3.0])
+def test_centres_in_one_plane_are_enough(n, height):
+    """As of a drone; pycolmap.estimate_sim3d gives None where the plane is exact."""
+    flat = np.asarray([1.0, 1, 0])
+    truth = {k: p._replace(centre=p.centre * flat + [0, 0, height]) for k, p in poses(n).items()}
     assert evaluate(truth, truth).position["max"] < 1e-9
+
+
+def test_a_mirrored_model_is_not_mirrored_back():
+    truth, mirror = poses(), np.asarray([1, 1, -1])
+    model = {name: pose._replace(centre=pose.centre * mirror) for name, pose in truth.items()}
+    assert evaluate(model, truth).position["max"] > 0.1
 
 
 def test_align_on_names_are_the_models_or_the_references_and_known():

@@ -75,3 +75,39 @@ def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
         assert process.wait(60) == 130
     text = log.read_text()
     assert "interrupted" in text and "Traceback" not in text
+
+
+MAP_AND_INTERRUPT = """
+import os, signal, sys, threading, time
+import jaxsfm.cli
+from jaxsfm.host import colmap
+import pycolmap
+
+mapper, path = sys.argv[1:]
+options = pycolmap.SyntheticDatasetOptions(
+    num_rigs=1, num_frames_per_rig=60, num_points3D=4000, num_points2D_without_point3D=0
+)
+with pycolmap.Database.open(path) as db:
+    pycolmap.synthesize_dataset(options, db)
+colmap.verify = lambda *a: None
+
+def interrupt():
+    time.sleep(1)
+    os.kill(os.getpid(), signal.SIGINT)
+
+def weights():
+    threading.Thread(target=interrupt, daemon=True).start()
+    colmap.build_models(path, colmap.MapOptions(mapper=mapper, threads=1))
+
+jaxsfm.cli.COMMANDS["weights"] = weights
+sys.exit(jaxsfm.cli.main(["weights"]))
+"""
+
+
+@pytest.mark.parametrize("mapper", ["incremental", "global"])
+def test_a_signal_during_native_mapping_ends_the_process_cleanly(tmp_path, mapper):
+    """Ctrl-C inside Thread.join let Python 3.11 shut down under running native code: SIGABRT."""
+    command = [sys.executable, "-c", MAP_AND_INTERRUPT, mapper, str(tmp_path / "d.db")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 130, done.stderr
+    assert "interrupted" in done.stderr and "terminate" not in done.stderr

@@ -74,7 +74,7 @@ def test_every_lost_image_names_the_stage_that_lost_it():
 
 def test_without_a_model_no_image_is_called_connected():
     assert {row["stage"] for row in lost([]).values()} >= {"not connected", "no plane", "pairs"}
-    assert lost([])["m0"]["stage"] == "not connected"
+    assert lost([])["m0"]["stage"] == "no pose"
 
 
 def test_registered_images_are_not_lost():
@@ -101,9 +101,14 @@ def test_a_summary_has_the_counts_of_every_stage():
     text = "\n".join(summary_lines(report()))
     for part in ("3 usable of 4", "3 tried, 2 verified, 1 handed", "2 of 3 images", "321", "0.71"):
         assert part in text
-    assert "warning" not in text and "separate" not in text and "reference" not in text
-    assert "2 separate models" in "\n".join(summary_lines(report(models=[MODEL, MODEL])))
+    assert "warning" not in text and "smaller" not in text and "reference" not in text
+    assert "and 1 smaller model" in "\n".join(summary_lines(report(models=[MODEL, MODEL])))
     assert "none: no model" in "\n".join(summary_lines(report(models=[])))
+
+
+def test_a_failed_evaluation_is_said():
+    lines = summary_lines(report(evaluation_failed="no common images"))
+    assert lines[-1] == "not evaluated    no common images"
 
 
 def test_overflow_and_evaluation_are_said():

@@ -3,9 +3,9 @@
 Everything is checked here first: a match index out of range ends the process in native code, and
 unset options fail silently. Pixels get their +0.5 here and nowhere else.
 
-cv2 is imported before pycolmap on purpose: with pycolmap loaded first, PNG writing by libraries
-that link zlib corrupts the heap (measured with pycolmap 4.2.1 and Pillow 13). For the same reason
-this package never writes a PNG through Pillow.
+zlib and cv2 are imported before pycolmap on purpose: pycolmap 4.2.1 brings a zlib of its own, and
+where it is loaded first every later deflate (zlib.compress, PNG by OpenCV or Pillow) corrupts the
+heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so; it is not used.
 """
 
 import dataclasses
@@ -21,12 +21,14 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import ImageFile
+from jaxsfm.host.images import ImageError, ImageFile, shown_name
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.pairs import Pair, PairResult, describe
 
 pycolmap.logging.minloglevel = 3
 
+THREAD = "jaxsfm-colmap"
+"""Name of the thread COLMAP runs in."""
 Mapper = Literal["incremental", "global"]
 PIXEL_OFFSET = np.float32(0.5)
 """COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
@@ -98,7 +100,10 @@ def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Came
                 params=[1.2 * max(width, height), width / 2, height / 2, 0.0],
             )
     if not camera.verify_params():
-        raise UserError(f"--intrinsics: COLMAP does not accept {camera.model_name} {camera.params}")
+        raise UserError(
+            f"{shown_name(image.name)}: COLMAP does not accept the camera {camera.model_name} "
+            f"{camera.params}"
+        )
     return camera
 
 
@@ -116,6 +121,12 @@ def write_database(
     Raises:
       ValueError: inconsistent results (nothing is written).
     """
+    for pair, result in results.items():
+        if pair != result.pair:
+            raise ValueError(f"pair {describe(pair)} holds the result of {describe(result.pair)}")
+        n = result.num_inliers
+        if not (result.cells.shape == result.keypoints0.shape == result.keypoints1.shape == (n, 2)):
+            raise ValueError(f"pair {describe(pair)}: cells and keypoints must be {n} x 2")
     tables = keypoint_tables(results.values())
     names = {image.name: image for image in images}
     if unknown := sorted(tables.keys() - names.keys()):
@@ -185,6 +196,8 @@ def _incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOpt
     p.mapper.init_max_error *= options.scale
     p.mapper.abs_pose_max_error *= options.scale
     p.mapper.filter_max_reproj_error *= options.scale
+    p.triangulation.complete_max_reproj_error *= options.scale
+    p.triangulation.merge_max_reproj_error *= options.scale
     return p
 
 
@@ -214,6 +227,7 @@ def build_models(
     token = pycolmap.CancellationToken()
     models: dict[int, pycolmap.Reconstruction] = {}
     failure: list[BaseException] = []
+    done = threading.Event()
 
     def work(scratch: str) -> None:
         try:
@@ -227,7 +241,7 @@ def build_models(
                         scratch,
                         scratch,
                         _incremental_options(options),
-                        initial_image_pair_callback=on_image,
+                        initial_image_pair_callback=lambda: (on_image(), on_image()) and None,
                         next_image_callback=on_image,
                         cancellation_token=token,
                     )
@@ -238,17 +252,22 @@ def build_models(
                 )
         except BaseException as error:
             failure.append(error)
+        finally:
+            done.set()
 
-    with tempfile.TemporaryDirectory() as scratch:
-        thread = threading.Thread(target=work, args=(scratch,), daemon=True)
-        thread.start()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        threading.Thread(target=work, args=(scratch,), name=THREAD, daemon=True).start()
         try:
-            while thread.is_alive():
-                thread.join(0.2)
+            # Not Thread.join: Ctrl-C inside it makes Python 3.11 take the thread for ended, and the
+            # process then aborts under the native code that still runs.
+            while not done.wait(0.2):
+                pass
         except KeyboardInterrupt:
             token.cancel()
-            thread.join(30)
+            done.wait(30 if options.mapper == "incremental" else 1)  # the global one has no token
             raise
+    if failure and isinstance(failure[0], RuntimeError):
+        raise UserError(f"{database}: COLMAP failed ({failure[0]}); the matches are kept")
     if failure:
         raise failure[0]
     return sorted(
@@ -259,15 +278,11 @@ def build_models(
 
 def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
     """`folder`/0 the best model, 1, 2, ... the others; what was there before goes."""
-    fresh = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(fresh, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
     for index, model in enumerate(models):
-        target = fresh / str(index)
+        target = folder / str(index)
         target.mkdir(parents=True)
         model.write_binary(target)
-    shutil.rmtree(folder, ignore_errors=True)
-    if models:
-        fresh.rename(folder)
 
 
 def colour_points(
@@ -282,7 +297,10 @@ def colour_points(
     total: dict[int, np.ndarray] = {}
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
-        rgb, scale = read_rgb(image.name)
+        try:
+            rgb, scale = read_rgb(image.name)
+        except ImageError:  # the photo went away since; its points keep the others' colours
+            continue
         for point in image.points2D:
             if point.has_point3D():
                 x, y = np.floor(point.xy / np.asarray(scale)).astype(int)

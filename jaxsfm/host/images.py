@@ -4,10 +4,14 @@ EXIF orientation is ignored, because COLMAP 4.2 ignores it (measured): the pixel
 stored, so keypoints, intrinsics and COLMAP's own tools agree.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import logging
+import os
+import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -65,17 +69,26 @@ class WorkingImage:
 
 def find_images(folder: Path) -> list[str]:
     """Names of the image files below a folder, sorted; sub-folders included, hidden ones not."""
-    if not folder.exists():
-        raise UserError(f"{folder}: no such folder")
-    if not folder.is_dir():
-        raise UserError(f"{folder}: not a folder")
-    names = [
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.suffix.lower() in SUFFIXES
-        and path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
+    try:
+        if not folder.exists():
+            raise UserError(f"{folder}: no such folder")
+        if not folder.is_dir():
+            raise UserError(f"{folder}: not a folder")
+        os.listdir(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
+
+    def unreadable(error: OSError) -> None:
+        logger.warning("%s: skipped, cannot be read (%s)", error.filename, error.strerror)
+
+    names = []
+    for root, folders, files in os.walk(folder, onerror=unreadable):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        names += [
+            (Path(root) / name).relative_to(folder).as_posix()
+            for name in files
+            if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
+        ]
     if not names:
         raise UserError(f"{folder}: no images here (looked for {', '.join(sorted(SUFFIXES))})")
     return sorted(names)
@@ -89,18 +102,20 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     """
     shown = shown_name(name or str(path))
     try:
+        (name or path.name).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise ImageError(f"{shown}: the file name is not UTF-8, which COLMAP needs") from error
+    try:
         data = path.read_bytes()
     except OSError as error:
         raise ImageError(f"{shown}: cannot be read ({error.strerror})") from error
     if not data:
         raise ImageError(f"{shown}: the file is empty")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # size warnings: we set our own limit
+        with warnings.catch_warnings(), _any_size():
+            warnings.simplefilter("ignore")  # odd metadata; only the size is wanted
             with Image.open(path) as header:
                 size = header.size
-    except Image.DecompressionBombError as error:
-        raise ImageError(f"{shown}: too large to read ({error})") from error
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
         raise ImageError(f"{shown}: not a readable image") from error
     if min(size) < MIN_SIDE:
@@ -114,13 +129,52 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
 
 def shown_name(name: str) -> str:
     """A file name that stays on one line in messages."""
-    return name.encode("unicode_escape").decode() if not name.isprintable() else name
+    return name if name.isprintable() else name.encode("unicode_escape").decode()
+
+
+_SCAN_END = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+
+
+def _jpeg_is_complete(data: bytes) -> bool:
+    """Whether the end marker follows the last scan; what a camera appends after it is ignored.
+
+    Source: ITU-T T.81, B.1: segments carry their length, entropy-coded data end at the next marker
+    that is neither a stuffed zero nor a restart.
+    """
+    position = 2
+    while position + 4 <= len(data):
+        if data[position] != 0xFF:
+            return False
+        marker = data[position + 1]
+        if marker == 0xD9:
+            return True
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
+            position += 1 if marker == 0xFF else 2
+            continue
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == 0xDA:
+            end = _SCAN_END.search(data, position)
+            if end is None:
+                return False
+            position = end.start()
+    return data[position : position + 2] == b"\xff\xd9"
 
 
 def _check_complete(data: bytes, shown: str) -> None:
-    """A JPEG must end after its last scan: decoders fill what is missing with grey, silently."""
-    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+    """Decoders fill what is missing of a JPEG with grey, silently: refuse it here."""
+    if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
         raise ImageError(f"{shown}: the file is truncated")
+
+
+@contextlib.contextmanager
+def _any_size() -> Iterator[None]:
+    """Let Pillow read the header of any image: we set our own limit on decoding."""
+    limit = Image.MAX_IMAGE_PIXELS
+    Image.MAX_IMAGE_PIXELS = None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
 
 
 def _decode(image: ImageFile) -> np.ndarray:

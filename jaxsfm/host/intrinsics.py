@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.images import shown_name
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,7 +72,7 @@ def parse_intrinsics(text: str) -> Intrinsics:
       UserError: what is wrong, naming the option.
     """
     model, colon, params = text.partition(":")
-    models = {name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"}
+    models = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
     if not colon or model not in models:
         path = Path(text)
         if path.is_file():
@@ -106,7 +107,8 @@ def check_fits(intrinsics: Intrinsics, sizes: dict[str, tuple[int, int]]) -> Non
         by_size.setdefault(size, []).append(name)
     if len(by_size) > 1:
         shown = "; ".join(
-            f"{w} x {h}: {len(names)} (e.g. {names[0]})" for (w, h), names in by_size.items()
+            f"{w} x {h}: {len(names)} (e.g. {shown_name(names[0])})"
+            for (w, h), names in by_size.items()
         )
         raise UserError(f"--intrinsics describe one camera, but the images differ in size: {shown}")
     for width, height in by_size:

@@ -67,6 +67,8 @@ def _split(line: str, known: set[str]) -> Pair | None:
 def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
     """Pairs from a text file: two names a line, by a blank or a tab; # starts a comment.
 
+    Names may hold blanks; names with a newline, or with # first, cannot be written in such a file.
+
     Args:
       known: the image folder's names.
 
@@ -75,7 +77,7 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
     """
     names = set(known)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"--pairs {path}: cannot be read as text") from error
     pairs = set()

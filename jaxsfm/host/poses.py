@@ -42,13 +42,16 @@ def _read_strecha(path: Path) -> CameraPose:
     if len(values) < 24 or not np.isfinite(values).all():
         raise UserError(f"{path}: not a Strecha camera file (expected at least 24 finite numbers)")
     rotation = np.asarray(values[12:21]).reshape(3, 3).T
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-        raise UserError(f"{path}: its rotation is not orthonormal")
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise UserError(f"{path}: its rotation is not one")
     return CameraPose(rotation, np.asarray(values[21:24]))
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """The COLMAP model (binary or text) in a folder."""
+    points = path / "points3D.bin"
+    if points.is_file() and points.stat().st_size < 8:  # COLMAP would allocate without end
+        raise UserError(f"{path}: not a readable COLMAP model")
     try:
         return pycolmap.Reconstruction(path)
     except Exception as error:  # native errors of several kinds; the text is long and technical

@@ -16,7 +16,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
@@ -30,21 +30,38 @@ logger = logging.getLogger(__name__)
 
 MEMORY_BYTES = 2 << 30
 """Features kept in memory; the others are read again from the folder."""
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+RESULTS = ("report.json", "sparse", "database.db")
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile)
+
+
+@contextlib.contextmanager
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """A file to write that appears whole or not at all.
+
+    Raises:
+      UserError: it cannot be written (permission, disk full).
+    """
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with partial.open("wb") as file:
+            yield file
+        os.replace(partial, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def write_atomic(path: Path, data: bytes) -> None:
     """Write a file that is either whole or absent."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    os.replace(partial, path)
+    with atomic_file(path) as file:
+        file.write(data)
 
 
 def _save_npz(path: Path, arrays: dict[str, Any]) -> None:
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
+    path.parent.mkdir(exist_ok=True)
+    with atomic_file(path) as file:
         np.savez(file, **arrays)
-    os.replace(partial, path)
 
 
 class WorkFolder:
@@ -61,9 +78,7 @@ class WorkFolder:
 
     def save_features(self, features: ImageFeatures) -> None:
         arrays = {**features.dense._asdict(), "scale": np.asarray(features.scale, np.float64)}
-        path = self._feature_path(features.image)
-        path.parent.mkdir(exist_ok=True)
-        _save_npz(path, arrays)
+        _save_npz(self._feature_path(features.image), arrays)
         self._remember(features)
 
     def has_features(self, image: ImageFile) -> bool:
@@ -75,7 +90,10 @@ class WorkFolder:
             self._cache.move_to_end(image.name)
             return self._cache[image.name]
         try:
-            with np.load(self._feature_path(image), allow_pickle=False) as file:
+            with (
+                self._feature_path(image).open("rb") as raw,
+                np.load(raw, allow_pickle=False) as file,
+            ):
                 dense = DenseFeatures(*(file[name] for name in DenseFeatures._fields))
                 scale = file["scale"]
         except _DAMAGED:
@@ -97,6 +115,51 @@ class WorkFolder:
         self._cache.clear()
         shutil.rmtree(self.path / "features", ignore_errors=True)
 
+    # -- photos that could not be decoded ------------------------------------------------------
+
+    def unusable(self) -> dict[str, str]:
+        """SHA-256 -> reason of the photos an earlier attempt could not decode."""
+        try:
+            record = json.loads((self.path / "unusable.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return record if isinstance(record, dict) else {}
+
+    def mark_unusable(self, image: ImageFile, reason: str) -> None:
+        """Remember a photo that cannot be decoded, so that going on does not try again."""
+        record = {**self.unusable(), image.sha256: reason}
+        write_atomic(self.path / "unusable.json", json.dumps(record, indent=1).encode())
+
+    # -- results ---------------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def publish(self) -> Iterator[Path]:
+        """A folder for new results; when it is complete they replace the old ones together.
+
+        Results without a model do not replace results with one: they are left in `failed`.
+        """
+        fresh = self.path / "fresh"
+        shutil.rmtree(fresh, ignore_errors=True)
+        fresh.mkdir()
+        yield fresh
+        target = self.path
+        if (self.path / "sparse").exists() and not (fresh / "sparse").exists():
+            target = self.path / "failed"
+            logger.warning(
+                "no model this time: the earlier one stays; this report is in %s", target
+            )
+            target.mkdir(exist_ok=True)
+        for name in RESULTS:  # the report goes first and comes last: it never tells of other files
+            old = target / name
+            if old.is_dir():
+                shutil.rmtree(old)
+            else:
+                old.unlink(missing_ok=True)
+        for name in reversed(RESULTS):
+            if (fresh / name).exists():
+                (fresh / name).rename(target / name)
+        fresh.rmdir()
+
     # -- matches ---------------------------------------------------------------------------------
 
     def _match_path(self, pair: Pair) -> Path:
@@ -104,10 +167,8 @@ class WorkFolder:
         return self.path / "matches" / f"{digest[:32]}.npz"
 
     def save_matches(self, result: PairResult) -> None:
-        path = self._match_path(result.pair)
-        path.parent.mkdir(exist_ok=True)
         _save_npz(
-            path,
+            self._match_path(result.pair),
             {
                 "cells": result.cells,
                 "keypoints0": result.keypoints0,
@@ -123,7 +184,7 @@ class WorkFolder:
     def load_matches(self, pair: Pair) -> PairResult | None:
         """The saved matches, or None if there are none (or they are damaged)."""
         try:
-            with np.load(self._match_path(pair), allow_pickle=False) as file:
+            with self._match_path(pair).open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 tentative, dropped, status = (int(v) for v in file["counts"])
                 return PairResult(
                     pair=pair,
@@ -140,19 +201,66 @@ class WorkFolder:
             return None
 
 
+_OPTIONS = {"max_size": "--max-size", "keypoints": "--keypoints", "seed": "--seed"}
+
+
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> str:
+    """What differs, in the user's terms."""
     parts = []
     for key in sorted(old.keys() | new.keys()):
-        if old.get(key) != new.get(key):
-            if key == "images":
-                before, now = old.get(key, {}), new.get(key, {})
-                changed = sorted(
-                    n for n in before.keys() | now.keys() if before.get(n) != now.get(n)
-                )
-                parts.append(f"{len(changed)} images, first {changed[0]!r}")
-            else:
-                parts.append(f"{key}: {old.get(key)} there, {new.get(key)} now")
+        before, now = old.get(key), new.get(key)
+        if before == now:
+            continue
+        if isinstance(before, dict) and isinstance(now, dict) and key == "images":
+            changed = sorted(n for n in before.keys() | now.keys() if before.get(n) != now.get(n))
+            parts.append(f"{len(changed)} images, first {changed[0]!r}")
+        elif isinstance(before, dict) and isinstance(now, dict):
+            parts.append(_differences(before, now))
+        else:
+            parts.append(f"{_OPTIONS.get(key, key)}: {before} there, {now} now")
     return "; ".join(parts)
+
+
+def _prepare(path: Path) -> TextIO:
+    """Make the folder, or see that it is one of ours; its lock file, open."""
+    try:
+        if path.exists() and not path.is_dir():
+            raise UserError(f"--out {path}: is a file, not a folder")
+        if path.is_dir() and not (path / "run.json").exists():
+            ours = {".lock", "run.json.partial"}
+            strangers = sorted(p.name for p in path.iterdir() if p.name not in ours)
+            if strangers:
+                raise UserError(
+                    f"--out {path}: not empty and not a jaxsfm run (it holds {strangers[0]!r}); "
+                    "choose an empty or new folder"
+                )
+        path.mkdir(parents=True, exist_ok=True)
+        return (path / ".lock").open("w")
+    except OSError as error:
+        raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
+
+
+def _check_identity(path: Path, identity: dict[str, Any]) -> None:
+    """Record what the run is of, or refuse a folder whose record says otherwise."""
+    record = path / "run.json"
+    if not record.exists():
+        write_atomic(record, json.dumps(identity, indent=1).encode())
+        return
+    try:
+        old = json.loads(record.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        old = None
+    if not isinstance(old, dict):
+        raise UserError(
+            f"--out {path}: holds another run, whose run.json is damaged; "
+            "choose another folder or delete this one"
+        )
+    if old != identity:
+        raise UserError(
+            f"--out {path}: holds another run ({_differences(old, identity)}); "
+            "choose another folder or delete this one"
+        )
+    logger.info("continuing the run in %s", path)
 
 
 @contextlib.contextmanager
@@ -165,41 +273,10 @@ def open_folder(path: Path, identity: dict[str, Any]) -> Iterator[WorkFolder]:
     Raises:
       UserError: a file, not writable, in use, or another run's.
     """
-    identity = json.loads(json.dumps(identity))
-    if path.exists() and not path.is_dir():
-        raise UserError(f"--out {path}: is a file, not a folder")
-    record = path / "run.json"
-    try:
-        if path.is_dir() and not record.exists():
-            strangers = sorted(p.name for p in path.iterdir() if p.name != ".lock")
-            if strangers:
-                raise UserError(
-                    f"--out {path}: not empty and not a jaxsfm run (it holds {strangers[0]!r}); "
-                    "choose an empty or new folder"
-                )
-        path.mkdir(parents=True, exist_ok=True)
-        lock = (path / ".lock").open("w")
-    except OSError as error:
-        raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
-    with lock:
+    with _prepare(path) as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise UserError(f"--out {path}: another run is using this folder") from error
-        try:
-            if record.exists():
-                try:
-                    old = json.loads(record.read_text(encoding="utf-8"))
-                except ValueError:
-                    old = {}
-                if old != identity:
-                    raise UserError(
-                        f"--out {path}: holds another run ({_differences(old, identity)}); "
-                        "choose another folder or delete this one"
-                    )
-                logger.info("continuing the run in %s", path)
-            else:
-                write_atomic(record, json.dumps(identity, indent=1).encode())
-            yield WorkFolder(path)
-        except OSError as error:
-            raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
+        _check_identity(path, json.loads(json.dumps(identity)))
+        yield WorkFolder(path)

@@ -1,0 +1,73 @@
+"""What the tests of the COLMAP adapter share."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+import pytest
+
+from jaxsfm.core.types import Status
+from jaxsfm.host.images import ImageFile
+from jaxsfm.host.intrinsics import Intrinsics
+from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
+
+SIZE = (1024, 768)
+KNOWN = Intrinsics(model="PINHOLE", params=(1280.0, 1280.0, 512.0, 384.0))
+NAMES = ["a b.png", "b\tc.png", "new\nline.png", "sub/日本.png", "z.png"]
+
+
+class Scene(NamedTuple):
+    """Five views of 150 points, exact; odd image names; the files do not exist."""
+
+    truth: pycolmap.Reconstruction
+    names: list[str]
+    images: list[ImageFile]
+    results: dict[Pair, PairResult]
+    """Every pair with the points both see; a cell is the point's number."""
+    known: Intrinsics
+
+
+def _truth() -> pycolmap.Reconstruction:
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1,
+        num_frames_per_rig=len(NAMES),
+        num_points3D=150,
+        num_points2D_without_point3D=0,
+        camera_model_id=pycolmap.CameraModelId.PINHOLE,
+        camera_params=list(KNOWN.params),
+    )
+    model = pycolmap.synthesize_dataset(options)
+    for image_id, name in zip(sorted(model.reg_image_ids()), NAMES, strict=True):
+        model.image(image_id).name = name
+    return model
+
+
+def _results(truth: pycolmap.Reconstruction) -> dict[Pair, PairResult]:
+    seen = {
+        image.name: {p.point3D_id: p.xy - 0.5 for p in image.points2D}
+        for image in truth.images.values()
+    }
+    found = {}
+    for a, b in exhaustive_pairs(NAMES):
+        cells = np.asarray(sorted(seen[a].keys() & seen[b].keys()), np.int32)
+        found[a, b] = PairResult(
+            pair=(a, b),
+            cells=np.stack([cells, cells], axis=1),
+            keypoints0=np.asarray([seen[a][c] for c in cells], np.float32),
+            keypoints1=np.asarray([seen[b][c] for c in cells], np.float32),
+            plane=np.zeros(len(cells), np.int32),
+            homographies=np.eye(3)[None],
+            num_tentative=len(cells),
+            num_dropped=0,
+            status=Status.VERIFIED,
+        )
+    return found
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory) -> Scene:
+    nowhere = tmp_path_factory.mktemp("images")
+    images = [ImageFile(name=n, path=nowhere / n, size=SIZE, sha256=64 * "0") for n in NAMES]
+    truth = _truth()
+    return Scene(truth, NAMES, images, _results(truth), KNOWN)

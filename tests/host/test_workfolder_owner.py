@@ -1,0 +1,107 @@
+"""A run's folder has one owner at a time and never another run's files."""
+
+import json
+import os
+
+import pytest
+
+from jaxsfm.errors import UserError
+from jaxsfm.host.workfolder import open_folder, write_atomic
+
+IDENTITY = {"seed": 0, "version": "1", "images": {"a.jpg": "00", "b.jpg": "11"}}
+
+
+def test_the_same_run_goes_on_where_it_was(tmp_path):
+    out = tmp_path / "deep" / "out"
+    with open_folder(out, IDENTITY) as folder:
+        (folder.path / "mine").write_text("x")
+    with open_folder(out, dict(reversed(IDENTITY.items()))) as folder:
+        assert (folder.path / "mine").read_text() == "x"
+
+
+def test_identity_is_compared_as_json(tmp_path):
+    for value in ((1, 2), [1, 2]):
+        with open_folder(tmp_path, {"size": value}):
+            pass
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 1}, "seed: 0 there, 1 now"),
+        ({"version": "2"}, "version: 1 there, 2 now"),
+        ({"extra": 5}, "extra: None there, 5 now"),
+        ({"images": {"a.jpg": "00", "b.jpg": "22"}}, "1 images, first 'b.jpg'"),
+        ({"images": {"b.jpg": "11", "c.jpg": "33"}}, "2 images, first 'a.jpg'"),
+    ],
+)
+def test_another_run_is_refused_with_the_difference(tmp_path, change, message):
+    with open_folder(tmp_path, IDENTITY):
+        (tmp_path / "mine").write_text("x")
+    before = (tmp_path / "run.json").read_bytes()
+    with pytest.raises(UserError, match="holds another run") as error:
+        with open_folder(tmp_path, {**IDENTITY, **change}):
+            pytest.fail("opened")
+    assert message in str(error.value) and str(tmp_path) in str(error.value)
+    assert (tmp_path / "run.json").read_bytes() == before
+    assert (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("record", ["", "{", "[]", "null", '{"images": []}', "\x00"])
+def test_a_damaged_record_is_refused_not_overwritten(tmp_path, record):
+    (tmp_path / "run.json").write_text(record)
+    with pytest.raises(UserError, match="holds another run"):
+        with open_folder(tmp_path, IDENTITY):
+            pytest.fail("opened")
+    assert (tmp_path / "run.json").read_text() == record
+
+
+def test_a_second_run_in_the_same_folder_is_refused_until_the_first_ends(tmp_path):
+    with open_folder(tmp_path, IDENTITY):
+        with pytest.raises(UserError, match="another run is using this folder"):
+            with open_folder(tmp_path, IDENTITY):
+                pytest.fail("opened")
+    with open_folder(tmp_path, IDENTITY):
+        pass
+
+
+def test_a_file_or_a_foreign_folder_is_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.tex").write_text("x")
+    for name, message in (("file", "is a file"), ("thesis", "not empty .*'chapter1.tex'")):
+        with pytest.raises(UserError, match=f"{name}: {message}"):
+            with open_folder(tmp_path / name, IDENTITY):
+                pytest.fail("opened")
+    assert [path.name for path in (tmp_path / "thesis").iterdir()] == ["chapter1.tex"]
+
+
+def test_an_empty_folder_becomes_a_run(tmp_path):
+    with open_folder(tmp_path, IDENTITY):
+        assert json.loads((tmp_path / "run.json").read_text()) == IDENTITY
+
+
+def test_a_place_that_cannot_be_written_is_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UserError, match="cannot be written"):
+        with open_folder(tmp_path / "file" / "out", IDENTITY):
+            pytest.fail("opened")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes anywhere")
+def test_a_read_only_parent_is_refused(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(UserError, match="cannot be written"):
+        with open_folder(tmp_path / "out", IDENTITY):
+            pytest.fail("opened")
+
+
+def test_a_full_disk_is_reported_as_such_and_leaves_no_partial_file(tmp_path, monkeypatch):
+    def full(*args):
+        raise OSError(28, os.strerror(28))
+
+    with open_folder(tmp_path, IDENTITY):
+        monkeypatch.setattr(os, "replace", full)
+        with pytest.raises(UserError, match="a.json: cannot be written .No space left"):
+            write_atomic(tmp_path / "a.json", b"{}")
+    assert not list(tmp_path.glob("a.json*"))
