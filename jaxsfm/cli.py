@@ -17,6 +17,7 @@ import tyro
 
 from jaxsfm.config import Config, Keypoints, preset
 from jaxsfm.errors import UserError
+from jaxsfm.host import interrupt
 
 Positional = tyro.conf.Positional
 Preset = Literal["paper", "default"]
@@ -291,13 +292,14 @@ def main(argv: list[str] | None = None) -> int:
     logger.handlers, logger.propagate = [handler], False
     logger.setLevel(logging.INFO)
     try:
-        return tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="jaxsfm",
-            description="Structure-from-Motion from dense VGG-16 features with relocalization.",
-            args=argv,
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
+        with interrupt.noted():
+            return tyro.extras.subcommand_cli_from_dict(
+                COMMANDS,
+                prog="jaxsfm",
+                description="Structure-from-Motion from dense VGG-16 features with relocalization.",
+                args=argv,
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
     except UserError as error:
         print(f"jaxsfm: {error}", file=sys.stderr)
         return 2

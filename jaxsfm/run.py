@@ -14,7 +14,7 @@ from tqdm import tqdm
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.host import colmap
+from jaxsfm.host import colmap, interrupt
 from jaxsfm.host.features import image_features
 from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
@@ -205,8 +205,11 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = time.monotonic() - start
 
 
-def _bar(items: Iterable[T], stage: str, unit: str, options: RunOptions) -> "tqdm[T]":
-    return tqdm(items, desc=stage, unit=unit, disable=not options.progress)
+def _bar(items: Iterable[T], stage: str, unit: str, options: RunOptions) -> Iterator[T]:
+    for item in tqdm(items, desc=stage, unit=unit, disable=not options.progress):
+        interrupt.check()
+        yield item
+    interrupt.check()
 
 
 def _extract(

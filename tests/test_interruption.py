@@ -1,5 +1,6 @@
 """Ctrl-C in each stage: nothing computed is lost, and the same command goes on."""
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -61,6 +62,23 @@ def test_an_interrupted_run_goes_on_where_it_was(
     for name in ("images.bin", "points3D.bin"):
         one, two = (tmp_path / run / "sparse" / "0" / name for run in ("whole", "cut"))
         assert one.read_bytes() == two.read_bytes()
+
+
+def test_an_interrupt_that_a_callback_swallowed_still_ends_the_run(
+    scene, tmp_path, monkeypatch, capsys
+):
+    """Like JAX's garbage collector hook, which Python lets print and forget the exception."""
+    original = jaxsfm.run.image_features
+
+    def swallowing(*args, **kwargs):
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(jaxsfm.run, "image_features", swallowing)
+    assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert len(list((tmp_path / "out" / "features").iterdir())) == 1
 
 
 def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):

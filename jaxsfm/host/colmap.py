@@ -21,6 +21,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
+from jaxsfm.host import interrupt
 from jaxsfm.host.images import ImageError, ImageFile, shown_name
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.pairs import Pair, PairResult, describe
@@ -261,7 +262,8 @@ def build_models(
             # Not Thread.join: Ctrl-C inside it makes Python 3.11 take the thread for ended, and the
             # process then aborts under the native code that still runs.
             while not done.wait(0.2):
-                pass
+                interrupt.check()
+            interrupt.check()
         except KeyboardInterrupt:
             token.cancel()
             done.wait(30 if options.mapper == "incremental" else 1)  # the global one has no token
