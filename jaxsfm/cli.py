@@ -8,7 +8,6 @@ import json
 import logging
 import os
 import sys
-import tempfile
 import threading
 from pathlib import Path
 from typing import Literal
@@ -21,10 +20,6 @@ from jaxsfm.host import interrupt
 
 Positional = tyro.conf.Positional
 Preset = Literal["paper", "default"]
-
-DEMO_MAX_POSITION = 0.02
-"""Stated mean position error of the demo, units (metres) of its room."""
-DEMO_MAX_ROTATION_DEG = 0.25
 
 
 def _config(name: str, max_size: int, keypoints: Keypoints) -> Config:
@@ -239,40 +234,11 @@ def demo(*, out: Path | None = None, seed: int = 0) -> int:
       out: Folder for the scene and the results; default: a new one under the temporary folder.
       seed: Of the scene's noise and of the reconstruction.
     """
-    from jaxsfm.report import summary_lines
-    from jaxsfm.run import RunOptions, run_folder
-    from jaxsfm.synthetic import write_scene
+    from jaxsfm.demo import run_demo
 
-    if out is None:
-        out = Path(tempfile.mkdtemp(prefix="jaxsfm-demo-"))
-    try:
-        truth = write_scene(out / "scene", seed=seed)
-    except OSError as error:
-        raise UserError(f"--out {out}: cannot be written ({error.strerror})") from error
-    options = RunOptions(
-        intrinsics=str(out / "scene" / "K.txt"),
-        reference=out / "scene" / "reference",
-        seed=seed,
-        progress=True,
-    )
-    report = run_folder(
-        out / "scene" / "images", out / "run", config=preset("default"), options=options
-    )
-    print("\n".join(summary_lines(report)))
-    print(f"files            {out}")
-    result = report.get("evaluation")
-    good = (
-        result is not None
-        and result["registered"] == len(truth)
-        and result["position"]["mean"] <= DEMO_MAX_POSITION
-        and result["rotation_deg"]["mean"] <= DEMO_MAX_ROTATION_DEG
-    )
-    print(
-        f"demo {'passed' if good else 'FAILED'}: synthetic scene; required {len(truth)} of "
-        f"{len(truth)} cameras, mean errors at most {DEMO_MAX_POSITION} units and "
-        f"{DEMO_MAX_ROTATION_DEG} deg"
-    )
-    return 0 if good else 1
+    lines, passed = run_demo(out, seed=seed)
+    print("\n".join(lines))
+    return 0 if passed else 1
 
 
 COMMANDS = {
