@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from jaxsfm.errors import UserError as UserError
     from jaxsfm.evaluation import Evaluation as Evaluation
     from jaxsfm.evaluation import evaluate as evaluate
-    from jaxsfm.host.colmap import MapOptions as MapOptions
     from jaxsfm.host.intrinsics import parse_intrinsics as parse_intrinsics
+    from jaxsfm.host.mapping import MapOptions as MapOptions
     from jaxsfm.host.pairs import PairResult as PairResult
     from jaxsfm.host.pairs import best_pairs as best_pairs
     from jaxsfm.host.pairs import exhaustive_pairs as exhaustive_pairs
@@ -37,7 +37,7 @@ _HOME = {
     "UserError": "errors",
     "Evaluation": "evaluation",
     "evaluate": "evaluation",
-    "MapOptions": "host.colmap",
+    "MapOptions": "host.mapping",
     "parse_intrinsics": "host.intrinsics",
     "PairResult": "host.pairs",
     "best_pairs": "host.pairs",

@@ -14,17 +14,33 @@ from typing import Literal
 
 import tyro
 
-from jaxsfm.config import Config, Keypoints, preset
+from jaxsfm.config import Config, Keypoints, Refinement, preset
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 
 Positional = tyro.conf.Positional
 Preset = Literal["paper", "default"]
+Switch = Literal["preset", "yes", "no"]
+Method = Literal["rootsift", "grid", "reloc", "default"]
 
 
-def _config(name: str, max_size: int, keypoints: Keypoints) -> Config:
+def _config(
+    name: str,
+    max_size: int,
+    keypoints: Keypoints,
+    view_graph: Switch = "preset",
+    refine: int | None = None,
+) -> Config:
     try:
-        return dataclasses.replace(preset(name), max_size=max_size, keypoints=keypoints)
+        config = dataclasses.replace(preset(name), max_size=max_size, keypoints=keypoints)
+        if view_graph != "preset":
+            config = dataclasses.replace(config, view_graph=view_graph == "yes")
+        if refine is not None:
+            if refine < 0:
+                raise ValueError(f"refine must be at least 0; got {refine}")
+            passes = Refinement(passes=refine) if refine else None
+            config = dataclasses.replace(config, refinement=passes)
+        return config
     except ValueError as error:
         raise UserError(f"--{str(error).replace('_', '-', 1)}") from error
 
@@ -52,6 +68,8 @@ def reconstruct(
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto",
     pairs: str = "exhaustive",
     best_pairs: int | None = None,
+    view_graph: Switch = "preset",
+    refine: int | None = None,
     max_size: int = 1600,
     keypoints: Keypoints = "relocalized",
     mapper: Literal["incremental", "global"] = "incremental",
@@ -65,12 +83,15 @@ def reconstruct(
       images: Folder with the photos; sub-folders are included.
       out: Folder for the results; a run that was interrupted goes on there.
       preset: paper: the constants of the authors' code. default: iterated refits, the most
-        similar of several matches.
+        similar of several matches, view graph, two passes of refinement.
       intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
         model, COLMAP's pixels) for all photos; without it one camera per photo.
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.
       pairs: exhaustive, or a file with two image names a line.
       best_pairs: Hand on only each image's N pairs with the most inliers.
+      view_graph: Whether to hand on only pairs whose rotations agree with stronger pairs (scenes
+        that repeat themselves).
+      refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
       max_size: Longer side of the working images, pixels.
       keypoints: relocalized, or grid: cell centres (for the ablation).
       mapper: COLMAP's incremental or global mapper.
@@ -78,7 +99,7 @@ def reconstruct(
       threads: Of COLMAP's part; 1 makes the model repeatable to the last byte; -1: all.
       reference: Reference poses (Strecha .camera files or a COLMAP model) to evaluate against.
     """
-    config = _config(preset, max_size, keypoints)
+    config = _config(preset, max_size, keypoints, view_graph, refine)
     from jaxsfm.report import summary_lines
     from jaxsfm.run import RunOptions, run_folder
 
@@ -241,7 +262,54 @@ def demo(*, out: Path | None = None, seed: int = 0) -> int:
     return 0 if passed else 1
 
 
+def bench(
+    what: Positional[Literal["strecha"]],
+    *,
+    root: Path,
+    sets: tuple[str, ...] | None = None,
+    methods: tuple[Method, ...] = ("rootsift", "grid", "reloc", "default"),
+    intrinsics: Literal["known", "unknown"] = "known",
+    json: Path | None = None,
+    out: Path | None = None,
+    seed: int = 0,
+    threads: int = -1,
+) -> int:
+    """Compare our methods with COLMAP's RootSIFT on Strecha sets, in one go.
+
+    Args:
+      what: The benchmark.
+      root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
+      sets: Which of them; default: all.
+      methods: rootsift: COLMAP's own features. grid, reloc: the default preset without refinement,
+        at cell centres or relocalized. default: the default preset.
+      intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
+      json: Write all figures here.
+      out: Keep databases and models here, and go on from what is there.
+      seed: Of everything random.
+      threads: Of COLMAP's part; -1: all.
+    """
+    _check_writable(json, "--json", (".json",))
+    from jaxsfm import bench as benches
+
+    assert what == "strecha"
+    result = benches.bench_strecha(
+        root,
+        sets=sets,
+        methods=methods,
+        known_intrinsics=intrinsics == "known",
+        out=out,
+        seed=seed,
+        threads=threads,
+        progress=True,
+    )
+    print("\n".join(benches.table_lines(result)))
+    if json is not None:
+        benches.write_json(json, result)
+    return 0
+
+
 COMMANDS = {
+    "bench": bench,
     "reconstruct": reconstruct,
     "match": match,
     "evaluate": evaluate,

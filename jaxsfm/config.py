@@ -57,8 +57,45 @@ class PairShape:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """Multi-view keypoint refinement after mapping (`jaxsfm.refine`)."""
+
+    passes: int = 2
+    """Alignment, bundle adjustment and filtering, this many times."""
+    radius: int = 7
+    """Patches are (2 radius + 1)^2 pixels of the working image."""
+    iterations: int = 10
+    """Gauss-Newton steps of an alignment."""
+    min_score: float = 0.8
+    """Least normalised cross-correlation of an observation with its reference patch."""
+    max_sigma_px: float = 0.25
+    """Largest standard deviation of an observation along its worst direction."""
+    max_shift_px: float = 4.0
+    """Furthest an observation may end from where the model puts it; half of it in later passes."""
+    max_error_px: float = 1.0
+    """Largest reprojection error of an observation after bundle adjustment."""
+    min_cosine: float = 0.25
+    """Views steeper than this towards the surface get no new observations (75 deg)."""
+    max_stretch: float = 6.0
+    """Nor views that see the surface at an area scale this far from the reference view's."""
+    neighbours: int = 16
+    """3-D points that give a point its surface normal."""
+
+    def __post_init__(self) -> None:
+        for name in ("passes", "radius", "iterations", "neighbours"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Refinement.{name} must be at least 1; got {getattr(self, name)}")
+        for name in ("max_sigma_px", "max_shift_px", "max_error_px", "max_stretch"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"Refinement.{name} must be positive; got {getattr(self, name)}")
+        for name in ("min_score", "min_cosine"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"Refinement.{name} must lie in [0, 1); got {getattr(self, name)}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:
-    """Everything that decides which matches a pair of images has."""
+    """Everything that decides which matches a pair of images has, and what is made of them."""
 
     max_size: int = 1600
     """Longer side of the working image, pixels; larger images are reduced, never enlarged."""
@@ -71,6 +108,16 @@ class Config:
     confidence: float = 0.999
     """RANSAC stops when a better plane has been missed with less than 1 - confidence."""
     pair: PairShape = dataclasses.field(default_factory=PairShape)
+    view_graph: bool = False
+    """Hand on only pairs that the view graph trusts (`jaxsfm.viewgraph`)."""
+    refinement: Refinement | None = None
+    """None: the mapper's model is the last."""
+
+    def matching(self) -> dict[str, object]:
+        """The part that the matches depend on, as plain data."""
+        parts = dataclasses.asdict(self)
+        del parts["view_graph"], parts["refinement"]
+        return parts
 
     def __post_init__(self) -> None:
         if self.max_size < MIN_SIDE:
@@ -90,11 +137,15 @@ MIN_SIDE = 48
 
 PRESETS: dict[str, Config] = {
     "paper": Config(),
-    "default": Config(pair=PairShape(local_refits=4, one_to_one="similarity")),
+    "default": Config(
+        pair=PairShape(local_refits=4, one_to_one="similarity"),
+        view_graph=True,
+        refinement=Refinement(),
+    ),
 }
 """`paper`: the constants of the authors' code. `default`: local refits iterated (one refit leaves
-up to a fifth of a plane's inliers behind, tests/core/test_ransac.py) and the most similar of a
-cell's several matches."""
+up to a fifth of a plane's inliers behind, tests/core/test_ransac.py), the most similar of a cell's
+several matches, the view graph and the refinement."""
 
 
 def preset(name: str) -> Config:

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from jaxsfm.config import Config
+from jaxsfm.config import Config, Refinement
 from jaxsfm.core.grid import rescale
 from jaxsfm.core.pair import match_pair, pair_key
 from jaxsfm.core.types import PairMatches, Status, Thresholds
@@ -21,13 +21,18 @@ from jaxsfm.errors import UserError
 from jaxsfm.host.features import ImageFeatures, image_features, pad_features
 from jaxsfm.host.images import ImageFile, find_images, inspect_image, read_image
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
+from jaxsfm.host.viewgraph import Verdict, trusted_pairs
 from jaxsfm.host.weights import Weights
 
 if TYPE_CHECKING:
     import pycolmap
 
-    from jaxsfm.host.colmap import MapOptions
     from jaxsfm.host.intrinsics import Intrinsics
+    from jaxsfm.host.mapping import Attempt, MapOptions
+    from jaxsfm.refine import PassFigures
+
+LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
+"""Intensity of an RGB pixel (ITU-R BT.601)."""
 
 
 def open_images(folder: Path, *, progress: bool = False) -> tuple[list[ImageFile], dict[str, str]]:
@@ -148,6 +153,22 @@ def pixel_scale(images: list[ImageFile], *, max_size: int) -> float:
     return float(np.median([max(1.0, max(image.size) / max_size) for image in images]))
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reconstructed:
+    """What became of verified matches."""
+
+    models: "list[pycolmap.Reconstruction]"
+    """The one with most images first; empty if none."""
+    verdicts: dict[Pair, Verdict]
+    """The view graph's, by pair; empty where it is switched off."""
+    verified: dict[Pair, int]
+    """COLMAP's two-view inliers of the pairs the mapper was given."""
+    attempts: "list[Attempt]"
+    """Runs of the mapper."""
+    passes: "list[list[PassFigures]]"
+    """Of the refinement, per model."""
+
+
 def reconstruct(
     images: list[ImageFile],
     matches: Mapping[Pair, PairResult],
@@ -157,34 +178,92 @@ def reconstruct(
     intrinsics: "Intrinsics | None" = None,
     options: "MapOptions | None" = None,
     on_image: Callable[[], None] = lambda: None,
-) -> "list[pycolmap.Reconstruction]":
-    """COLMAP models from verified matches, the one with most images first; empty if none.
+    on_pass: Callable[[], None] = lambda: None,
+    on_mapped: Callable[[], None] = lambda: None,
+) -> Reconstructed:
+    """COLMAP models from verified matches: view graph, mapping, refinement.
 
-    COLMAP's pixel thresholds are multiplied by `pixel_scale`; points get the photos' colours.
+    Pixel thresholds are multiplied by `pixel_scale`; points get the photos' colours.
 
     Args:
       matches: as from `match`.
       database: where to write the COLMAP database; replaced.
-      config: the one the matches were made with.
+      config: the one the matches were made with; its `view_graph` and `refinement` switch those
+        stages on.
       intrinsics: one known camera for all images; None takes one camera per photo.
       options: default: incremental, refining the intrinsics unless they are given.
+      on_image, on_mapped, on_pass: told of every registered image, of the end of mapping, of every
+        pass of the refinement.
     """
-    from jaxsfm.host import colmap
+    from jaxsfm.host import colmap, mapping
     from jaxsfm.host.intrinsics import check_fits
 
     if options is None:
-        options = colmap.MapOptions(refine_intrinsics=intrinsics is None)
+        options = mapping.MapOptions(refine_intrinsics=intrinsics is None)
     options = dataclasses.replace(options, scale=pixel_scale(images, max_size=config.max_size))
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in images})
     colmap.write_database(database, images, matches, intrinsics)
-    models = colmap.build_models(database, options, on_image=on_image)
+    colmap.verify(
+        database,
+        seed=options.seed,
+        threads=options.threads,
+        scale=options.scale,
+        relative_poses=config.view_graph,
+    )
+    two_views = colmap.read_two_views(database)
+    verdicts: dict[Pair, Verdict] = {}
+    if config.view_graph:
+        verdicts = trusted_pairs({pair: view.geometry for pair, view in two_views.items()})
+        dropped = [pair for pair, verdict in verdicts.items() if not verdict.trusted]
+        colmap.drop_pairs(database, dropped)
+        for pair in dropped:
+            del two_views[pair]
+    models, attempts = mapping.build_models(database, two_views, options, on_image=on_image)
+    on_mapped()
     by_name = {image.name: image for image in images}
 
     def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
         working = read_image(by_name[name], max_size=config.max_size)
         return working.rgb, working.scale
 
+    passes = []
+    if config.refinement is not None:
+        models, passes = _refine(models, read, config.refinement, options, on_pass)
     for model in models:
         colmap.colour_points(model, read)
-    return models
+    return Reconstructed(
+        models=models,
+        verdicts=verdicts,
+        verified={pair: view.geometry.num_inliers for pair, view in two_views.items()},
+        attempts=attempts,
+        passes=passes,
+    )
+
+
+def _refine(
+    models: "list[pycolmap.Reconstruction]",
+    read: Callable[[str], tuple[np.ndarray, tuple[float, float]]],
+    config: Refinement,
+    options: "MapOptions",
+    on_pass: Callable[[], None],
+) -> "tuple[list[pycolmap.Reconstruction], list[list[PassFigures]]]":
+    from jaxsfm.refine import refine_model
+
+    def gray(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        rgb, scale = read(name)
+        return rgb.astype(np.float32) @ LUMA, scale
+
+    refined, passes = [], []
+    for model in models:
+        new, figures = refine_model(
+            model,
+            gray,
+            config=config,
+            refine_intrinsics=options.refine_intrinsics,
+            threads=options.threads,
+            on_pass=on_pass,
+        )
+        refined.append(new)
+        passes.append(figures)
+    return refined, passes

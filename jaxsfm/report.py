@@ -5,21 +5,7 @@ from typing import Any
 
 from jaxsfm.core.types import Status
 from jaxsfm.host.images import shown_name
-from jaxsfm.host.pairs import Pair, PairResult
-
-
-def component_of(seeds: Iterable[str], edges: Iterable[Pair]) -> set[str]:
-    """All images reachable from `seeds` over `edges`."""
-    neighbours: dict[str, set[str]] = {}
-    for a, b in edges:
-        neighbours.setdefault(a, set()).add(b)
-        neighbours.setdefault(b, set()).add(a)
-    reached, queue = set(seeds), list(seeds)
-    while queue:
-        for name in neighbours.get(queue.pop(), set()) - reached:
-            reached.add(name)
-            queue.append(name)
-    return reached
+from jaxsfm.host.pairs import Pair, PairResult, component_of
 
 
 def lost_images(
@@ -101,7 +87,7 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
     lines = [
         f"images           {images['usable']} usable of {images['found']}",
         f"pairs            {pairs['tried']} tried, {pairs['verified']} verified, "
-        f"{pairs['handed_on']} handed to COLMAP",
+        f"{pairs['handed_on']} handed to COLMAP, {pairs['trusted']} trusted",
     ]
     models = report["models"]
     if models:

@@ -7,26 +7,26 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from tqdm import tqdm
 
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.host import colmap, interrupt
+from jaxsfm.host import interrupt
+from jaxsfm.host.colmap import write_models
 from jaxsfm.host.features import image_features
 from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
+from jaxsfm.host.mapping import MapOptions, Mapper
 from jaxsfm.host.pairs import Pair, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
+from jaxsfm.host.viewgraph import Verdict
 from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.host.workfolder import WorkFolder, open_folder, write_atomic
-from jaxsfm.pipeline import match_features, on_device, open_images, reconstruct
+from jaxsfm.pipeline import Reconstructed, match_features, on_device, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures
-
-if TYPE_CHECKING:
-    import pycolmap
 
 T = TypeVar("T")
 
@@ -43,7 +43,7 @@ class RunOptions:
     """K.txt or MODEL:p1,p2,..; None: one camera per photo."""
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto"
     """`auto` refines them unless they are given."""
-    mapper: colmap.Mapper = "incremental"
+    mapper: Mapper = "incremental"
     seed: int = 0
     threads: int = -1
     reference: Path | None = None
@@ -78,7 +78,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     identity = {
         "version": importlib.metadata.version("jaxsfm"),
         "weights": weights.sha256,
-        "config": dataclasses.asdict(config),
+        "config": config.matching(),
         "seed": options.seed,
         "images": {image.name: image.sha256 for image in usable},
     }
@@ -102,15 +102,14 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 results[pair] = result
         with folder.publish() as fresh:
             chosen = _choose(results, options.best_pairs)
-            with _timed(seconds, "mapping"):
-                handed_on = {pair: results[pair] for pair in chosen}
-                models = _map(fresh, good, handed_on, intrinsics, config, options)
-            verified = colmap.verified_counts(fresh / "database.db")
+            handed_on = {pair: results[pair] for pair in chosen}
+            made = _map(fresh, good, handed_on, intrinsics, config, options, seconds)
+            models, verified = made.models, made.verified
             figures = [model_figures(model) for model in models]
             report: dict[str, Any] = {
                 "version": identity["version"],
                 "options": {
-                    "config": identity["config"],
+                    "config": dataclasses.asdict(config),
                     **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
                 },
                 "images": {"found": len(names), "usable": len(good), "skipped": skipped},
@@ -118,12 +117,16 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     "tried": len(results),
                     "verified": sum(r.num_inliers > 0 for r in results.values()),
                     "handed_on": len(chosen),
+                    "trusted": len(verified),
                     "overflowed": sum(r.num_dropped > 0 for r in results.values()),
                     "each": [
-                        _pair_figures(r, chosen, verified) for _, r in sorted(results.items())
+                        _pair_figures(r, chosen, verified, made.verdicts)
+                        for _, r in sorted(results.items())
                     ],
                 },
                 "models": figures,
+                "mapping": [dataclasses.asdict(attempt) for attempt in made.attempts],
+                "refinement": [[dataclasses.asdict(p) for p in each] for each in made.passes],
                 "lost": lost_images(
                     [image.name for image in good],
                     figures[0]["images"] if figures else [],
@@ -150,31 +153,51 @@ def _map(
     intrinsics: Intrinsics | None,
     config: Config,
     options: RunOptions,
-) -> "list[pycolmap.Reconstruction]":
+    seconds: dict[str, float],
+) -> Reconstructed:
     """Database and models, written into `fresh`."""
-    with tqdm(total=len(images), desc="mapping", unit="image", disable=not options.progress) as bar:
+    start = time.monotonic()
+    passes = config.refinement.passes if config.refinement else 0
+    quiet = not options.progress
+    with (
+        tqdm(total=len(images), desc="mapping", unit="image", disable=quiet) as bar,
+        tqdm(total=passes, desc="refinement", unit="pass", disable=quiet or not passes) as turns,
+    ):
 
         def on_image() -> None:
             bar.update(bar.n < len(images))  # several models may share images
 
-        models = reconstruct(
+        def on_mapped() -> None:
+            seconds["mapping"] = time.monotonic() - start
+            turns.reset()
+
+        def on_pass() -> None:
+            turns.update(turns.n < passes)
+
+        made = reconstruct(
             images,
             matches,
             fresh / "database.db",
             config=config,
             intrinsics=intrinsics,
-            options=colmap.MapOptions(
+            options=MapOptions(
                 mapper=options.mapper,
                 refine_intrinsics=_refines(options),
                 seed=options.seed,
                 threads=options.threads,
             ),
             on_image=on_image,
+            on_mapped=on_mapped,
+            on_pass=on_pass,
         )
-        if models:
-            bar.update(models[0].num_reg_images() - bar.n)  # the global mapper tells at the end
-    colmap.write_models(models, fresh / "sparse")
-    return models
+        if made.models:
+            bar.update(
+                made.models[0].num_reg_images() - bar.n
+            )  # the global mapper tells at the end
+    if passes:
+        seconds["refinement"] = time.monotonic() - start - seconds["mapping"]
+    write_models(made.models, fresh / "sparse")
+    return made
 
 
 def _check_options(options: RunOptions) -> None:
@@ -260,8 +283,12 @@ def _choose(results: dict[Pair, PairResult], n: int | None) -> set[Pair]:
 
 
 def _pair_figures(
-    result: PairResult, chosen: set[Pair], verified: dict[Pair, int]
+    result: PairResult,
+    chosen: set[Pair],
+    verified: dict[Pair, int],
+    verdicts: dict[Pair, Verdict],
 ) -> dict[str, Any]:
+    verdict = verdicts.get(result.pair)
     return {
         "pair": list(result.pair),
         "status": result.status.name.lower(),
@@ -270,4 +297,5 @@ def _pair_figures(
         "planes": len(result.homographies),
         "handed_on": result.pair in chosen,
         "colmap_inliers": verified.get(result.pair, 0),
+        "view_graph": None if verdict is None else dataclasses.asdict(verdict),
     }

@@ -1,4 +1,4 @@
-"""The one place that talks to COLMAP (pycolmap 4.2): database, verification, mapping.
+"""COLMAP's database and two-view verification (pycolmap 4.2); the mapper is in `mapping`.
 
 Everything is checked here first: a match index out of range ends the process in native code, and
 unset options fail silently. Pixels get their +0.5 here and nowhere else.
@@ -8,45 +8,28 @@ where it is loaded first every later deflate (zlib.compress, PNG by OpenCV or Pi
 heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so; it is not used.
 """
 
-import dataclasses
 import shutil
-import tempfile
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 import cv2  # noqa: F401  must precede pycolmap, see above
 import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
-from jaxsfm.host import interrupt
 from jaxsfm.host.images import ImageError, ImageFile, shown_name
 from jaxsfm.host.intrinsics import Intrinsics
+from jaxsfm.host.native import native
 from jaxsfm.host.pairs import Pair, PairResult, describe
+from jaxsfm.host.viewgraph import PairGeometry, spread
 
 pycolmap.logging.minloglevel = 3
 
-THREAD = "jaxsfm-colmap"
-"""Name of the thread COLMAP runs in."""
-Mapper = Literal["incremental", "global"]
 PIXEL_OFFSET = np.float32(0.5)
 """COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MapOptions:
-    """How verified matches become a model."""
-
-    mapper: Mapper = "incremental"
-    refine_intrinsics: bool = True
-    seed: int = 0
-    threads: int = -1
-    """Threads of verification and bundle adjustment; -1: all. One makes the model repeatable to
-    the last byte."""
-    scale: float = 1.0
-    """Original pixels per working pixel: COLMAP's pixel thresholds grow with it."""
+PLANAR = (4, 6)
+"""COLMAP's two-view configurations PLANAR and PLANAR_OR_PANORAMIC."""
 
 
 def keypoint_tables(results: Iterable[PairResult]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -157,125 +140,82 @@ def write_database(
             db.write_matches(ids[a], ids[b], index)
 
 
-def verify(path: Path, options: MapOptions, token: pycolmap.CancellationToken) -> None:
-    """COLMAP's own two-view verification of all pairs (paper, section 4)."""
-    two_view = pycolmap.TwoViewGeometryOptions()
-    two_view.ransac.random_seed = options.seed
-    two_view.ransac.max_error *= options.scale
-    verifier = pycolmap.GeometricVerifierOptions()
-    verifier.num_threads = options.threads
-    pycolmap.geometric_verification(
-        path,
-        verifier_options=verifier,
-        two_view_geometry_options=two_view,
-        cancellation_token=token,
-    )
+def verify(path: Path, *, seed: int, threads: int, scale: float, relative_poses: bool) -> None:
+    """COLMAP's own two-view verification of all pairs (paper, section 4).
 
-
-def verified_counts(path: Path) -> dict[Pair, int]:
-    """Inliers of COLMAP's verification, per pair that has any."""
-    with pycolmap.Database.open(path) as db:
-        names = {image.image_id: image.name for image in db.read_all_images()}
-        pair_ids, geometries = db.read_two_view_geometries()
-        counts = {}
-        for pair_id, geometry in zip(pair_ids, geometries, strict=True):
-            a, b = pycolmap.pair_id_to_image_pair(pair_id)
-            if len(geometry.inlier_matches):
-                name0, name1 = sorted((names[a], names[b]))
-                counts[name0, name1] = len(geometry.inlier_matches)
-        return counts
-
-
-def _incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOptions:
-    p = pycolmap.IncrementalPipelineOptions()
-    p.ba_refine_focal_length = p.ba_refine_extra_params = options.refine_intrinsics
-    p.ba_refine_principal_point = False
-    p.num_threads = p.mapper.num_threads = options.threads
-    p.random_seed = p.mapper.random_seed = options.seed
-    p.min_model_size = 2
-    p.extract_colors = False  # coloured by `colour_points`, from our own reader
-    p.mapper.init_max_error *= options.scale
-    p.mapper.abs_pose_max_error *= options.scale
-    p.mapper.filter_max_reproj_error *= options.scale
-    p.triangulation.complete_max_reproj_error *= options.scale
-    p.triangulation.merge_max_reproj_error *= options.scale
-    return p
-
-
-def _global_options(options: MapOptions) -> pycolmap.GlobalPipelineOptions:
-    p = pycolmap.GlobalPipelineOptions()
-    p.num_threads = options.threads
-    p.random_seed = options.seed
-    p.mapper.num_threads = options.threads
-    p.mapper.random_seed = options.seed
-    ba = p.mapper.bundle_adjustment
-    ba.refine_focal_length = ba.refine_extra_params = options.refine_intrinsics
-    ba.refine_principal_point = False
-    return p
-
-
-def build_models(
-    database: Path, options: MapOptions, *, on_image: Callable[[], None] = lambda: None
-) -> list[pycolmap.Reconstruction]:
-    """Verify and map; the models, the one with most registered images first; empty if none.
-
-    Runs beside the calling thread, which therefore stays open to Ctrl-C: native code is asked to
-    stop, then KeyboardInterrupt goes on.
+    Cameras with a known or prior focal length are verified calibrated (essential matrices).
 
     Args:
-      on_image: called for every image registered (incremental mapper).
+      scale: original pixels per working pixel; COLMAP's 4 px are multiplied by it.
+      relative_poses: also find the relative pose of every pair, for the view graph.
     """
-    token = pycolmap.CancellationToken()
-    models: dict[int, pycolmap.Reconstruction] = {}
-    failure: list[BaseException] = []
-    done = threading.Event()
-
-    def work(scratch: str) -> None:
-        try:
-            verify(database, options, token)
-            if token.is_cancelled:
-                return
-            if options.mapper == "incremental":
-                models.update(
-                    pycolmap.incremental_mapping(
-                        database,
-                        scratch,
-                        scratch,
-                        _incremental_options(options),
-                        initial_image_pair_callback=lambda: (on_image(), on_image()) and None,
-                        next_image_callback=on_image,
-                        cancellation_token=token,
-                    )
-                )
-            else:
-                models.update(
-                    pycolmap.global_mapping(database, scratch, scratch, _global_options(options))
-                )
-        except BaseException as error:
-            failure.append(error)
-        finally:
-            done.set()
-
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        threading.Thread(target=work, args=(scratch,), name=THREAD, daemon=True).start()
-        try:
-            # Not Thread.join: Ctrl-C inside it makes Python 3.11 take the thread for ended, and the
-            # process then aborts under the native code that still runs.
-            while not done.wait(0.2):
-                interrupt.check()
-            interrupt.check()
-        except KeyboardInterrupt:
-            token.cancel()
-            done.wait(30 if options.mapper == "incremental" else 1)  # the global one has no token
-            raise
-    if failure and isinstance(failure[0], RuntimeError):
-        raise UserError(f"{database}: COLMAP failed ({failure[0]}); the matches are kept")
-    if failure:
-        raise failure[0]
-    return sorted(
-        models.values(),
-        key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids())),
+    two_view = pycolmap.TwoViewGeometryOptions()
+    two_view.ransac.random_seed = seed
+    two_view.ransac.max_error *= scale
+    two_view.compute_relative_pose = relative_poses
+    verifier = pycolmap.GeometricVerifierOptions()
+    verifier.num_threads = threads
+    native(
+        lambda token: pycolmap.geometric_verification(
+            path,
+            verifier_options=verifier,
+            two_view_geometry_options=two_view,
+            cancellation_token=token,
+        ),
+        path,
     )
+
+
+class TwoView(NamedTuple):
+    """What COLMAP's verification says of a pair."""
+
+    geometry: PairGeometry
+    tri_angle_deg: float
+    """Median angle between the rays of a point; 0 if unknown."""
+    planar: bool
+    """A homography explains all inliers."""
+
+
+def read_two_views(path: Path) -> dict[Pair, TwoView]:
+    """Every pair with inliers, the lesser name first.
+
+    Relative poses are there if `verify` was asked for them.
+    """
+    with pycolmap.Database.open(path) as db:
+        images = {image.image_id: image for image in db.read_all_images()}
+        sizes = {c.camera_id: (c.width, c.height) for c in db.read_all_cameras()}
+        xy = {i: np.asarray(db.read_keypoints(i))[:, :2] - PIXEL_OFFSET for i in images}
+        found = {}
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            if not len(geometry.inlier_matches):
+                continue
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            rotation = None
+            if geometry.cam2_from_cam1 is not None:
+                rotation = geometry.cam2_from_cam1.rotation.matrix()
+            if images[a].name > images[b].name:
+                rotation = None if rotation is None else rotation.T
+            covered = min(
+                spread(xy[i][geometry.inlier_matches[:, side]], sizes[images[i].camera_id])
+                for side, i in enumerate((a, b))
+            )
+            name0, name1 = sorted((images[a].name, images[b].name))
+            found[name0, name1] = TwoView(
+                PairGeometry(
+                    num_inliers=len(geometry.inlier_matches), rotation=rotation, spread=covered
+                ),
+                float(np.degrees(max(geometry.tri_angle, 0.0))),
+                int(geometry.config) in PLANAR,
+            )
+        return found
+
+
+def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
+    """Take pairs' verified geometries out of a database; their matches stay."""
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        for a, b in pairs:
+            db.delete_two_view_geometry(ids[a], ids[b])
 
 
 def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:

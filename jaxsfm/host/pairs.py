@@ -116,6 +116,20 @@ def best_pairs(num_inliers: Mapping[Pair, int], n: int) -> set[Pair]:
     return {pair for rows in ranked.values() for _, _, pair in sorted(rows)[:n]}
 
 
+def component_of(seeds: Iterable[str], edges: Iterable[Pair]) -> set[str]:
+    """All images reachable from `seeds` over `edges`."""
+    neighbours: dict[str, set[str]] = {}
+    for a, b in edges:
+        neighbours.setdefault(a, set()).add(b)
+        neighbours.setdefault(b, set()).add(a)
+    reached, queue = set(seeds), list(seeds)
+    while queue:
+        for name in neighbours.get(queue.pop(), set()) - reached:
+            reached.add(name)
+            queue.append(name)
+    return reached
+
+
 def describe(pair: Pair) -> str:
     """A pair's name in messages."""
     return f"{shown_name(pair[0])} - {shown_name(pair[1])}"

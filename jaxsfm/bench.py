@@ -1,0 +1,257 @@
+"""Benchmarks on public data sets. `bench strecha` is the paper's comparison on standard scenes."""
+
+import dataclasses
+import importlib.metadata
+import json
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from jaxsfm.config import Config, preset
+from jaxsfm.errors import UserError
+from jaxsfm.evaluation import evaluate
+from jaxsfm.host.colmap import read_two_views, write_models
+from jaxsfm.host.intrinsics import parse_intrinsics
+from jaxsfm.host.mapping import MapOptions, build_models
+from jaxsfm.host.poses import model_poses, read_model, read_poses
+from jaxsfm.host.rootsift import write_rootsift_database
+from jaxsfm.host.workfolder import write_atomic
+from jaxsfm.pipeline import open_images
+from jaxsfm.report import model_figures
+from jaxsfm.run import RunOptions, run_folder
+
+Method = Literal["rootsift", "grid", "reloc", "default"]
+METHODS: tuple[Method, ...] = get_args(Method)
+PUBLISHED = (
+    "published (Widya et al. 2018, mean over six full-size sets): "
+    "DoG + RootSIFT 0.17 m, 0.90 deg; dense + relocalization 0.59 m, 2.27 deg"
+)
+
+
+def method_config(method: Method) -> Config:
+    """grid and reloc are the default preset without refinement, at cell centres or relocalized."""
+    config = preset("default")
+    if method == "default":
+        return config
+    keypoints = "grid" if method == "grid" else "relocalized"
+    return dataclasses.replace(config, refinement=None, keypoints=keypoints)
+
+
+def strecha_intrinsics(folder: Path) -> tuple[str, float]:
+    """A set's camera as `MODEL:params`, and its focal length in pixels.
+
+    The sets' K counts pixels from the image's corner, as COLMAP does: it was halved with the
+    images, which is exact only there, and rotations agree better that way (docs/results.md).
+    """
+    path = folder / "images" / "K.txt"
+    try:
+        k = np.loadtxt(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"--root: {path} cannot be read as a camera matrix") from error
+    if k.shape != (3, 3) or not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0:
+        raise UserError(f"--root: {path} is not a camera matrix")
+    fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+    return f"PINHOLE:{fx!r},{fy!r},{cx!r},{cy!r}", 0.5 * (fx + fy)
+
+
+def find_sets(root: Path, names: Sequence[str] | None) -> list[Path]:
+    """Strecha folders (images/K.txt inside) below `root`, by name.
+
+    Raises:
+      UserError: none there, or one of `names` is not.
+    """
+    if not root.is_dir():
+        raise UserError(f"--root {root}: no such folder")
+    found = {path.parent.parent.name: path.parent.parent for path in root.glob("*/images/K.txt")}
+    if names is None:
+        if not found:
+            raise UserError(f"--root {root}: no Strecha sets (SET/images/K.txt) in it")
+        return [found[name] for name in sorted(found)]
+    if unknown := [name for name in names if name not in found]:
+        raise UserError(f"--sets: no set {unknown[0]!r} in {root} (there: {sorted(found)})")
+    return [found[name] for name in names]
+
+
+def _row(set_name: str, method: str, figures: dict[str, Any] | None) -> dict[str, Any]:
+    row: dict[str, Any] = {"set": set_name, "method": method, "registered": 0}
+    if figures is not None:
+        row |= {k: v for k, v in figures.items() if k != "images"}
+    return row
+
+
+def _finish(row: dict[str, Any], model_folder: Path, folder: Path, focal: float) -> dict[str, Any]:
+    """Errors of a row's model against the ground truth, and of its focal lengths."""
+    truth = read_poses(folder, option="--root")
+    row["images"] = len(truth)
+    if not (model_folder / "images.bin").is_file():
+        return row
+    model = read_model(model_folder)
+    try:
+        errors = evaluate(model_poses(model), truth)
+    except UserError as error:
+        row["not_evaluated"] = str(error)
+        return row
+    row["position"], row["rotation_deg"] = errors.position, errors.rotation_deg
+    focals = [
+        model.cameras[model.image(i).camera_id].mean_focal_length() for i in model.reg_image_ids()
+    ]
+    row["focal_error_percent"] = 100 * float(np.max(np.abs(np.asarray(focals) / focal - 1)))
+    return row
+
+
+def run_rootsift(
+    folder: Path, out: Path, intrinsics: str | None, *, seed: int, threads: int
+) -> dict[str, Any]:
+    """COLMAP with its own features on one set; the model goes to `out`/sparse."""
+    out.mkdir(parents=True, exist_ok=True)
+    images, _ = open_images(folder / "images")
+    start = time.monotonic()
+    given = parse_intrinsics(intrinsics) if intrinsics else None
+    database = out / "database.db"
+    write_rootsift_database(database, folder / "images", images, given, seed=seed, threads=threads)
+    options = MapOptions(refine_intrinsics=intrinsics is None, seed=seed, threads=threads)
+    models, _ = build_models(database, read_two_views(database), options)
+    write_models(models, out / "sparse")
+    row = _row(folder.name, "rootsift", model_figures(models[0]) if models else None)
+    return row | {"seconds": time.monotonic() - start}
+
+
+def run_method(
+    folder: Path,
+    out: Path,
+    method: Method,
+    intrinsics: str | None,
+    *,
+    seed: int,
+    threads: int,
+    progress: bool,
+) -> dict[str, Any]:
+    """One of our methods on one set, in the work folder `out`."""
+    options = RunOptions(intrinsics=intrinsics, seed=seed, threads=threads, progress=progress)
+    report = run_folder(folder / "images", out, config=method_config(method), options=options)
+    row = _row(folder.name, method, report["models"][0] if report["models"] else None)
+    return row | {"stages": report["seconds"], "seconds": sum(report["seconds"].values())}
+
+
+def bench_strecha(
+    root: Path,
+    *,
+    sets: Sequence[str] | None = None,
+    methods: Sequence[Method] = METHODS,
+    known_intrinsics: bool = True,
+    out: Path | None = None,
+    seed: int = 0,
+    threads: int = -1,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """All methods on all sets, same images, camera, verification and mapper; plain JSON.
+
+    `reloc` and `default` differ after mapping only: extraction and matching are done once and
+    counted in both rows' seconds.
+
+    Args:
+      root: folder of Strecha sets (SET/images/K.txt, SET/gt_dense_cameras/*.camera).
+      known_intrinsics: False: focal lengths are guessed and refined, one camera per image.
+      out: keeps the work folders here; runs in it are gone on with.
+    """
+    rows = []
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        for folder in find_sets(root, sets):
+            camera, focal = strecha_intrinsics(folder)
+            given = camera if known_intrinsics else None
+            shared: dict[str, float] = {}
+            for method in methods:
+                work = (out or Path(scratch)) / folder.name
+                work = work / ("dense" if method in ("reloc", "default") else method)
+                work.parent.mkdir(parents=True, exist_ok=True)
+                if method == "rootsift":
+                    row = run_rootsift(folder, work, given, seed=seed, threads=threads)
+                else:
+                    row = run_method(
+                        folder, work, method, given, seed=seed, threads=threads, progress=progress
+                    )
+                if method in ("reloc", "default"):
+                    for stage in ("extraction", "matching"):
+                        shared[stage] = max(shared.get(stage, 0.0), row["stages"][stage])
+                    row["stages"] |= shared
+                    row["seconds"] = sum(row["stages"].values())
+                rows.append(_finish(row, work / "sparse" / "0", folder, focal))
+                if progress:
+                    print(row_line(rows[-1]), flush=True)
+    return {
+        "benchmark": "strecha",
+        "versions": {
+            name: importlib.metadata.version(name) for name in ("jaxsfm", "jax", "pycolmap")
+        },
+        "intrinsics": "known" if known_intrinsics else "refined from a guess",
+        "seed": seed,
+        "rows": rows,
+        "ratios": ratios(rows),
+        "published": PUBLISHED,
+    }
+
+
+def ratios(rows: Sequence[dict[str, Any]], *, baseline: str = "rootsift") -> dict[str, Any]:
+    """Every method's errors over the baseline's, per set and as the mean of the sets."""
+    base = {row["set"]: row for row in rows if row["method"] == baseline and "position" in row}
+    result: dict[str, Any] = {}
+    for method in dict.fromkeys(row["method"] for row in rows):
+        if method == baseline:
+            continue
+        per_set = {
+            row["set"]: {
+                "position": row["position"]["mean"] / base[row["set"]]["position"]["mean"],
+                "rotation": row["rotation_deg"]["mean"] / base[row["set"]]["rotation_deg"]["mean"],
+                "points": row["points"] / base[row["set"]]["points"],
+                "reprojection_error": row["reprojection_error_px"]
+                / base[row["set"]]["reprojection_error_px"],
+            }
+            for row in rows
+            if row["method"] == method and "position" in row and row["set"] in base
+        }
+        if per_set:
+            keys = next(iter(per_set.values()))
+            mean = {k: float(np.mean([v[k] for v in per_set.values()])) for k in keys}
+            result[method] = {"sets": per_set, "mean": mean}
+    return result
+
+
+HEADER = (
+    f"{'set':16s} {'method':9s} {'images':>7s} {'position':>9s} {'rotation':>9s} {'points':>7s} "
+    f"{'observ.':>8s} {'track':>6s} {'reproj.':>8s} {'focal':>7s} {'seconds':>8s}"
+)
+
+
+def row_line(row: dict[str, Any]) -> str:
+    """One line of the table."""
+    head = f"{row['set']:16s} {row['method']:9s} {row['registered']:3d}/{row['images']:<3d}"
+    if "position" not in row:
+        return f"{head}   {row.get('not_evaluated', 'no model')}"
+    return (
+        f"{head} {row['position']['mean']:9.4f} {row['rotation_deg']['mean']:9.4f} "
+        f"{row['points']:7d} {row['observations']:8d} {row['track_length']:6.2f} "
+        f"{row['reprojection_error_px']:8.3f} {row['focal_error_percent']:6.2f}% "
+        f"{row['seconds']:8.1f}"
+    )
+
+
+def table_lines(result: dict[str, Any]) -> list[str]:
+    """The paper's table: mean errors in the reference's units and degrees."""
+    lines = [HEADER, *(row_line(row) for row in result["rows"]), ""]
+    for method, figures in result["ratios"].items():
+        mean = figures["mean"]
+        lines.append(
+            f"{method} / rootsift, mean of {len(figures['sets'])} sets: "
+            f"position {mean['position']:.2f}, rotation {mean['rotation']:.2f}, "
+            f"points {mean['points']:.2f}, reprojection error {mean['reprojection_error']:.2f}"
+        )
+    return [*lines, result["published"]]
+
+
+def write_json(path: Path, result: dict[str, Any]) -> None:
+    """The figures as JSON."""
+    write_atomic(path, json.dumps(result, indent=1).encode())

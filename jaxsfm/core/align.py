@@ -1,0 +1,196 @@
+"""Sub-pixel alignment of keypoints: a patch of the reference view, warped by the local plane, is
+moved over another view by Gauss-Newton until the two agree up to gain and offset.
+
+Maps are (h, w, c): c = 1 for intensities, more for dense features; they may be padded at the bottom
+and on the right beyond `size`. A patch is a list of offsets around a keypoint with a weight each.
+Everything is batched by vmap, jits, and differentiates with respect to keypoints and maps: the
+iteration count is static, what fails is masked.
+
+The template's gradient is used (inverse compositional: Baker and Matthews, IJCV 2004, section 3.2),
+so an iteration is one sampling of the map and a 2 x 2 solve.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsfm.core.numerics import HIGHEST
+
+
+class Patch(NamedTuple):
+    """Where a patch is sampled around its keypoint."""
+
+    offsets: Float[Array, "q 2"]
+    """(x, y), pixels of the reference view."""
+    weights: Float[Array, " q"]
+    """Sum 1."""
+
+
+class Templates(NamedTuple):
+    """Reference patches."""
+
+    values: Float[Array, "n q c"]
+    """Weighted mean 0 in every channel, weighted variance 1 over all channels; 0 where flat."""
+    descent: Float[Array, "n q c 2"]
+    """Derivative of `values` with respect to the shift of the patch, per reference pixel."""
+    """With gain and offset projected out."""
+    hessian: Float[Array, "n 2 2"]
+    contrast: Float[Array, " n"]
+    """Weighted standard deviation before normalisation, units of the map."""
+    inside: Bool[Array, " n"]
+    """The whole patch lies in the image."""
+
+
+class Aligned(NamedTuple):
+    """Where keypoints moved, and how far they can be trusted."""
+
+    xy: Float[Array, "n 2"]
+    score: Float[Array, " n"]
+    """Zero-mean normalised cross-correlation at the end, -1 .. 1."""
+    sigma: Float[Array, " n"]
+    """Standard deviation of the position along its worst direction, pixels of the other view."""
+    converged: Bool[Array, " n"]
+    """It came to rest inside the image, on a patch that is not flat."""
+
+
+def square_patch(radius: int, *, spacing: float = 1.0, sigma: float | None = None) -> Patch:
+    """A (2 radius + 1)^2 grid with Gaussian weights (sigma in grid steps, default 0.5 radius)."""
+    if radius < 1:
+        raise ValueError(f"radius must be at least 1; got {radius}")
+    steps = jnp.arange(-radius, radius + 1, dtype=jnp.float32)
+    y, x = jnp.meshgrid(steps, steps, indexing="ij")
+    offsets = jnp.stack([x.ravel(), y.ravel()], axis=-1)
+    weights = jnp.exp(-0.5 * jnp.sum(offsets**2, -1) / (sigma or 0.5 * radius) ** 2)
+    return Patch(offsets * spacing, weights / weights.sum())
+
+
+def sample(
+    image: Float[Array, "h w c"], size: Int[Array, " 2"], xy: Float[Array, "*n 2"]
+) -> tuple[Float[Array, "*n c"], Bool[Array, "*n"]]:
+    """Bilinear values at (x, y), and which lie inside; outside is the nearest edge.
+
+    Args:
+      size: valid (rows, columns) of the map, at least 2.
+    """
+    h, w, c = image.shape
+    x, y = xy[..., 0], xy[..., 1]
+    right, bottom = size[1] - 1.0, size[0] - 1.0
+    inside = (x >= 0) & (x <= right) & (y >= 0) & (y <= bottom)
+    x, y = jnp.clip(x, 0, right), jnp.clip(y, 0, bottom)
+    x0 = jnp.clip(jnp.floor(x), 0, right - 1).astype(jnp.int32)
+    y0 = jnp.clip(jnp.floor(y), 0, bottom - 1).astype(jnp.int32)
+    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    flat = image.reshape(h * w, c)
+    at = y0 * w + x0
+    v00, v01 = flat[at], flat[at + 1]
+    v10, v11 = flat[at + w], flat[at + w + 1]
+    top = v00 + fx * (v01 - v00)
+    return top + fy * (v10 + fx * (v11 - v10) - top), inside
+
+
+def _normalise(values: Float[Array, "q c"], weights: Float[Array, " q"]):
+    """Weighted mean removed per channel, joint weighted variance 1; flat patches become zero."""
+    values = values - jnp.einsum("q,qc->c", weights, values, precision=HIGHEST)
+    variance = jnp.einsum("q,qc->", weights, values * values, precision=HIGHEST)
+    safe = jnp.where(variance > 0, variance, 1.0)
+    scale = jnp.where(variance > 0, lax.rsqrt(safe), 0.0)
+    return values * scale, jnp.sqrt(safe) * (variance > 0), scale
+
+
+@jax.jit
+def make_templates(
+    image: Float[Array, "h w c"],
+    size: Int[Array, " 2"],
+    xy: Float[Array, "n 2"],
+    patch: Patch,
+) -> Templates:
+    """Templates around keypoints of a reference view."""
+    dx, dy = jnp.asarray([0.5, 0.0]), jnp.asarray([0.0, 0.5])
+
+    def one(centre):
+        at = centre + patch.offsets
+        values, inside = sample(image, size, at)
+        gx = sample(image, size, at + dx)[0] - sample(image, size, at - dx)[0]
+        gy = sample(image, size, at + dy)[0] - sample(image, size, at - dy)[0]
+        values, contrast, scale = _normalise(values, patch.weights)
+        g = jnp.stack([gx, gy], -1) * scale
+        # Gain and offset are projected out of the gradient: a shift that only looks like a change
+        # of contrast must not count as information.
+        g = g - jnp.einsum("q,qck->ck", patch.weights, g, precision=HIGHEST)
+        along = jnp.einsum("q,qc,qck->k", patch.weights, values, g, precision=HIGHEST)
+        g = g - values[..., None] * along
+        hessian = jnp.einsum("q,qck,qcl->kl", patch.weights, g, g, precision=HIGHEST)
+        return Templates(values, g, hessian, contrast, inside.all())
+
+    return jax.vmap(one)(xy)
+
+
+def _solve2(a: Float[Array, "2 2"], b: Float[Array, " 2"]) -> Float[Array, " 2"]:
+    det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    ok = det > 1e-12
+    inv = jnp.where(ok, 1.0 / jnp.where(ok, det, 1.0), 0.0)
+    return inv * jnp.stack([a[1, 1] * b[0] - a[0, 1] * b[1], a[0, 0] * b[1] - a[1, 0] * b[0]])
+
+
+@functools.partial(jax.jit, static_argnames=("iterations",))
+def align(
+    image: Float[Array, "h w c"],
+    size: Int[Array, " 2"],
+    templates: Templates,
+    xy: Float[Array, "n 2"],
+    affine: Float[Array, "n 2 2"],
+    patch: Patch,
+    *,
+    iterations: int = 10,
+    max_step: float = 1.0,
+    tolerance: float = 0.02,
+) -> Aligned:
+    """Move keypoints of a view onto their templates.
+
+    Args:
+      image: the view's map.
+      size: its valid (rows, columns).
+      templates: of the same tracks in their reference views.
+      xy: where to start, pixels of the view.
+      affine: reference offsets to offsets in the view, from the local plane.
+      max_step: longest step of one iteration, reference pixels.
+      tolerance: converged when the last step is shorter, reference pixels.
+    """
+
+    def one(t: Templates, start, a):
+        offsets = jnp.einsum("qk,lk->ql", patch.offsets, a, precision=HIGHEST)
+
+        def residual(at):
+            values, inside = sample(image, size, at + offsets)
+            values, contrast, _ = _normalise(values, patch.weights)
+            return values - t.values, inside.all(), contrast, values
+
+        def step(at, _):
+            r, _, _, _ = residual(at)
+            b = jnp.einsum("q,qc,qck->k", patch.weights, r, t.descent, precision=HIGHEST)
+            d = -_solve2(t.hessian, b)
+            length = jnp.sqrt(jnp.sum(d * d) + 1e-20)
+            d = d * jnp.minimum(1.0, max_step / length)
+            return at + a @ d, length
+
+        at, lengths = lax.scan(step, start, None, length=iterations)
+        _, inside, contrast, values = residual(at)
+        score = jnp.einsum("q,qc,qc->", patch.weights, values, t.values, precision=HIGHEST)
+        # Two patches of variance 1 differ by 2 (1 - score). Spread over the effective number of
+        # samples that is the noise of a least-squares shift (its covariance: noise / hessian).
+        h = t.hessian
+        mean, diff = 0.5 * (h[0, 0] + h[1, 1]), 0.5 * (h[0, 0] - h[1, 1])
+        smallest = mean - jnp.sqrt(diff**2 + h[0, 1] ** 2 + 1e-30)
+        effective = 1.0 / jnp.sum(patch.weights**2)
+        sigma = jnp.sqrt(
+            2 * jnp.maximum(1 - score, 1e-6) / (jnp.maximum(smallest, 1e-9) * effective)
+        )
+        stretch = jnp.sqrt(0.5 * jnp.sum(a * a))
+        ok = inside & t.inside & (lengths[-1] < tolerance) & (contrast > 0) & (t.contrast > 0)
+        return Aligned(at, score, sigma * stretch, ok)
+
+    return jax.vmap(one)(templates, xy, affine)

@@ -1,0 +1,161 @@
+"""A COLMAP model as arrays and back: views, tracks, bundle adjustment.
+
+Arrays use this package's pixels of the *working* images; COLMAP's half pixel and the resizing are
+undone and redone here.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
+import numpy as np
+import pycolmap
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """A registered image."""
+
+    image_id: int
+    name: str
+    rotation: np.ndarray
+    """float64 (3, 3), world to camera."""
+    centre: np.ndarray
+    """float64 (3,)."""
+    camera: pycolmap.Camera
+    scale: np.ndarray
+    """Original pixels per working pixel, (x, y)."""
+    size: tuple[int, int]
+    """(width, height) of the working image."""
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Working pixels (n, 2) and depth (n,) of world points (n, 3); NaN pixels behind it."""
+        local = (points - self.centre) @ self.rotation.T
+        depth = local[:, 2]
+        front = depth > 0
+        xy = np.full((len(points), 2), np.nan)
+        if front.any():
+            xy[front] = self.camera.img_from_cam(np.ascontiguousarray(local[front]))
+        return xy / self.scale - 0.5, depth
+
+    def rays(self, xy: np.ndarray) -> np.ndarray:
+        """World directions (n, 3) of working pixels, of depth 1."""
+        flat = self.camera.cam_from_img(np.ascontiguousarray((xy + 0.5) * self.scale))
+        assert flat is not None
+        return np.c_[flat, np.ones(len(flat))] @ self.rotation
+
+
+class Tracks(NamedTuple):
+    """Points and where the views see them; observation k is of `point[k]` in `view[k]`."""
+
+    points: np.ndarray
+    """float64 (n, 3)."""
+    point: np.ndarray
+    """int (m,): index into `points`."""
+    view: np.ndarray
+    """int (m,): index into the views."""
+    xy: np.ndarray
+    """float64 (m, 2), working pixels of the view."""
+
+
+def read_model_arrays(
+    model: pycolmap.Reconstruction,
+    sizes: Mapping[str, tuple[tuple[int, int], tuple[float, float]]],
+) -> tuple[list[View], Tracks]:
+    """Views (by image id) and tracks (by point id) of a model.
+
+    Args:
+      sizes: image name -> working (width, height) and original pixels per working pixel.
+    """
+    views, index, pixels = [], {}, []
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        size, scale = sizes[image.name]
+        index[image_id] = len(views)
+        views.append(
+            View(
+                image_id=image_id,
+                name=image.name,
+                rotation=image.cam_from_world().rotation.matrix(),
+                centre=np.asarray(image.projection_center()),
+                camera=model.camera(image.camera_id),
+                scale=np.asarray(scale, np.float64),
+                size=size,
+            )
+        )
+        xy = np.asarray([p.xy for p in image.points2D], np.float64).reshape(-1, 2)
+        pixels.append(xy / np.asarray(scale) - 0.5)
+    points, rows = [], []
+    for k, point_id in enumerate(sorted(model.point3D_ids())):
+        point = model.point3D(point_id)
+        points.append(point.xyz)
+        rows += [(k, index[e.image_id], e.point2D_idx) for e in point.track.elements]
+    table = np.asarray(rows, np.int64).reshape(-1, 3)
+    xy = np.asarray([pixels[v][i] for _, v, i in table]).reshape(-1, 2)
+    return views, Tracks(np.asarray(points).reshape(-1, 3), table[:, 0], table[:, 1], xy)
+
+
+def build_model(
+    template: pycolmap.Reconstruction, views: list[View], tracks: Tracks
+) -> pycolmap.Reconstruction:
+    """A model with the cameras and poses of `template` and these tracks.
+
+    Points with fewer than two observations are left out.
+    """
+    model = pycolmap.Reconstruction()
+    for camera_id in sorted(template.cameras):
+        model.add_camera_with_trivial_rig(template.camera(camera_id))
+    place = np.zeros(len(tracks.xy), np.int64)
+    for k, view in enumerate(views):
+        rows = np.flatnonzero(tracks.view == k)
+        place[rows] = np.arange(len(rows))
+        old = template.image(view.image_id)
+        image = pycolmap.Image(
+            name=view.name,
+            camera_id=old.camera_id,
+            image_id=view.image_id,
+            keypoints=(tracks.xy[rows] + 0.5) * view.scale,
+        )
+        model.add_image_with_trivial_frame(image, old.cam_from_world())
+    order = np.argsort(tracks.point, kind="stable")
+    ends = np.searchsorted(tracks.point[order], np.arange(len(tracks.points) + 1))
+    for k, xyz in enumerate(tracks.points):
+        rows = order[ends[k] : ends[k + 1]]
+        if len(rows) < 2:
+            continue
+        track = pycolmap.Track()
+        for row in rows:
+            track.add_element(views[tracks.view[row]].image_id, int(place[row]))
+        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    return model
+
+
+def bundle_adjust(
+    model: pycolmap.Reconstruction, *, loss_px: float, refine_intrinsics: bool, threads: int
+) -> None:
+    """Bundle adjustment of everything, in place.
+
+    Args:
+      loss_px: scale of the Cauchy loss, original pixels.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = refine_intrinsics
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = loss_px
+    options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.function_tolerance = 1e-7
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # Not pycolmap.bundle_adjustment: it switches COLMAP's log messages on for the whole process.
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def filter_points(model: pycolmap.Reconstruction, *, max_error_px: float) -> None:
+    """Drop observations with larger errors (original pixels), then points left without two, or
+    with rays closer than 1.5 degrees."""
+    pycolmap.ObservationManager(model).filter_all_points3D(max_error_px, 1.5)
