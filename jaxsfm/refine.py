@@ -178,9 +178,7 @@ def refine_model(
         bundle_adjust(fresh, loss_px=unit, refine_intrinsics=refine_intrinsics, threads=threads)
         interrupt.check()
         filter_points(fresh, max_error_px=config.max_error_px * unit)
-        bundle_adjust(
-            fresh, loss_px=0.25 * unit, refine_intrinsics=refine_intrinsics, threads=threads
-        )
+        bundle_adjust(fresh, loss_px=unit, refine_intrinsics=refine_intrinsics, threads=threads)
         interrupt.check()
         if fresh.num_points3D() < MIN_POINTS:
             break

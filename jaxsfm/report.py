@@ -1,6 +1,6 @@
 """What a run did, as plain JSON and as the last lines on the screen; why images were lost."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from jaxsfm.core.types import Status
@@ -13,6 +13,7 @@ def lost_images(
     registered: Iterable[str],
     results: Mapping[Pair, PairResult],
     verified: Mapping[Pair, int],
+    untrusted: Collection[Pair] = (),
 ) -> list[dict[str, str]]:
     """For every image without a pose, the stage that lost it and the numbers behind that.
 
@@ -22,7 +23,8 @@ def lost_images(
 
     Args:
       results: every pair tried.
-      verified: COLMAP's inliers of the pairs handed on.
+      verified: COLMAP's inliers of the pairs the mapper was given.
+      untrusted: pairs that the view graph dropped.
     """
     registered = set(registered)
     connected = component_of(registered, verified)
@@ -40,9 +42,14 @@ def lost_images(
             stage, detail = "no plane", f"{tentative} tentative matches, no homography among them"
         elif not edges or (registered and name not in connected):
             stage = "not connected"
+            dropped = sum(name in pair for pair in untrusted)
             detail = (
                 f"{inliers} inliers in its best pair, {len(edges)} pairs verified by COLMAP, "
                 "none leads to the model"
+                + (
+                    f"; the view graph dropped {dropped} (--view-graph no keeps them)"
+                    * bool(dropped)
+                )
             )
         else:
             stage = "no pose"
@@ -104,6 +111,16 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
         ]
     else:
         lines.append("registered       none: no model could be built")
+    attempts = report["mapping"]
+    if len(attempts) > 1:
+        tries = ", ".join(str(max(a["registered"], default=0)) for a in attempts)
+        lines.append(f"mapping          started {len(attempts)} times, images registered: {tries}")
+    if report["refinement"] and report["refinement"][0]:
+        last = report["refinement"][0][-1]
+        lines.append(
+            f"refinement       {last['kept']} observations agreed, {last['dropped']} dropped, "
+            f"{last['added']} added in the last of {len(report['refinement'][0])} passes"
+        )
     seconds = report["seconds"]
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in seconds.items()))
     if pairs["overflowed"]:

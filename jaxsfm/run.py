@@ -132,6 +132,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     figures[0]["images"] if figures else [],
                     results,
                     verified,
+                    [pair for pair, v in made.verdicts.items() if not v.trusted],
                 ),
                 "seconds": seconds,
             }

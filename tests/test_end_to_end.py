@@ -30,14 +30,14 @@ def test_a_dozen_lines_of_python_do_the_same_as_the_command(tmp_path):
     images, _ = jaxsfm.open_images(tmp_path / "images")
     features = jaxsfm.extract(weights, images, config=config)
     matches = jaxsfm.match(features, jaxsfm.exhaustive_pairs(features), config=config)
-    models = jaxsfm.reconstruct(
+    made = jaxsfm.reconstruct(
         images,
         matches,
         tmp_path / "database.db",
         config=config,
         intrinsics=jaxsfm.parse_intrinsics(str(tmp_path / "K.txt")),
     )
-    errors = jaxsfm.evaluate(jaxsfm.model_poses(models[0]), truth)
+    errors = jaxsfm.evaluate(jaxsfm.model_poses(made.models[0]), truth)
     assert len(errors.images) == 4
     # 320 x 240: one working pixel is 1/320 of a focal length, 0.015 units at the room's distance.
     assert errors.position["mean"] < 0.1 and errors.rotation_deg["mean"] < 1.0
@@ -57,14 +57,14 @@ def test_strecha_cameras_are_recovered_at_half_size(data_folder, tmp_path):
     config = jaxsfm.Config(max_size=768, pair=jaxsfm.preset("paper").pair)
     features = jaxsfm.extract(jaxsfm.load_weights(), images, config=config)
     matches = jaxsfm.match(features, jaxsfm.exhaustive_pairs(features), config=config)
-    models = jaxsfm.reconstruct(
+    made = jaxsfm.reconstruct(
         images,
         matches,
         tmp_path / "database.db",
         config=config,
         intrinsics=jaxsfm.parse_intrinsics(str(folder / "images" / "K.txt")),
     )
-    errors = evaluate(jaxsfm.model_poses(models[0]), jaxsfm.read_poses(folder))
+    errors = evaluate(jaxsfm.model_poses(made.models[0]), jaxsfm.read_poses(folder))
     assert len(errors.images) == len(names)
     assert errors.position["max"] < 0.05 and errors.rotation_deg["max"] < 0.5
 

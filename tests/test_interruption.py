@@ -98,7 +98,7 @@ def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
 MAP_AND_INTERRUPT = """
 import os, signal, sys, threading, time
 import jaxsfm.cli
-from jaxsfm.host import colmap
+from jaxsfm.host import mapping
 import pycolmap
 
 mapper, path = sys.argv[1:]
@@ -107,7 +107,6 @@ options = pycolmap.SyntheticDatasetOptions(
 )
 with pycolmap.Database.open(path) as db:
     pycolmap.synthesize_dataset(options, db)
-colmap.verify = lambda *a: None
 
 def interrupt():
     time.sleep(1)
@@ -115,7 +114,7 @@ def interrupt():
 
 def weights():
     threading.Thread(target=interrupt, daemon=True).start()
-    colmap.build_models(path, colmap.MapOptions(mapper=mapper, threads=1))
+    mapping.build_models(path, {}, mapping.MapOptions(mapper=mapper, threads=1))
 
 jaxsfm.cli.COMMANDS["weights"] = weights
 sys.exit(jaxsfm.cli.main(["weights"]))

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from jaxsfm.core.types import Status
 from jaxsfm.host.images import ImageError, inspect_image
-from jaxsfm.host.pairs import PairResult, exhaustive_pairs
-from jaxsfm.report import component_of, lost_images, summary_lines
+from jaxsfm.host.pairs import PairResult, component_of, exhaustive_pairs
+from jaxsfm.report import lost_images, summary_lines
 
 edges = st.lists(st.sampled_from(exhaustive_pairs("abcdefg")), max_size=10)
 
@@ -89,8 +89,10 @@ MODEL = {"registered": 2, "points": 321, "track_length": 2.5, "reprojection_erro
 def report(**changes) -> dict:
     return {
         "images": {"found": 4, "usable": 3, "skipped": {}},
-        "pairs": {"tried": 3, "verified": 2, "handed_on": 1, "overflowed": 0},
+        "pairs": {"tried": 3, "verified": 2, "handed_on": 1, "trusted": 1, "overflowed": 0},
         "models": [MODEL],
+        "mapping": [{"mapper": "incremental", "initial_pair": None, "registered": [2]}],
+        "refinement": [],
         "seconds": {"extraction": 1.25, "mapping": 2.0},
         "lost": [],
         **changes,
@@ -106,13 +108,27 @@ def test_a_summary_has_the_counts_of_every_stage():
     assert "none: no model" in "\n".join(summary_lines(report(models=[])))
 
 
+def test_second_tries_and_refinement_are_said():
+    figures = {"candidates": 9, "kept": 5, "dropped": 3, "added": 4}
+    attempts = [{"registered": []}, {"registered": [2, 1]}]
+    text = "\n".join(summary_lines(report(mapping=attempts, refinement=[[figures, figures]])))
+    assert "started 2 times, images registered: 0, 2" in text
+    assert "5 observations agreed, 3 dropped, 4 added in the last of 2 passes" in text
+
+
+def test_images_that_the_view_graph_cut_off_are_told_how_to_keep_them():
+    results = {("a", "b"): result("a", "b", Status.VERIFIED, 60, 30)}
+    (row,) = [r for r in lost_images("ab", "b", results, {}, [("a", "b")])]
+    assert row["stage"] == "not connected" and "--view-graph no" in row["detail"]
+
+
 def test_a_failed_evaluation_is_said():
     lines = summary_lines(report(evaluation_failed="no common images"))
     assert lines[-1] == "not evaluated    no common images"
 
 
 def test_overflow_and_evaluation_are_said():
-    pairs = {"tried": 3, "verified": 2, "handed_on": 1, "overflowed": 2}
+    pairs = {"tried": 3, "verified": 2, "handed_on": 1, "trusted": 1, "overflowed": 2}
     errors = {"mean": 0.01, "median": 0.02, "max": 0.03}
     evaluation = {
         "registered": 2,

@@ -10,3 +10,6 @@ GRADIENT = {"rtol": 2e-2, "atol": 1e-3}
 """Central differences in float32: truncation and rounding meet near 1 %."""
 NEAR_TIE = 1e-5
 """Similarities closer than this may be ordered either way."""
+ALIGNED_PX = 0.03
+"""Sub-pixel alignment of smooth exact patches (periods of 8 pixels and more): what interpolation
+leaves."""

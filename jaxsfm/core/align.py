@@ -57,6 +57,10 @@ class Aligned(NamedTuple):
     """It came to rest inside the image, on a patch that is not flat."""
 
 
+FLAT = 1e-5
+"""Deviation over root mean square below which a patch is flat."""
+
+
 def square_patch(radius: int, *, spacing: float = 1.0, sigma: float | None = None) -> Patch:
     """A (2 radius + 1)^2 grid with Gaussian weights (sigma in grid steps, default 0.5 radius)."""
     if radius < 1:
@@ -68,37 +72,60 @@ def square_patch(radius: int, *, spacing: float = 1.0, sigma: float | None = Non
     return Patch(offsets * spacing, weights / weights.sum())
 
 
+def _cubic(f: Float[Array, "*n"]) -> list[Float[Array, "*n"]]:
+    """Weights of the pixels -1, 0, 1, 2 for a position f in [0, 1] between 0 and 1."""
+    return [
+        ((-0.5 * f + 1.0) * f - 0.5) * f,
+        (1.5 * f - 2.5) * f * f + 1.0,
+        ((-1.5 * f + 2.0) * f + 0.5) * f,
+        (0.5 * f - 0.5) * f * f,
+    ]
+
+
 def sample(
     image: Float[Array, "h w c"], size: Int[Array, " 2"], xy: Float[Array, "*n 2"]
 ) -> tuple[Float[Array, "*n c"], Bool[Array, "*n"]]:
-    """Bilinear values at (x, y), and which lie inside; outside is the nearest edge.
+    """Values at (x, y) by cubic convolution, and which lie inside; outside is the nearest edge.
+
+    Bilinear values blur most half-way between pixels, which draws an alignment towards there: 0.05
+    px on smooth textures against 0.01 (tests/core/test_align.py).
 
     Args:
-      size: valid (rows, columns) of the map, at least 2.
+      size: valid (rows, columns) of the map.
+
+    Source: Keys, IEEE ASSP 1981, equation 15 with a = -1/2.
     """
     h, w, c = image.shape
-    x, y = xy[..., 0], xy[..., 1]
-    right, bottom = size[1] - 1.0, size[0] - 1.0
-    inside = (x >= 0) & (x <= right) & (y >= 0) & (y <= bottom)
-    x, y = jnp.clip(x, 0, right), jnp.clip(y, 0, bottom)
-    x0 = jnp.clip(jnp.floor(x), 0, right - 1).astype(jnp.int32)
-    y0 = jnp.clip(jnp.floor(y), 0, bottom - 1).astype(jnp.int32)
-    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    right, bottom = size[1] - 1, size[0] - 1
+    x = jnp.clip(xy[..., 0], 0, right.astype(xy.dtype))
+    y = jnp.clip(xy[..., 1], 0, bottom.astype(xy.dtype))
+    inside = (x == xy[..., 0]) & (y == xy[..., 1])
+    x0, y0 = jnp.floor(x), jnp.floor(y)
+    columns = [jnp.clip(x0.astype(jnp.int32) + k, 0, right) for k in (-1, 0, 1, 2)]
+    rows = [jnp.clip(y0.astype(jnp.int32) + k, 0, bottom) * w for k in (-1, 0, 1, 2)]
     flat = image.reshape(h * w, c)
-    at = y0 * w + x0
-    v00, v01 = flat[at], flat[at + 1]
-    v10, v11 = flat[at + w], flat[at + w + 1]
-    top = v00 + fx * (v01 - v00)
-    return top + fy * (v10 + fx * (v11 - v10) - top), inside
+    across, down = _cubic(x - x0), _cubic(y - y0)
+    total = jnp.zeros((*xy.shape[:-1], c), image.dtype)
+    for row, v in zip(rows, down, strict=True):
+        line = sum(flat[row + col] * u[..., None] for col, u in zip(columns, across, strict=True))
+        total = total + line * v[..., None]
+    return total, inside
 
 
-def _normalise(values: Float[Array, "q c"], weights: Float[Array, " q"]):
-    """Weighted mean removed per channel, joint weighted variance 1; flat patches become zero."""
+def _normalise(
+    values: Float[Array, "q c"], weights: Float[Array, " q"]
+) -> tuple[Float[Array, "q c"], Float[Array, ""], Float[Array, ""]]:
+    """Weighted mean removed per channel, joint variance 1; the deviation before, and its inverse.
+
+    Flat patches (deviation below float32's rounding of the values) become zero.
+    """
+    power = jnp.einsum("q,qc->", weights, values * values, precision=HIGHEST)
     values = values - jnp.einsum("q,qc->c", weights, values, precision=HIGHEST)
     variance = jnp.einsum("q,qc->", weights, values * values, precision=HIGHEST)
-    safe = jnp.where(variance > 0, variance, 1.0)
-    scale = jnp.where(variance > 0, lax.rsqrt(safe), 0.0)
-    return values * scale, jnp.sqrt(safe) * (variance > 0), scale
+    flat = variance <= FLAT**2 * power
+    safe = jnp.where(flat, 1.0, variance)
+    scale = jnp.where(flat, 0.0, lax.rsqrt(safe))
+    return values * scale, jnp.where(flat, 0.0, jnp.sqrt(safe)), scale
 
 
 @jax.jit

@@ -132,12 +132,17 @@ def build_model(
 
 
 def bundle_adjust(
-    model: pycolmap.Reconstruction, *, loss_px: float, refine_intrinsics: bool, threads: int
+    model: pycolmap.Reconstruction,
+    *,
+    loss_px: float,
+    refine_intrinsics: bool,
+    threads: int,
 ) -> None:
     """Bundle adjustment of everything, in place.
 
     Args:
-      loss_px: scale of the Cauchy loss, original pixels.
+      loss_px: scale of the Cauchy loss, original pixels. Well above the noise (0.1 px
+        after refinement) it is least squares for what is sound, and still robust.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = refine_intrinsics

@@ -5,19 +5,19 @@ import dataclasses
 import numpy as np
 import pycolmap
 import pytest
+from mapped import map_database
 
 from jaxsfm.evaluation import evaluate
-from jaxsfm.host import colmap
+from jaxsfm.host import mapping
 from jaxsfm.host.colmap import (
-    MapOptions,
-    build_models,
     keypoint_tables,
-    verified_counts,
+    read_two_views,
     write_database,
     write_models,
 )
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
+from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.poses import model_poses
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)
@@ -34,12 +34,12 @@ def errors(model, truth) -> tuple[int, float, float]:
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_an_exact_scene_comes_back_with_its_odd_names(tmp_path, scene, mapper):
     write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
-    models = build_models(tmp_path / "d.db", dataclasses.replace(ONE, mapper=mapper))
+    models = map_database(tmp_path / "d.db", dataclasses.replace(ONE, mapper=mapper))
     registered, position, rotation = errors(models[0], scene.truth)
     assert registered == len(scene.names) and position < 1e-4 and rotation < 1e-3
     (camera,) = models[0].cameras.values()
     assert tuple(camera.params) == scene.known.params  # to the bit
-    assert verified_counts(tmp_path / "d.db").keys() == scene.results.keys()
+    assert read_two_views(tmp_path / "d.db").keys() == scene.results.keys()
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
@@ -48,7 +48,7 @@ def test_a_wrong_focal_length_moves_only_when_refined(tmp_path, scene, mapper):
     write_database(tmp_path / "d.db", scene.images, scene.results, wrong)
     for refine in (False, True):
         options = dataclasses.replace(ONE, mapper=mapper, refine_intrinsics=refine)
-        model = build_models(tmp_path / "d.db", options)[0]
+        model = map_database(tmp_path / "d.db", options)[0]
         (camera,) = model.cameras.values()
         if refine:
             assert camera.params[0] == pytest.approx(1280, abs=0.5)
@@ -66,7 +66,7 @@ def test_without_intrinsics_every_image_has_its_camera(tmp_path, scene):
     for camera in cameras:  # the files do not exist: the guess is COLMAP's
         assert not camera.has_prior_focal_length
         assert (camera.model_name, list(camera.params)) == ("SIMPLE_RADIAL", [1228.8, 512, 384, 0])
-    models = build_models(tmp_path / "d.db", MapOptions(threads=1))
+    models = map_database(tmp_path / "d.db", MapOptions(threads=1))
     registered, _, rotation = errors(models[0], scene.truth)
     assert registered == len(scene.names) and rotation < 1.0
 
@@ -106,10 +106,10 @@ def test_seed_threads_and_scale_reach_all_of_colmaps_options():
     """A scene without outliers comes back the same whatever they are."""
     options = MapOptions(seed=7, threads=1, scale=2.0)
     plain = pycolmap.IncrementalPipelineOptions().mapper
-    for got in (colmap._incremental_options(options), colmap._global_options(options)):
+    for got in (mapping._incremental_options(options), mapping._global_options(options)):
         assert (got.random_seed, got.mapper.random_seed) == (7, 7)
         assert (got.num_threads, got.mapper.num_threads) == (1, 1)
-    mapper = colmap._incremental_options(options).mapper
+    mapper = mapping._incremental_options(options).mapper
     for name in ("init_max_error", "abs_pose_max_error", "filter_max_reproj_error"):
         assert getattr(mapper, name) == 2 * getattr(plain, name)
 
@@ -119,7 +119,7 @@ def test_one_thread_and_one_seed_give_the_same_bytes(tmp_path, scene):
     for run in ("1", "2"):
         database, out = tmp_path / f"{run}.db", tmp_path / run
         write_database(database, scene.images, dict(reversed(scene.results.items())), None)
-        write_models(build_models(database, MapOptions(threads=1, seed=7)), out)
+        write_models(map_database(database, MapOptions(threads=1, seed=7)), out)
         files.append({p.relative_to(out): p.read_bytes() for p in out.rglob("*") if p.is_file()})
     assert files[0] and files[0] == files[1]
 
@@ -129,7 +129,7 @@ def test_an_image_without_matches_is_in_the_database_but_not_in_the_model(tmp_pa
         name="0.png", path=tmp_path / "0.png", size=scene.images[0].size, sha256=64 * "0"
     )
     write_database(tmp_path / "d.db", [lonely, *scene.images], scene.results, scene.known)
-    model = build_models(tmp_path / "d.db", ONE)[0]
+    model = map_database(tmp_path / "d.db", ONE)[0]
     assert sorted(model_poses(model)) == scene.names
     with pycolmap.Database.open(tmp_path / "d.db") as db:
         assert len(db.read_all_images()) == len(scene.names) + 1
@@ -138,5 +138,5 @@ def test_an_image_without_matches_is_in_the_database_but_not_in_the_model(tmp_pa
 def test_no_matches_give_no_model(tmp_path, scene):
     for mapper in ("incremental", "global"):
         write_database(tmp_path / "d.db", scene.images, {}, scene.known)  # replaces the former
-        assert build_models(tmp_path / "d.db", dataclasses.replace(ONE, mapper=mapper)) == []
-    assert verified_counts(tmp_path / "d.db") == {}
+        assert map_database(tmp_path / "d.db", dataclasses.replace(ONE, mapper=mapper)) == []
+    assert read_two_views(tmp_path / "d.db") == {}

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pycolmap
 import pytest
+from mapped import map_database
 
 from jaxsfm.host.colmap import (
-    MapOptions,
-    build_models,
     colour_points,
     write_database,
     write_models,
 )
+from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.poses import model_poses
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)
@@ -43,7 +43,7 @@ def test_two_scenes_give_two_models_the_larger_first(tmp_path, scene):
         for i, j in ((0, 1), (0, 2), (1, 2))
     }
     write_database(tmp_path / "d.db", small + scene.images, scene.results | other, scene.known)
-    models = build_models(tmp_path / "d.db", ONE)
+    models = map_database(tmp_path / "d.db", ONE)
     assert [sorted(model_poses(m)) for m in models] == [scene.names, [i.name for i in small]]
 
 

@@ -6,8 +6,11 @@ import threading
 import numpy as np
 import pycolmap
 import pytest
+from mapped import map_database
 
-from jaxsfm.host.colmap import THREAD, MapOptions, build_models, write_database
+from jaxsfm.host.colmap import write_database
+from jaxsfm.host.mapping import MapOptions
+from jaxsfm.host.native import THREAD
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)
 
@@ -102,7 +105,7 @@ def test_ctrl_c_while_waiting_stops_native_code(tmp_path, monkeypatch, scene, to
 
     monkeypatch.setattr(threading.Event, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        build_models(tmp_path / "d.db", ONE)
+        map_database(tmp_path / "d.db", ONE)
     assert tokens[0].is_cancelled and len(waited) == 2
     assert all(thread.name != THREAD for thread in threading.enumerate())
 
@@ -113,11 +116,11 @@ def test_a_failure_beside_the_waiting_thread_is_raised(tmp_path, scene):
 
     write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
     with pytest.raises(Exception, match="the bar broke"):
-        build_models(tmp_path / "d.db", ONE, on_image=fail)
+        map_database(tmp_path / "d.db", ONE, on_image=fail)
 
 
 def test_every_registered_image_is_counted(tmp_path, scene):
     counted = []
     write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
-    build_models(tmp_path / "d.db", ONE, on_image=lambda: counted.append(1))
+    map_database(tmp_path / "d.db", ONE, on_image=lambda: counted.append(1))
     assert len(counted) == len(scene.names)

@@ -1,0 +1,246 @@
+"""Laws of sub-pixel alignment, on textures that are known everywhere."""
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from strategies import rng_of, seeds
+from tolerances import ALIGNED_PX
+
+from jaxsfm.core.align import Templates, align, make_templates, sample, square_patch
+
+SIZE = (64, 80)
+PATCH = square_patch(7)
+
+
+def texture(rng, channels: int = 1):
+    """A smooth random function of (x, y), periods of 8 pixels and more."""
+    waves = rng.uniform(-2 * np.pi / 8, 2 * np.pi / 8, (12, 2))
+    phase, size = rng.uniform(0, 2 * np.pi, 12), rng.uniform(10, 30, (12, channels))
+    return lambda xy: 120 + np.cos(xy @ waves.T + phase) @ size
+
+
+def grid():
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    return np.stack([x, y], -1).astype(np.float64)
+
+
+def small_affine(rng) -> np.ndarray:
+    return np.eye(2) + rng.uniform(-0.25, 0.25, (2, 2))
+
+
+def views(rng, *, channels: int = 1):
+    """A reference view, another one that shows it through x -> a (x - ref) + truth, and those."""
+    f = texture(rng, channels)
+    ref = np.asarray([40.0, 32.0])
+    a, truth = small_affine(rng), ref + rng.uniform(-3, 3, 2)
+    back = np.linalg.inv(a)
+    return f(grid()), f((grid() - truth) @ back.T + ref), ref, a, truth
+
+
+def run(one, two, ref, a, start, *, patch=PATCH, size=SIZE, **options):
+    size = jnp.asarray(size, jnp.int32)
+    ref, start, a = (jnp.asarray(v, jnp.float32)[None] for v in (ref, start, a))
+    templates = make_templates(jnp.asarray(one, jnp.float32), size, ref, patch)
+    return align(jnp.asarray(two, jnp.float32), size, templates, start, a, patch, **options)
+
+
+def error(result, truth) -> float:
+    return float(np.linalg.norm(np.asarray(result.xy[0]) - truth))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds)
+def test_a_known_warp_is_found_to_hundredths_of_a_pixel(seed):
+    rng = rng_of(seed)
+    one, two, ref, a, truth = views(rng)
+    result = run(one, two, ref, a, truth + rng.uniform(-1, 1, 2))
+    assert result.converged[0] and error(result, truth) < ALIGNED_PX
+    assert result.score[0] > 0.99 and result.sigma[0] < 0.1
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_it_converges_from_two_pixels_away(seed):
+    """A quarter of the shortest period: beyond, another valley may be nearer."""
+    rng = rng_of(seed)
+    one, two, ref, a, truth = views(rng)
+    angle = rng.uniform(0, 2 * np.pi)
+    start = truth + 2 * np.asarray([np.cos(angle), np.sin(angle)])
+    assert error(run(one, two, ref, a, start), truth) < ALIGNED_PX
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_gain_and_offset_change_nothing(seed):
+    rng = rng_of(seed)
+    one, two, ref, a, truth = views(rng)
+    plain = run(one, two, ref, a, truth + 0.7)
+    changed = run(one, 0.2 * two + 40, ref, a, truth + 0.7)
+    np.testing.assert_allclose(changed.xy, plain.xy, atol=2e-3)
+    np.testing.assert_allclose(changed.score, plain.score, atol=1e-3)
+    negative = run(one, 200 - two, ref, a, truth)
+    assert negative.score[0] < 0.9  # a negative gain is another surface
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds)
+def test_on_equal_frames_opencvs_ecc_ends_at_the_same_place(seed):
+    rng = rng_of(seed)
+    f, ref = texture(rng), np.asarray([40.0, 32.0])
+    shift = rng.uniform(-1, 1, 2)
+    one, two = f(grid())[..., 0], f(grid() - shift)[..., 0]
+    result = run(one[..., None], two[..., None], ref, np.eye(2), ref)
+    crop = np.float32(one[32 - 7 : 32 + 8, 40 - 7 : 40 + 8])
+    warp = np.float32([[1, 0, 33], [0, 1, 25]])
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-8)
+    _, warp = cv2.findTransformECC(
+        crop, np.float32(two), warp, cv2.MOTION_TRANSLATION, stop, np.ones_like(two, np.uint8), 1
+    )
+    ecc = warp[:, 2] + 7
+    np.testing.assert_allclose(np.asarray(result.xy[0]), ecc, atol=2 * ALIGNED_PX)
+
+
+def test_flat_patches_stay_where_they_are_and_do_not_count():
+    flat = np.full((*SIZE, 1), 7.0)
+    rng = rng_of(1)
+    one, two, ref, a, _ = views(rng)
+    start = np.asarray([40.3, 30.2])
+    for first, second in ((flat, two), (one, flat), (flat, flat)):
+        result = run(first, second, ref, a, start)
+        assert not result.converged[0] and np.isfinite(np.asarray(result.xy)).all()
+    np.testing.assert_allclose(run(flat, two, ref, a, start).xy[0], start, atol=1e-5)
+
+
+def test_an_edge_tells_its_direction_only():
+    """A straight edge leaves the shift along it open: the deviation says so."""
+    edge = np.tanh((grid()[..., :1] - 40.3) / 2)
+    corner = edge + np.tanh((grid()[..., 1:] - 32.2) / 2)
+    noise = rng_of(0).normal(0, 0.02, (2, *SIZE, 1))
+    ref = np.asarray([40.0, 32.0])
+    sharp = run(corner + noise[0], corner + noise[1], ref, np.eye(2), ref)
+    blind = run(edge + noise[0], edge + noise[1], ref, np.eye(2), ref)
+    assert sharp.sigma[0] < 0.05 < 5 * sharp.sigma[0] < blind.sigma[0]
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds)
+def test_the_stated_deviation_is_the_real_one(seed):
+    """Noise in both views; the mean square of error / sigma is that of two coordinates at most."""
+    rng = rng_of(seed)
+    f, ref = texture(rng), np.asarray([40.0, 32.0])
+    one = f(grid())
+    ratios = []
+    for _ in range(12):
+        noisy = one + rng.normal(0, 6, one.shape), one + rng.normal(0, 6, one.shape)
+        result = run(*noisy, ref, np.eye(2), ref)
+        ratios.append(error(result, ref) / float(result.sigma[0]))
+    assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 3
+
+
+def test_patches_that_leave_the_image_do_not_count():
+    one, two, ref, a, truth = views(rng_of(2))
+    assert not run(one, two, np.asarray([3.0, 30.0]), a, truth).converged[0]
+    assert not run(one, two, ref, a, np.asarray([78.0, 30.0])).converged[0]
+
+
+@settings(max_examples=10, deadline=None)
+@given(seeds)
+def test_several_channels_and_padding_give_what_they_should(seed):
+    rng = rng_of(seed)
+    one, two, ref, a, truth = views(rng, channels=5)
+    plain = run(one, two, ref, a, truth + 0.5)
+    assert error(plain, truth) < ALIGNED_PX
+    wide = [np.pad(v, ((0, 9), (0, 5), (0, 0)), constant_values=1e3) for v in (one, two)]
+    padded = run(*wide, ref, a, truth + 0.5)
+    np.testing.assert_allclose(padded.xy, plain.xy, atol=1e-5)
+
+
+def test_a_batch_is_its_members():
+    rng = rng_of(5)
+    one, two, ref, a, truth = views(rng)
+    starts = truth + rng.uniform(-1, 1, (6, 2))
+    size = jnp.asarray(SIZE, jnp.int32)
+    refs = jnp.asarray(np.tile(ref, (6, 1)), jnp.float32)
+    templates = make_templates(jnp.asarray(one, jnp.float32), size, refs, PATCH)
+    affine = jnp.asarray(np.tile(a, (6, 1, 1)), jnp.float32)
+    image = jnp.asarray(two, jnp.float32)
+    batch = align(image, size, templates, jnp.asarray(starts, jnp.float32), affine, PATCH)
+    for k, start in enumerate(starts):
+        alone = run(one, two, ref, a, start)
+        np.testing.assert_allclose(batch.xy[k], alone.xy[0], atol=1e-4)
+
+
+def test_sampling_is_exact_on_pixels_and_parabolas_and_clamped_outside():
+    rng = rng_of(0)
+    image = jnp.asarray(rng.normal(size=(5, 6, 2)), jnp.float32)
+    size = jnp.asarray([5, 6], jnp.int32)
+    at = jnp.asarray([[0.0, 0.0], [5.0, 4.0], [2.0, 3.0], [-3.0, 2.0], [7.0, 9.0]])
+    values, inside = sample(image, size, at)
+    np.testing.assert_array_equal(np.asarray(inside), [True, True, True, False, False])
+    np.testing.assert_allclose(values[0], image[0, 0])
+    np.testing.assert_allclose(values[1], image[4, 5], rtol=1e-6)
+    np.testing.assert_allclose(values[2], image[3, 2], rtol=1e-6)
+    np.testing.assert_allclose(values[3], image[2, 0], rtol=1e-6)
+    np.testing.assert_allclose(values[4], image[4, 5], rtol=1e-6)
+    y, x = np.mgrid[:9, :9].astype(np.float32)
+    parabola = jnp.asarray((0.3 * x * x - y * y + x * y)[..., None])
+    at = jnp.asarray([[2.3, 4.8], [5.5, 3.25]])
+    want = 0.3 * at[:, 0] ** 2 - at[:, 1] ** 2 + at[:, 0] * at[:, 1]
+    got = sample(parabola, jnp.asarray([9, 9], jnp.int32), at)[0][:, 0]
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_where_a_keypoint_ends_follows_the_map_and_its_gradient_is_finite():
+    """Moving the whole map by t moves the aligned keypoint by t: d xy / d t = identity."""
+    f, ref = texture(rng_of(4)), np.asarray([40.0, 32.0])
+    one = jnp.asarray(f(grid()), jnp.float32)
+    size = jnp.asarray(SIZE, jnp.int32)
+    at = jnp.asarray(ref, jnp.float32)[None]
+    affine = jnp.eye(2)[None]
+    pixels = jnp.asarray(grid(), jnp.float32)
+
+    def end(t, image):
+        moved = sample(image, size, pixels - t)[0]
+        templates = make_templates(one, size, at, PATCH)
+        return align(moved, size, templates, at, affine, PATCH).xy[0]
+
+    jacobian = jax.jacobian(end)(jnp.asarray([0.3, -0.4]), one)
+    np.testing.assert_allclose(jacobian, np.eye(2), atol=0.1)
+    for image in (one, jnp.zeros_like(one)):
+        gradient = jax.grad(lambda m: end(jnp.zeros(2), m).sum())(image)  # noqa: B023
+        assert jnp.isfinite(gradient).all()
+
+
+def test_gradients_with_respect_to_keypoints_vanish_once_converged():
+    """The end does not depend on the start: its derivative is finite and near zero."""
+    one, two, ref, a, truth = views(rng_of(6))
+    size = jnp.asarray(SIZE, jnp.int32)
+    templates = make_templates(
+        jnp.asarray(one, jnp.float32), size, jnp.asarray(ref, jnp.float32)[None], PATCH
+    )
+
+    def end(start):
+        image = jnp.asarray(two, jnp.float32)
+        affine = jnp.asarray(a, jnp.float32)[None]
+        return align(image, size, templates, start[None], affine, PATCH).xy[0]
+
+    jacobian = jax.jacobian(end)(jnp.asarray(truth + 0.4, jnp.float32))
+    assert jnp.isfinite(jacobian).all() and jnp.abs(jacobian).max() < 0.05
+
+
+def test_templates_are_normalised_and_a_patch_weighs_one():
+    one, _, ref, _, _ = views(rng_of(7), channels=3)
+    size = jnp.asarray(SIZE, jnp.int32)
+    t = make_templates(
+        jnp.asarray(one, jnp.float32), size, jnp.asarray(ref, jnp.float32)[None], PATCH
+    )
+    assert isinstance(t, Templates)
+    w = PATCH.weights
+    np.testing.assert_allclose(w.sum(), 1, rtol=1e-5)
+    np.testing.assert_allclose(jnp.einsum("q,nqc->nc", w, t.values), np.zeros((1, 3)), atol=1e-5)
+    np.testing.assert_allclose(jnp.einsum("q,nqc->n", w, t.values**2), [1.0], rtol=1e-4)
+    with pytest.raises(ValueError, match="radius"):
+        square_patch(0)

@@ -1,0 +1,28 @@
+"""Verification and mapping of a database, as the pipeline strings them together."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pycolmap
+
+from jaxsfm.host.colmap import read_two_views, verify
+from jaxsfm.host.mapping import MapOptions, build_models
+
+
+def verified(path: Path, options: MapOptions):
+    """The pairs of a database after COLMAP's verification."""
+    verify(
+        path,
+        seed=options.seed,
+        threads=options.threads,
+        scale=options.scale,
+        relative_poses=True,
+    )
+    return read_two_views(path)
+
+
+def map_database(
+    path: Path, options: MapOptions, *, on_image: Callable[[], None] = lambda: None
+) -> list[pycolmap.Reconstruction]:
+    """Its models, the largest first."""
+    return build_models(path, verified(path, options), options, on_image=on_image)[0]
