@@ -171,9 +171,17 @@ class TwoView(NamedTuple):
 
     geometry: PairGeometry
     tri_angle_deg: float
-    """Median angle between the rays of a point; 0 if unknown."""
+    """Median angle between the rays of a point; 0 if unknown. (COLMAP's own is not stored.)"""
     planar: bool
     """A homography explains all inliers."""
+
+
+def _rays(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
+    """Unit directions (n, 3) of pixels, in the camera's frame."""
+    flat = camera.cam_from_img(np.ascontiguousarray(xy + float(PIXEL_OFFSET)))
+    assert flat is not None
+    rays = np.c_[flat, np.ones(len(flat))]
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 def read_two_views(path: Path) -> dict[Pair, TwoView]:
@@ -183,28 +191,36 @@ def read_two_views(path: Path) -> dict[Pair, TwoView]:
     """
     with pycolmap.Database.open(path) as db:
         images = {image.image_id: image for image in db.read_all_images()}
-        sizes = {c.camera_id: (c.width, c.height) for c in db.read_all_cameras()}
+        cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
+        camera_of = {i: cameras[image.camera_id] for i, image in images.items()}
         xy = {i: np.asarray(db.read_keypoints(i))[:, :2] - PIXEL_OFFSET for i in images}
         found = {}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             if not len(geometry.inlier_matches):
                 continue
             a, b = pycolmap.pair_id_to_image_pair(pair_id)
-            rotation = None
+            seen = [
+                xy[i][geometry.inlier_matches[:, side]].astype(np.float64)
+                for side, i in enumerate((a, b))
+            ]
+            covered = min(
+                spread(at, (camera_of[i].width, camera_of[i].height))
+                for at, i in zip(seen, (a, b), strict=True)
+            )
+            rotation, angle = None, 0.0
             if geometry.cam2_from_cam1 is not None:
                 rotation = geometry.cam2_from_cam1.rotation.matrix()
+                rays = [_rays(camera_of[i], at) for at, i in zip(seen, (a, b), strict=True)]
+                cross = np.linalg.norm(np.cross(rays[0] @ rotation.T, rays[1]), axis=1)
+                angle = float(np.degrees(np.median(np.arcsin(np.minimum(cross, 1.0)))))
             if images[a].name > images[b].name:
                 rotation = None if rotation is None else rotation.T
-            covered = min(
-                spread(xy[i][geometry.inlier_matches[:, side]], sizes[images[i].camera_id])
-                for side, i in enumerate((a, b))
-            )
             name0, name1 = sorted((images[a].name, images[b].name))
             found[name0, name1] = TwoView(
                 PairGeometry(
                     num_inliers=len(geometry.inlier_matches), rotation=rotation, spread=covered
                 ),
-                float(np.degrees(max(geometry.tri_angle, 0.0))),
+                angle,
                 int(geometry.config) in PLANAR,
             )
         return found

@@ -158,6 +158,7 @@ def bundle_adjust(
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Not pycolmap.bundle_adjustment: it switches COLMAP's log messages on for the whole process.
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    model.update_point_3d_errors()  # the solver leaves them as they were
 
 
 def filter_points(model: pycolmap.Reconstruction, *, max_error_px: float) -> None:

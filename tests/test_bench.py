@@ -1,0 +1,105 @@
+"""`bench strecha` on a rendered set in Strecha's layout."""
+
+import json
+import shutil
+
+import pytest
+
+from jaxsfm.bench import METHODS, find_sets, method_config, ratios
+from jaxsfm.cli import main
+from jaxsfm.config import preset
+
+
+@pytest.fixture(scope="module")
+def root(scene, tmp_path_factory):
+    """One set: SET/images with K.txt, SET/gt_dense_cameras."""
+    folder = tmp_path_factory.mktemp("sets")
+    shutil.copytree(scene / "images", folder / "room" / "images")
+    shutil.copy(scene / "K.txt", folder / "room" / "images" / "K.txt")
+    shutil.copytree(scene / "reference", folder / "room" / "gt_dense_cameras")
+    return folder
+
+
+def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys):
+    out = tmp_path / "figures.json"
+    args = ["bench", "strecha", "--root", str(root), "--json", str(out)]
+    assert main([*args, "--out", str(tmp_path / "work"), "--threads", "1"]) == 0
+    text, figures = capsys.readouterr().out, json.loads(out.read_text())
+    rows = {row["method"]: row for row in figures["rows"]}
+    assert tuple(rows) == METHODS
+    for method, row in rows.items():
+        assert row["set"] == "room" and row["images"] == 3 and f"room             {method}" in text
+        assert row["seconds"] > 0
+    for method in ("grid", "reloc", "default"):  # the third view is RootSIFT's to lose: it is night
+        assert rows[method]["registered"] == 3 and rows[method]["focal_error_percent"] == 0
+    assert rows["default"]["reprojection_error_px"] < 0.5 * rows["reloc"]["reprojection_error_px"]
+    for stage in ("extraction", "matching"):  # done once, counted twice
+        assert rows["default"]["stages"][stage] == rows["reloc"]["stages"][stage]
+    assert "published" in text and (tmp_path / "work" / "room" / "dense" / "sparse").is_dir()
+
+    again = ["--methods", "default", "--sets", "room", "--intrinsics", "unknown"]
+    assert main([*args, *again, "--out", str(tmp_path / "work")]) == 0
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["method"] == "default" and row["focal_error_percent"] > 0
+
+
+def test_methods_differ_in_the_switch_they_name():
+    default = preset("default")
+    assert method_config("default") == default
+    for method, keypoints in (("grid", "grid"), ("reloc", "relocalized")):
+        config = method_config(method)
+        assert config.keypoints == keypoints and config.refinement is None
+        assert config.view_graph and config.pair == default.pair
+
+
+def row(name, method, position, points):
+    return {
+        "set": name,
+        "method": method,
+        "position": {"mean": position},
+        "rotation_deg": {"mean": 2 * position},
+        "points": points,
+        "reprojection_error_px": 0.5 * position,
+    }
+
+
+def test_ratios_are_means_of_the_sets_ratios():
+    rows = [
+        row("a", "rootsift", 1.0, 10),
+        row("a", "default", 0.5, 20),
+        row("b", "rootsift", 2.0, 10),
+        row("b", "default", 3.0, 30),
+        row("c", "default", 1.0, 1),  # nothing to compare with
+        {"set": "b", "method": "grid", "registered": 0},
+    ]
+    got = ratios(rows)
+    assert set(got) == {"default"} and set(got["default"]["sets"]) == {"a", "b"}
+    assert got["default"]["mean"] == {
+        "position": 1.0,
+        "rotation": 1.0,
+        "points": 2.5,
+        "reprojection_error": 1.0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}", "--sets", "cathedral"], "no set 'cathedral'"),
+        (["--root", "{root}/room"], "no Strecha sets"),
+        (["--root", "{root}", "--json", "figures.txt"], "--json"),
+    ],
+)
+def test_what_cannot_be_benchmarked_is_said(root, capsys, args, word):
+    assert main(["bench", "strecha", *(a.format(root=root) for a in args)]) == 2
+    error = capsys.readouterr().err
+    assert word in error and "Traceback" not in error
+
+
+def test_a_camera_matrix_that_is_none_is_named(root, tmp_path, capsys):
+    shutil.copytree(root / "room", tmp_path / "odd")
+    (tmp_path / "odd" / "images" / "K.txt").write_text("1 2 3")
+    assert main(["bench", "strecha", "--root", str(tmp_path)]) == 2
+    assert "K.txt" in capsys.readouterr().err
+    assert [path.name for path in find_sets(tmp_path, None)] == ["odd"]

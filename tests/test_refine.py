@@ -1,0 +1,324 @@
+"""Multi-view refinement against exact cameras, planes and pixels of a rendered room."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+import pytest
+
+from jaxsfm import surface
+from jaxsfm.config import Refinement
+from jaxsfm.evaluation import evaluate
+from jaxsfm.host.model import Tracks, View, build_model, bundle_adjust, read_model_arrays
+from jaxsfm.host.poses import CameraPose, model_poses
+from jaxsfm.refine import refine_model
+from jaxsfm.synthetic import arc, camera_matrix, render, room
+
+SIZE = (480, 360)
+
+
+class Room(NamedTuple):
+    views: list[View]
+    images: dict[str, np.ndarray]
+    """Intensities by name."""
+    poses: dict[str, CameraPose]
+    points: np.ndarray
+    plane: np.ndarray
+    """Which plane each point lies on."""
+    normals: np.ndarray
+    visible: np.ndarray
+    """bool (points, views)."""
+
+
+def camera(size=SIZE) -> pycolmap.Camera:
+    k = camera_matrix(size)
+    params = [k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5]
+    return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
+
+
+def view_of(pose: CameraPose, number: int) -> View:
+    return View(
+        image_id=number + 1,
+        name=f"{number}.png",
+        rotation=pose.rotation,
+        centre=pose.centre,
+        camera=camera(),
+        scale=np.ones(2),
+        size=SIZE,
+    )
+
+
+def hidden(points, own, centre, planes) -> np.ndarray:
+    """Whether another plane lies between a camera and each point."""
+    ray = points - centre
+    covered = np.zeros(len(points), bool)
+    for k, plane in enumerate(planes):
+        normal = np.cross(plane.right, plane.down)
+        depth = ((plane.corner - centre) @ normal) / (ray @ normal)
+        offset = centre + depth[:, None] * ray - plane.corner
+        a = offset @ plane.right / (plane.right @ plane.right)
+        b = offset @ plane.down / (plane.down @ plane.down)
+        inside = (a > -0.02) & (a < 1.02) & (b > -0.02) & (b < 1.02)
+        covered |= inside & (depth > 0) & (depth < 0.99) & (own != k)
+    return covered
+
+
+@pytest.fixture(scope="module")
+def rendered() -> Room:
+    rng = np.random.default_rng(0)
+    planes, poses = room(), arc(5)
+    points, plane, normals = [], [], []
+    for k, p in enumerate(planes):
+        st = rng.uniform(0.03, 0.97, (250, 2))
+        points.append(p.corner + st[:, :1] * p.right + st[:, 1:] * p.down)
+        plane += [k] * len(st)
+        normal = np.cross(p.right, p.down)
+        normals += [normal / np.linalg.norm(normal)] * len(st)
+    points, plane = np.concatenate(points), np.asarray(plane)
+    views = [view_of(pose, k) for k, pose in enumerate(poses)]
+    visible = np.zeros((len(points), len(views)), bool)
+    images = {}
+    for k, view in enumerate(views):
+        xy, depth = view.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = (xy > 1).all(1) & (xy < np.asarray(SIZE) - 2).all(1)
+        visible[:, k] = (depth > 0) & inside & ~hidden(points, plane, view.centre, planes)
+        rgb = render(planes, poses[k], SIZE).astype(np.float32)
+        images[view.name] = rgb @ np.float32([0.299, 0.587, 0.114])
+    keep = visible.sum(1) >= 2
+    return Room(
+        views,
+        images,
+        {view.name: pose for view, pose in zip(views, poses, strict=True)},
+        points[keep],
+        plane[keep],
+        np.asarray(normals)[keep],
+        visible[keep],
+    )
+
+
+def exact_tracks(scene: Room, *, use=None) -> Tracks:
+    point, view = np.nonzero(scene.visible if use is None else use)
+    xy = np.asarray(
+        [
+            scene.views[v].project(scene.points[p : p + 1])[0][0]
+            for p, v in zip(point, view, strict=True)
+        ]
+    )
+    return Tracks(scene.points, point, view, xy)
+
+
+def noisy_model(scene: Room, sigma: float, *, use=None) -> pycolmap.Reconstruction:
+    """Every observation (but none of the truth) moved by noise, then bundle adjusted."""
+    tracks = exact_tracks(scene, use=use)
+    rng = np.random.default_rng(1)
+    tracks = tracks._replace(xy=tracks.xy + rng.normal(0, sigma, tracks.xy.shape))
+    model = build_model(template(scene), scene.views, tracks)
+    if sigma:
+        bundle_adjust(model, loss_px=1.0, refine_intrinsics=False, threads=1)
+    return model
+
+
+def template(scene: Room) -> pycolmap.Reconstruction:
+    """Cameras and poses alone."""
+    model = pycolmap.Reconstruction()
+    known = camera()
+    known.camera_id = 1
+    model.add_camera_with_trivial_rig(known)
+    for view in scene.views:
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view.rotation), -view.rotation @ view.centre)
+        image = pycolmap.Image(name=view.name, camera_id=1, image_id=view.image_id)
+        model.add_image_with_trivial_frame(image, pose)
+    return model
+
+
+def read_of(scene: Room, change=lambda image: image):
+    return lambda name: (change(scene.images[name]), (1.0, 1.0))
+
+
+def errors(model, scene: Room) -> tuple[float, float]:
+    e = evaluate(model_poses(model), scene.poses)
+    return e.position["mean"], e.rotation_deg["mean"]
+
+
+def refine(model, scene, change=lambda image: image, **config):
+    return refine_model(
+        model,
+        read_of(scene, change),
+        config=Refinement(**config),
+        refine_intrinsics=False,
+        threads=1,
+    )
+
+
+def sizes(scene: Room):
+    return {view.name: (SIZE, (1.0, 1.0)) for view in scene.views}
+
+
+# -- the whole refinement --------------------------------------------------------------------------
+
+
+def test_noisy_keypoints_end_near_the_exact_cameras(rendered):
+    """One pixel of noise on every keypoint; the poses come closer to the truth by three times."""
+    before = noisy_model(rendered, 1.0)
+    after, figures = refine(before, rendered)
+    (p0, r0), (p1, r1) = errors(before, rendered), errors(after, rendered)
+    assert p1 < p0 / 3 and r1 < r0 / 3
+    assert after.compute_mean_reprojection_error() < 0.3
+    assert before.compute_mean_reprojection_error() > 0.9  # its own model was not touched
+    assert len(figures) == 2 and figures[0].kept > 0.5 * rendered.visible.sum()
+
+
+def test_gain_and_offset_of_a_view_change_little(rendered):
+    dark = {"1.png": 0.3, "3.png": 0.6}
+    model = noisy_model(rendered, 1.0)
+    plain, _ = refine(model, rendered)
+    images = {n: dark.get(n, 1.0) * i + 12 for n, i in rendered.images.items()}
+    other, _ = refine(model, rendered._replace(images=images))
+    np.testing.assert_allclose(errors(other, rendered), errors(plain, rendered), atol=3e-3)
+
+
+def test_lost_observations_come_back_and_hidden_ones_do_not(rendered):
+    """Tracks of two views grow to the views that show the point, and to no others."""
+    use = np.zeros_like(rendered.visible)
+    for row, seen in zip(use, rendered.visible, strict=True):
+        row[np.flatnonzero(seen)[:2]] = True
+    before = noisy_model(rendered, 0.3, use=use)
+    after, figures = refine(before, rendered)
+    assert sum(f.added for f in figures) > 500
+    assert after.compute_mean_track_length() > 1.5 * before.compute_mean_track_length()
+    views, tracks = read_model_arrays(after, sizes(rendered))
+    # After alignment to the truth every point lies on its plane: find the plane, ask who hides it.
+    planes = room()
+    wrong = 0
+    aligned = np.asarray([v.centre for v in views])
+    truth = np.asarray([rendered.poses[v.name].centre for v in views])
+    from jaxsfm.evaluation import umeyama
+
+    sim = umeyama(aligned, truth)
+    points = sim.scale * tracks.points @ sim.rotation.T + sim.translation
+    distance = np.stack(
+        [
+            np.abs((points - p.corner) @ np.cross(p.right, p.down))
+            / np.linalg.norm(np.cross(p.right, p.down))
+            for p in planes
+        ]
+    )
+    own = distance.argmin(0)
+    for k, view in enumerate(views):
+        rows = tracks.point[tracks.view == k]
+        wrong += hidden(points[rows], own[rows], truth[k], planes).sum()
+        assert view.name == rendered.views[k].name
+    assert wrong < 0.02 * len(tracks.xy)
+
+
+def test_flat_photos_leave_the_model_as_it_was(rendered):
+    before = noisy_model(rendered, 1.0)
+    after, figures = refine(before, rendered, lambda image: np.full_like(image, 80.0))
+    assert figures == [] and errors(after, rendered) == errors(before, rendered)
+    assert after.num_points3D() == before.num_points3D()
+
+
+def test_one_thread_gives_the_same_model_to_the_last_bit(rendered):
+    model = noisy_model(rendered, 1.0)
+    one, two = (refine(model, rendered, passes=1)[0] for _ in range(2))
+    for image_id in one.reg_image_ids():
+        a, b = (m.image(image_id).cam_from_world().matrix() for m in (one, two))
+        assert np.array_equal(a, b)
+
+
+def test_thresholds_refuse_what_makes_no_sense_and_have_effects(rendered):
+    for wrong in ({"passes": 0}, {"radius": 0}, {"max_shift_px": 0.0}, {"min_score": 1.0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            Refinement(**wrong)
+    model = noisy_model(rendered, 1.0)
+    base = refine(model, rendered, passes=1)[1][0]
+    for change in (
+        {"min_score": 0.97},
+        {"max_sigma_px": 0.05},
+        {"max_shift_px": 0.7},
+        {"min_cosine": 0.8},
+        {"max_stretch": 1.2},
+        {"max_error_px": 0.1},
+        {"iterations": 2},
+        {"radius": 3},
+        {"neighbours": 6},
+    ):
+        figures = refine(model, rendered, passes=1, **change)[1][0]
+        assert dataclasses.astuple(figures) != dataclasses.astuple(base), change
+
+
+# -- its parts -------------------------------------------------------------------------------------
+
+
+def test_arrays_of_a_model_become_the_same_model(rendered):
+    tracks = exact_tracks(rendered)
+    model = build_model(template(rendered), rendered.views, tracks)
+    views, back = read_model_arrays(model, sizes(rendered))
+    np.testing.assert_allclose(back.points, tracks.points)
+    order = np.lexsort((back.view, back.point))
+    np.testing.assert_array_equal(back.point[order], tracks.point)
+    np.testing.assert_array_equal(back.view[order], tracks.view)
+    np.testing.assert_allclose(back.xy[order], tracks.xy, atol=1e-9)
+    for one, two in zip(views, rendered.views, strict=True):
+        np.testing.assert_allclose(one.rotation, two.rotation, atol=1e-12)
+        np.testing.assert_allclose(one.centre, two.centre, atol=1e-12)
+
+
+def test_projection_and_rays_undo_each_other_for_any_camera_and_scale():
+    pose = arc(3)[0]
+    distorted = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=960, height=720, params=[900.0, 470.0, 350.0, -0.08]
+    )
+    view = dataclasses.replace(view_of(pose, 0), camera=distorted, scale=np.asarray([2.0, 1.9]))
+    xy = np.random.default_rng(0).uniform([0, 0], [479, 359], (50, 2))
+    back, depth = view.project(view.centre + 3.0 * view.rays(xy))
+    np.testing.assert_allclose(back, xy, atol=1e-6)
+    np.testing.assert_allclose(depth, 3.0)
+    behind, depth = view.project(view.centre - view.rays(xy))
+    assert np.isnan(behind).all() and (depth < 0).all()
+
+
+def test_normals_are_the_planes_normals_and_face_the_cameras(rendered):
+    got = surface.normals(exact_tracks(rendered), rendered.views, neighbours=12)
+    cosine = np.abs(np.einsum("ni,ni->n", got, rendered.normals))
+    assert np.mean(cosine > np.cos(np.radians(5))) > 0.8  # the rest lies where planes meet
+    centre = np.mean([view.centre for view in rendered.views], axis=0)
+    assert np.mean(np.einsum("ni,ni->n", got, centre - rendered.points) > 0) > 0.95
+
+
+def test_plane_affines_are_derivatives_of_the_planes_homography(rendered):
+    one, two = rendered.views[0], rendered.views[3]
+    both = np.flatnonzero(rendered.visible[:, 0] & rendered.visible[:, 3])
+    points, normals = rendered.points[both], rendered.normals[both]
+    xy = one.project(points)[0]
+    n = len(both)
+    zeros, threes = np.zeros(n, int), np.full(n, 3)
+    got = surface.plane_affines(points, rendered.views, normals, zeros, threes, xy)
+    k = camera_matrix(SIZE)
+    for i in range(0, n, 17):
+        rotation = two.rotation @ one.rotation.T
+        shift = two.rotation @ (one.centre - two.centre)
+        normal = one.rotation @ normals[i]
+        depth = normal @ (one.rotation @ (points[i] - one.centre))
+        h = k @ (rotation + np.outer(shift, normal) / depth) @ np.linalg.inv(k)
+        p = np.append(xy[i], 1.0)
+        u, v, w = h @ p
+        want = np.asarray([(h[r, :2] * w - (u, v)[r] * h[2, :2]) / w**2 for r in (0, 1)])
+        np.testing.assert_allclose(got[i], want, rtol=1e-3, atol=1e-4)
+
+
+def test_points_move_onto_their_reference_rays_within_their_planes(rendered):
+    tracks = exact_tracks(rendered)
+    seen = surface.visibility(tracks, rendered.views, rendered.normals)
+    reference = surface.reference_views(seen)
+    assert seen.tracked[np.arange(len(reference)), reference].all()
+    xy = seen.xy[np.arange(len(reference)), reference]
+    moved_xy = xy + np.random.default_rng(2).normal(0, 1, xy.shape)
+    moved = surface.on_reference_rays(tracks, rendered.views, rendered.normals, reference, moved_xy)
+    off = np.einsum("ni,ni->n", moved - tracks.points, rendered.normals)
+    assert np.mean(np.abs(off) < 1e-9) > 0.9  # else: nearly parallel, the depth was kept
+    for k, view in enumerate(rendered.views):
+        rows = reference == k
+        np.testing.assert_allclose(view.project(moved[rows])[0], moved_xy[rows], atol=1e-6)
