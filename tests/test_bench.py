@@ -37,10 +37,11 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
         assert rows["default"]["stages"][stage] == rows["reloc"]["stages"][stage]
     assert "published" in text and (tmp_path / "work" / "room" / "dense" / "sparse").is_dir()
 
-    again = ["--methods", "default", "--sets", "room", "--intrinsics", "unknown"]
+    again = ["--methods", "reloc,default", "--sets", "room", "--intrinsics", "unknown"]
     assert main([*args, *again, "--out", str(tmp_path / "work")]) == 0
-    (row,) = json.loads(out.read_text())["rows"]
-    assert row["method"] == "default" and row["focal_error_percent"] > 0
+    rows = json.loads(out.read_text())["rows"]
+    assert [row["method"] for row in rows] == ["reloc", "default"]
+    assert all(row["focal_error_percent"] > 0 for row in rows)
 
 
 def test_methods_differ_in_the_switch_they_name():
@@ -88,6 +89,7 @@ def test_ratios_are_means_of_the_sets_ratios():
         (["--root", "/nowhere"], "no such folder"),
         (["--root", "{root}", "--sets", "cathedral"], "no set 'cathedral'"),
         (["--root", "{root}/room"], "no Strecha sets"),
+        (["--root", "{root}", "--methods", "default,orb"], "no method 'orb'"),
         (["--root", "{root}", "--json", "figures.txt"], "--json"),
     ],
 )

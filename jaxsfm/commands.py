@@ -1,0 +1,314 @@
+"""What each command of the command line does; `cli` parses and reports errors.
+
+Heavy modules are imported inside the commands, so that --help is quick.
+"""
+
+import dataclasses
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from jaxsfm.config import Config, Keypoints, Refinement, preset
+from jaxsfm.errors import UserError
+
+Positional = tyro.conf.Positional
+Preset = Literal["paper", "default"]
+Switch = Literal["preset", "yes", "no"]
+
+
+def _config(
+    name: str,
+    max_size: int,
+    keypoints: Keypoints,
+    view_graph: Switch = "preset",
+    refine: int | None = None,
+) -> Config:
+    try:
+        config = dataclasses.replace(preset(name), max_size=max_size, keypoints=keypoints)
+        if view_graph != "preset":
+            config = dataclasses.replace(config, view_graph=view_graph == "yes")
+        if refine is not None:
+            if refine < 0:
+                raise ValueError(f"refine must be at least 0; got {refine}")
+            passes = Refinement(passes=refine) if refine else None
+            config = dataclasses.replace(config, refinement=passes)
+        return config
+    except ValueError as error:
+        raise UserError(f"--{str(error).replace('_', '-', 1)}") from error
+
+
+def _check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
+    """Fail before the work, not after it."""
+    if path is None:
+        return
+    if path.suffix.lower() not in suffixes:
+        raise UserError(f"{option} {path}: the name must end in {' or '.join(suffixes)}")
+    try:
+        writable = not path.is_dir() and path.parent.is_dir() and os.access(path.parent, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        raise UserError(f"{option} {path}: cannot be written there")
+
+
+def reconstruct(
+    images: Positional[Path],
+    *,
+    out: Path,
+    preset: Preset = "default",
+    intrinsics: str | None = None,
+    refine_intrinsics: Literal["auto", "yes", "no"] = "auto",
+    pairs: str = "exhaustive",
+    best_pairs: int | None = None,
+    view_graph: Switch = "preset",
+    refine: int | None = None,
+    max_size: int = 1600,
+    keypoints: Keypoints = "relocalized",
+    mapper: Literal["incremental", "global"] = "incremental",
+    seed: int = 0,
+    threads: int = -1,
+    reference: Path | None = None,
+) -> int:
+    """A folder of photos to a COLMAP model.
+
+    Args:
+      images: Folder with the photos; sub-folders are included.
+      out: Folder for the results; a run that was interrupted goes on there.
+      preset: paper: the constants of the authors' code. default: iterated refits, the most
+        similar of several matches, view graph, two passes of refinement.
+      intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
+        model, COLMAP's pixels) for all photos; without it one camera per photo.
+      refine_intrinsics: Whether mapping refines them; auto: unless they are given.
+      pairs: exhaustive, or a file with two image names a line.
+      best_pairs: Hand on only each image's N pairs with the most inliers.
+      view_graph: Whether to hand on only pairs whose rotations agree with stronger pairs (scenes
+        that repeat themselves).
+      refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
+      max_size: Longer side of the working images, pixels.
+      keypoints: relocalized, or grid: cell centres (for the ablation).
+      mapper: COLMAP's incremental or global mapper.
+      seed: Of everything random.
+      threads: Of COLMAP's part; 1 makes the model repeatable to the last byte; -1: all.
+      reference: Reference poses (Strecha .camera files or a COLMAP model) to evaluate against.
+    """
+    config = _config(preset, max_size, keypoints, view_graph, refine)
+    from jaxsfm.report import summary_lines
+    from jaxsfm.run import RunOptions, run_folder
+
+    options = RunOptions(
+        pairs=pairs,
+        best_pairs=best_pairs,
+        intrinsics=intrinsics,
+        refine_intrinsics=refine_intrinsics,
+        mapper=mapper,
+        seed=seed,
+        threads=threads,
+        reference=reference,
+        progress=True,
+    )
+    report = run_folder(images, out, config=config, options=options)
+    print("\n".join(summary_lines(report)))
+    if not report["models"]:
+        print(
+            f"jaxsfm: no model: see the lost images above and {out / 'report.json'}",
+            file=sys.stderr,
+        )
+        return 1
+    return 0
+
+
+def match(
+    image0: Positional[Path],
+    image1: Positional[Path],
+    *,
+    out: Path,
+    plot: Path | None = None,
+    preset: Preset = "default",
+    max_size: int = 1600,
+    keypoints: Keypoints = "relocalized",
+    seed: int = 0,
+) -> int:
+    """Match two images; writes keypoints, planes and homographies.
+
+    Args:
+      image0: The first image.
+      image1: The second image.
+      out: File.npz with keypoints0, keypoints1 (n x 2, original pixels, centre of the top-left
+        pixel (0, 0)), plane (n) and homographies (p x 3 x 3, image 0 to image 1).
+      plot: Picture of the matches, a colour for each plane.
+      preset: See reconstruct.
+      max_size: Longer side of the working images, pixels.
+      keypoints: relocalized, or grid: cell centres.
+      seed: Of the RANSAC draws.
+    """
+    config = _config(preset, max_size, keypoints)
+    _check_writable(out, "--out", (".npz",))
+    _check_writable(plot, "--plot", (".png", ".jpg"))
+    if not 0 <= seed < 2**31:
+        raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
+    import numpy as np
+
+    from jaxsfm.host.features import image_features
+    from jaxsfm.host.images import inspect_image, read_image
+    from jaxsfm.host.weights import load_weights
+    from jaxsfm.host.workfolder import atomic_file
+    from jaxsfm.pipeline import match_features, on_device
+
+    files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
+    weights = on_device(load_weights())
+    features = [image_features(weights, file, config=config) for file in files]
+    result = match_features(features[0], features[1], config=config, seed=seed)
+    with atomic_file(out) as file:
+        np.savez(
+            file,
+            keypoints0=result.keypoints0,
+            keypoints1=result.keypoints1,
+            plane=result.plane,
+            homographies=result.homographies,
+        )
+    if plot is not None:
+        from jaxsfm.plot import draw_matches, save_figure
+
+        working = [read_image(file, max_size=max_size) for file in files]
+        figure = draw_matches(
+            working[0].rgb,
+            working[1].rgb,
+            result,
+            scale0=np.asarray(working[0].scale),
+            scale1=np.asarray(working[1].scale),
+        )
+        save_figure(figure, plot)
+    print(
+        f"{result.num_inliers} matches on {len(result.homographies)} planes "
+        f"({result.num_tentative} tentative): {out}"
+    )
+    return 0
+
+
+def evaluate(
+    out: Positional[Path],
+    *,
+    reference: Path,
+    align_on: Path | None = None,
+    json: Path | None = None,
+) -> int:
+    """Compare a model's cameras with reference poses.
+
+    Args:
+      out: A run's folder, or a COLMAP model's.
+      reference: Folder of Strecha .camera files or of a COLMAP model.
+      align_on: Text file: align on these images only (the paper's night protocol).
+      json: Write all figures here.
+    """
+    _check_writable(json, "--json", (".json",))
+    from jaxsfm import evaluation
+    from jaxsfm.host.poses import find_model, model_poses, read_model, read_poses
+    from jaxsfm.host.workfolder import write_atomic
+    from jaxsfm.report import evaluation_lines
+
+    truth = read_poses(reference)
+    names = evaluation.read_names(align_on) if align_on else None
+    poses = model_poses(read_model(find_model(out)))
+    result = evaluation.evaluate(poses, truth, align_on=names).as_dict()
+    for name, error in result["images"].items():
+        print(f"{name!s:40s} {error['position']:10.4f} {error['rotation_deg']:9.4f} deg")
+    for name in result["missing"]:
+        print(f"{name!s:40s} not in the model")
+    print("\n".join(evaluation_lines(result)))
+    if json is not None:
+        write_atomic(json, _dump(result).encode())
+    return 0
+
+
+def _dump(value: object) -> str:
+    return json.dumps(value, indent=1)
+
+
+def weights() -> int:
+    """Show which weights are in use, and check them."""
+    from jaxsfm.host.weights import default_path, load_weights
+
+    loaded = load_weights()
+    p = loaded.preprocessing
+    print(f"weights          ImageNet VGG-16, {loaded.source}")
+    print(f"file             {default_path()}")
+    print(f"family           {loaded.family}")
+    print(f"preprocessing    RGB / {p.scale:g}, minus {p.mean}, divided by {p.std}")
+    print(f"sha256           {loaded.sha256} (checked)")
+    return 0
+
+
+def demo(*, out: Path | None = None, seed: int = 0) -> int:
+    """Render a small scene with known cameras, reconstruct it, compare with the truth.
+
+    Ends with 1 if a camera is missing or the mean errors exceed the stated ones.
+
+    Args:
+      out: Folder for the scene and the results; default: a new one under the temporary folder.
+      seed: Of the scene's noise and of the reconstruction.
+    """
+    from jaxsfm.demo import run_demo
+
+    lines, passed = run_demo(out, seed=seed)
+    print("\n".join(lines))
+    return 0 if passed else 1
+
+
+def _listed(values: tuple[str, ...]) -> list[str]:
+    """Names given by commas, blanks or both."""
+    return [name for value in values for name in value.split(",") if name]
+
+
+def bench(
+    what: Positional[Literal["strecha"]],
+    *,
+    root: Path,
+    sets: tuple[str, ...] | None = None,
+    methods: tuple[str, ...] = ("rootsift,grid,reloc,default",),
+    intrinsics: Literal["known", "unknown"] = "known",
+    json: Path | None = None,
+    out: Path | None = None,
+    seed: int = 0,
+    threads: int = -1,
+) -> int:
+    """Compare our methods with COLMAP's RootSIFT on Strecha sets, in one go.
+
+    Args:
+      what: The benchmark.
+      root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
+      sets: Which of them, by commas or blanks; default: all.
+      methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc: the default preset without refinement,
+        at cell centres or relocalized. default: the default preset.
+      intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
+      json: Write all figures here.
+      out: Keep databases and models here, and go on from what is there.
+      seed: Of everything random.
+      threads: Of COLMAP's part; -1: all.
+    """
+    _check_writable(json, "--json", (".json",))
+    from jaxsfm import bench as benches
+
+    assert what == "strecha"
+    chosen = _listed(methods)
+    if unknown := [name for name in chosen if name not in benches.METHODS]:
+        raise UserError(
+            f"--methods: no method {unknown[0]!r}; there are {', '.join(benches.METHODS)}"
+        )
+    result = benches.bench_strecha(
+        root,
+        sets=None if sets is None else _listed(sets),
+        methods=[name for name in benches.METHODS if name in chosen],
+        known_intrinsics=intrinsics == "known",
+        out=out,
+        seed=seed,
+        threads=threads,
+        progress=True,
+    )
+    print("\n".join(benches.table_lines(result)))
+    if json is not None:
+        benches.write_json(json, result)
+    return 0
