@@ -281,8 +281,8 @@ def bench(
       what: The benchmark.
       root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
       sets: Which of them, by commas or blanks; default: all.
-      methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc: the default preset without refinement,
-        at cell centres or relocalized. default: the default preset.
+      methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc: the default
+        preset without refinement, at cell centres or relocalized. default: the default preset.
       intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
       json: Write all figures here.
       out: Keep databases and models here, and go on from what is there.
