@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import json
+import shutil
 import tempfile
 import time
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from jaxsfm.evaluation import evaluate
 from jaxsfm.host.colmap import read_two_views, write_models
 from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, build_models
-from jaxsfm.host.poses import model_poses, read_model, read_poses
+from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.workfolder import write_atomic
 from jaxsfm.pipeline import open_images
@@ -83,9 +84,8 @@ def _row(set_name: str, method: str, figures: dict[str, Any] | None) -> dict[str
     return row
 
 
-def _finish(row: dict[str, Any], model_folder: Path, folder: Path, focal: float) -> dict[str, Any]:
+def _finish(row: dict[str, Any], model_folder: Path, truth: Poses, focal: float) -> dict[str, Any]:
     """Errors of a row's model against the ground truth, and of its focal lengths."""
-    truth = read_poses(folder, option="--root")
     row["images"] = len(truth)
     if not (model_folder / "images.bin").is_file():
         return row
@@ -137,6 +137,24 @@ def run_method(
     return row | {"stages": report["seconds"], "seconds": sum(report["seconds"].values())}
 
 
+def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
+    """Seconds of extraction and matching in a work folder, also where they were done before.
+
+    What is reused took its time once: the longest measured so far counts, and is kept beside it.
+    """
+    path = work / "bench_seconds.json"
+    try:
+        before = json.loads(path.read_text())
+    except (OSError, ValueError):
+        before = {}
+    spent = {
+        stage: max(float(before.get(stage, 0.0)), stages[stage])
+        for stage in ("extraction", "matching")
+    }
+    write_atomic(path, json.dumps(spent).encode())
+    return spent
+
+
 def bench_strecha(
     root: Path,
     *,
@@ -156,14 +174,20 @@ def bench_strecha(
     Args:
       root: folder of Strecha sets (SET/images/K.txt, SET/gt_dense_cameras/*.camera).
       known_intrinsics: False: focal lengths are guessed and refined, one camera per image.
-      out: keeps the work folders here; runs in it are gone on with.
+      out: keeps the work folders here, the models of `reloc` and `default` beside them; runs in it
+        are gone on with.
     """
+    if not methods:
+        raise UserError("--methods: none given")
+    folders = find_sets(root, sets)
+    # All inputs are read before the first long run.
+    cameras = {folder: strecha_intrinsics(folder) for folder in folders}
+    truths = {folder: read_poses(folder, option="--root") for folder in folders}
     rows = []
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        for folder in find_sets(root, sets):
-            camera, focal = strecha_intrinsics(folder)
+        for folder in folders:
+            camera, focal = cameras[folder]
             given = camera if known_intrinsics else None
-            shared: dict[str, float] = {}
             for method in methods:
                 work = (out or Path(scratch)) / folder.name
                 work = work / ("dense" if method in ("reloc", "default") else method)
@@ -174,12 +198,15 @@ def bench_strecha(
                     row = run_method(
                         folder, work, method, given, seed=seed, threads=threads, progress=progress
                     )
-                if method in ("reloc", "default"):
-                    for stage in ("extraction", "matching"):
-                        shared[stage] = max(shared.get(stage, 0.0), row["stages"][stage])
-                    row["stages"] |= shared
+                if "stages" in row:
+                    row["stages"] |= _matching_seconds(work, row["stages"])
                     row["seconds"] = sum(row["stages"].values())
-                rows.append(_finish(row, work / "sparse" / "0", folder, focal))
+                rows.append(_finish(row, work / "sparse" / "0", truths[folder], focal))
+                if out is not None and method in ("reloc", "default"):
+                    kept = work.parent / f"{method}-sparse"
+                    shutil.rmtree(kept, ignore_errors=True)
+                    if (work / "sparse").is_dir():
+                        shutil.copytree(work / "sparse", kept)
                 if progress:
                     print(row_line(rows[-1]), flush=True)
     return {

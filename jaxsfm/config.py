@@ -109,7 +109,7 @@ class Config:
     """RANSAC stops when a better plane has been missed with less than 1 - confidence."""
     pair: PairShape = dataclasses.field(default_factory=PairShape)
     view_graph: bool = False
-    """Hand on only pairs that the view graph trusts (`jaxsfm.viewgraph`)."""
+    """Hand on only pairs that the view graph trusts (`jaxsfm.host.viewgraph`)."""
     refinement: Refinement | None = None
     """None: the mapper's model is the last."""
 

@@ -5,6 +5,8 @@ work folder.
 """
 
 import dataclasses
+import functools
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +21,7 @@ from jaxsfm.core.pair import match_pair, pair_key
 from jaxsfm.core.types import PairMatches, Status, Thresholds
 from jaxsfm.errors import UserError
 from jaxsfm.host.features import ImageFeatures, image_features, pad_features
-from jaxsfm.host.images import ImageFile, find_images, inspect_image, read_image
+from jaxsfm.host.images import ImageError, ImageFile, find_images, inspect_image, read_image
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.viewgraph import Verdict, trusted_pairs
 from jaxsfm.host.weights import Weights
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
 
 LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
 """Intensity of an RGB pixel (ITU-R BT.601)."""
+GRAYS = 64
+"""Decoded images kept during refinement: 8 MB each at 1600 x 1200."""
+logger = logging.getLogger("jaxsfm")
 
 
 def open_images(folder: Path, *, progress: bool = False) -> tuple[list[ImageFile], dict[str, str]]:
@@ -162,7 +167,7 @@ class Reconstructed:
     verdicts: dict[Pair, Verdict]
     """The view graph's, by pair; empty where it is switched off."""
     verified: dict[Pair, int]
-    """COLMAP's two-view inliers of the pairs the mapper was given."""
+    """COLMAP's two-view inliers, by pair that has any."""
     attempts: "list[Attempt]"
     """Runs of the mapper."""
     passes: "list[list[PassFigures]]"
@@ -212,6 +217,7 @@ def reconstruct(
         relative_poses=config.view_graph,
     )
     two_views = colmap.read_two_views(database)
+    verified = {pair: view.geometry.num_inliers for pair, view in two_views.items()}
     verdicts: dict[Pair, Verdict] = {}
     if config.view_graph:
         verdicts = trusted_pairs({pair: view.geometry for pair, view in two_views.items()})
@@ -235,7 +241,7 @@ def reconstruct(
     return Reconstructed(
         models=models,
         verdicts=verdicts,
-        verified={pair: view.geometry.num_inliers for pair, view in two_views.items()},
+        verified=verified,
         attempts=attempts,
         passes=passes,
     )
@@ -250,20 +256,25 @@ def _refine(
 ) -> "tuple[list[pycolmap.Reconstruction], list[list[PassFigures]]]":
     from jaxsfm.refine import refine_model
 
+    @functools.lru_cache(maxsize=GRAYS)
     def gray(name: str) -> tuple[np.ndarray, tuple[float, float]]:
         rgb, scale = read(name)
         return rgb.astype(np.float32) @ LUMA, scale
 
     refined, passes = [], []
     for model in models:
-        new, figures = refine_model(
-            model,
-            gray,
-            config=config,
-            refine_intrinsics=options.refine_intrinsics,
-            threads=options.threads,
-            on_pass=on_pass,
-        )
+        try:
+            new, figures = refine_model(
+                model,
+                gray,
+                config=config,
+                refine_intrinsics=options.refine_intrinsics,
+                threads=options.threads,
+                on_pass=on_pass,
+            )
+        except ImageError as error:  # a photo went away since; the mapper's model is there
+            logger.warning("no refinement: %s", error)
+            new, figures = model, []
         refined.append(new)
         passes.append(figures)
     return refined, passes

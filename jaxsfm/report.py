@@ -23,10 +23,11 @@ def lost_images(
 
     Args:
       results: every pair tried.
-      verified: COLMAP's inliers of the pairs the mapper was given.
-      untrusted: pairs that the view graph dropped.
+      verified: COLMAP's inliers, of every pair that has any.
+      untrusted: those of them that the view graph dropped.
     """
     registered = set(registered)
+    verified = {pair: count for pair, count in verified.items() if pair not in set(untrusted)}
     connected = component_of(registered, verified)
     lost = []
     for name in sorted(set(names) - registered):
@@ -94,7 +95,8 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
     lines = [
         f"images           {images['usable']} usable of {images['found']}",
         f"pairs            {pairs['tried']} tried, {pairs['verified']} verified, "
-        f"{pairs['handed_on']} handed to COLMAP, {pairs['trusted']} trusted",
+        f"{pairs['handed_on']} handed to COLMAP"
+        + (f", {pairs['trusted']} trusted" if pairs["trusted"] is not None else ""),
     ]
     models = report["models"]
     if models:
@@ -120,7 +122,11 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"refinement       {last['kept']} observations agreed, {last['dropped']} dropped, "
             f"{last['added']} added in the last of {len(report['refinement'][0])} passes"
+            + ("" if last["accepted"] else "; too few, taken back")
         )
+        if last["weak_views"]:
+            names = ", ".join(shown_name(name) for name in last["weak_views"])
+            lines.append(f"not refined      {names}: too few observations agree; the old ones stay")
     seconds = report["seconds"]
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in seconds.items()))
     if pairs["overflowed"]:

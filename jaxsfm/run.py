@@ -105,6 +105,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             handed_on = {pair: results[pair] for pair in chosen}
             made = _map(fresh, good, handed_on, intrinsics, config, options, seconds)
             models, verified = made.models, made.verified
+            untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
             figures = [model_figures(model) for model in models]
             report: dict[str, Any] = {
                 "version": identity["version"],
@@ -117,7 +118,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     "tried": len(results),
                     "verified": sum(r.num_inliers > 0 for r in results.values()),
                     "handed_on": len(chosen),
-                    "trusted": len(verified),
+                    "trusted": len(verified) - len(untrusted) if made.verdicts else None,
                     "overflowed": sum(r.num_dropped > 0 for r in results.values()),
                     "each": [
                         _pair_figures(r, chosen, verified, made.verdicts)
@@ -132,7 +133,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     figures[0]["images"] if figures else [],
                     results,
                     verified,
-                    [pair for pair, v in made.verdicts.items() if not v.trusted],
+                    untrusted,
                 ),
                 "seconds": seconds,
             }

@@ -216,8 +216,47 @@ def test_lost_observations_come_back_and_hidden_ones_do_not(rendered):
 def test_flat_photos_leave_the_model_as_it_was(rendered):
     before = noisy_model(rendered, 1.0)
     after, figures = refine(before, rendered, lambda image: np.full_like(image, 80.0))
-    assert figures == [] and errors(after, rendered) == errors(before, rendered)
+    assert [f.accepted for f in figures] == [False]
+    assert errors(after, rendered) == errors(before, rendered)
     assert after.num_points3D() == before.num_points3D()
+
+
+def other_scene(seed: int) -> np.ndarray:
+    """Textured, but nothing of the room."""
+    noise = np.random.default_rng(seed).normal(0, 60, (SIZE[1] // 4, SIZE[0] // 4))
+    return 120 + np.kron(noise, np.ones((4, 4))).astype(np.float32)
+
+
+def test_a_view_that_agrees_with_nothing_keeps_its_observations_and_its_pose(rendered):
+    """As a photo by deep night: without its old keypoints it would hang on a handful."""
+    before = noisy_model(rendered, 0.7)
+    images = rendered.images | {"2.png": other_scene(0)}
+    after, figures = refine(before, rendered._replace(images=images))
+    assert all(f.accepted and f.weak_views == ["2.png"] for f in figures)
+    errs = [evaluate(model_poses(m), rendered.poses).images for m in (before, after)]
+    assert errs[1]["2.png"].position < 2 * errs[0]["2.png"].position + 0.002
+    others = [np.mean([e.position for n, e in es.items() if n != "2.png"]) for es in errs]
+    assert others[1] < others[0]
+    views, tracks = read_model_arrays(after, sizes(rendered))
+    assert (tracks.view == 2).sum() > 100
+
+
+def test_photos_that_agree_in_nothing_leave_the_model_as_it_was(rendered):
+    before = noisy_model(rendered, 1.0)
+    images = {name: other_scene(k) for k, name in enumerate(rendered.images)}
+    after, figures = refine(before, rendered._replace(images=images))
+    assert not figures[-1].accepted and errors(after, rendered) == errors(before, rendered)
+
+
+def test_blocks_of_points_change_nothing(rendered, monkeypatch):
+    from jaxsfm import refine as module
+
+    model = noisy_model(rendered, 1.0)
+    whole = refine(model, rendered, passes=1)
+    monkeypatch.setattr(module, "CELLS", 0)
+    monkeypatch.setattr(module, "MIN_BLOCK", 100)
+    parts = refine(model, rendered, passes=1)
+    assert whole[1] == parts[1] and errors(whole[0], rendered) == errors(parts[0], rendered)
 
 
 def test_one_thread_gives_the_same_model_to_the_last_bit(rendered):

@@ -109,11 +109,14 @@ def test_a_summary_has_the_counts_of_every_stage():
 
 
 def test_second_tries_and_refinement_are_said():
-    figures = {"candidates": 9, "kept": 5, "dropped": 3, "added": 4}
+    figures = {"accepted": True, "kept": 5, "dropped": 3, "added": 4, "weak_views": ["night"]}
     attempts = [{"registered": []}, {"registered": [2, 1]}]
     text = "\n".join(summary_lines(report(mapping=attempts, refinement=[[figures, figures]])))
     assert "started 2 times, images registered: 0, 2" in text
     assert "5 observations agreed, 3 dropped, 4 added in the last of 2 passes" in text
+    assert "not refined      night" in text and "taken back" not in text
+    text = "\n".join(summary_lines(report(refinement=[[figures | {"accepted": False}]])))
+    assert "too few, taken back" in text
 
 
 def test_images_that_the_view_graph_cut_off_are_told_how_to_keep_them():

@@ -212,7 +212,8 @@ def read_two_views(path: Path) -> dict[Pair, TwoView]:
                 rotation = geometry.cam2_from_cam1.rotation.matrix()
                 rays = [_rays(camera_of[i], at) for at, i in zip(seen, (a, b), strict=True)]
                 cross = np.linalg.norm(np.cross(rays[0] @ rotation.T, rays[1]), axis=1)
-                angle = float(np.degrees(np.median(np.arcsin(np.minimum(cross, 1.0)))))
+                seen_angles = np.arcsin(np.minimum(cross[np.isfinite(cross)], 1.0))
+                angle = float(np.degrees(np.median(seen_angles))) if len(seen_angles) else 0.0
             if images[a].name > images[b].name:
                 rotation = None if rotation is None else rotation.T
             name0, name1 = sorted((images[a].name, images[b].name))

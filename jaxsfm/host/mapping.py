@@ -18,6 +18,8 @@ from jaxsfm.host.native import native
 from jaxsfm.host.pairs import Pair, component_of
 
 Mapper = Literal["incremental", "global"]
+MISSING = 0.05
+"""Share of the connected images whose absence is a reason to start again."""
 MAX_RETRIES = 2
 """Further initial pairs tried when the mapper's own choice leaves connected images out."""
 
@@ -98,13 +100,17 @@ def _order(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstructio
     )
 
 
+def _names(model: pycolmap.Reconstruction) -> set[str]:
+    return {model.image(i).name for i in model.reg_image_ids()}
+
+
 def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:
-    """Whether the best model holds every image that a chain of pairs connects to it."""
+    """Whether the best model holds (nearly) all images that a chain of pairs connects to it."""
     if not models:
         return not pairs
-    best = models[0]
-    names = {best.image(i).name for i in best.reg_image_ids()}
-    return component_of(names, pairs) == names
+    names = _names(models[0])
+    connected = component_of(names, pairs)
+    return len(connected - names) <= MISSING * len(connected)
 
 
 def build_models(
@@ -116,10 +122,11 @@ def build_models(
 ) -> tuple[list[pycolmap.Reconstruction], list[Attempt]]:
     """Map a verified database; the models, the one with most registered images first.
 
-    If the mapper leaves out images that verified pairs connect to its best model, or finds no
-    model, it is started again from other initial pairs (`initial_pairs`, each image once, lower
-    demands on them), and where there is still none, the global mapper is tried. The best attempt
-    counts.
+    If the mapper leaves out more than `MISSING` of the images that verified pairs connect to its
+    best model, or finds no model, it is started again from other initial pairs (`initial_pairs`,
+    each image once, lower demands on them), and where there is still none, the global mapper is
+    tried. An attempt that registers more images takes the place of the former ones; their models of
+    other images stay.
 
     Args:
       two_views: the database's pairs.
@@ -138,18 +145,14 @@ def build_models(
             used |= set(pair)
             other = _run(database, options, pair, on_image)
             attempts.append(_attempt("incremental", pair, other))
-            models = min((models, other), key=_rank)
+            if other and (not models or other[0].num_reg_images() > models[0].num_reg_images()):
+                apart = [m for m in models if not _names(m) <= _names(other[0])]
+                models = _order([other[0], *apart])
         if not models and pairs:
             other = _run(database, dataclasses.replace(options, mapper="global"), None, on_image)
             attempts.append(_attempt("global", None, other))
             models = other
     return models, attempts
-
-
-def _rank(models: list[pycolmap.Reconstruction]) -> tuple[int, int]:
-    if not models:
-        return (0, 0)
-    return (-models[0].num_reg_images(), -models[0].num_points3D())
 
 
 def _attempt(mapper: Mapper, pair: Pair | None, models: list[pycolmap.Reconstruction]) -> Attempt:
@@ -180,6 +183,7 @@ def _run(
         p = _incremental_options(options)
         if initial is not None:
             p.init_image_id1, p.init_image_id2 = _image_ids(database, initial)
+            p.multiple_models = False  # else COLMAP starts every model from this pair, 50 times
             p.mapper.init_min_num_inliers = 30
             p.mapper.init_min_tri_angle = 4.0
         found = native(

@@ -12,6 +12,11 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
 import numpy as np
 import pycolmap
 
+from jaxsfm.host.native import native
+
+MIN_TRI_ANGLE_DEG = 1.5
+"""COLMAP's."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
@@ -86,14 +91,36 @@ def read_model_arrays(
         )
         xy = np.asarray([p.xy for p in image.points2D], np.float64).reshape(-1, 2)
         pixels.append(xy / np.asarray(scale) - 0.5)
-    points, rows = [], []
-    for k, point_id in enumerate(sorted(model.point3D_ids())):
-        point = model.point3D(point_id)
-        points.append(point.xyz)
-        rows += [(k, index[e.image_id], e.point2D_idx) for e in point.track.elements]
-    table = np.asarray(rows, np.int64).reshape(-1, 3)
-    xy = np.asarray([pixels[v][i] for _, v, i in table]).reshape(-1, 2)
-    return views, Tracks(np.asarray(points).reshape(-1, 3), table[:, 0], table[:, 1], xy)
+    ids = sorted(model.point3D_ids())
+    points = np.asarray([model.point3D(i).xyz for i in ids], np.float64).reshape(-1, 3)
+    rows = np.asarray(
+        [
+            (k, index[e.image_id], e.point2D_idx)
+            for k, i in enumerate(ids)
+            for e in model.point3D(i).track.elements
+        ],
+        np.int64,
+    ).reshape(-1, 3)
+    xy = np.empty((len(rows), 2))
+    for k, at in enumerate(pixels):
+        own = rows[:, 1] == k
+        xy[own] = at[rows[own, 2]]
+    return views, Tracks(points, rows[:, 0], rows[:, 1], xy)
+
+
+def errors_px(views: list[View], tracks: Tracks) -> np.ndarray:
+    """Reprojection error of every observation, working pixels; infinite behind the camera."""
+    errors = np.empty(len(tracks.xy))
+    for k, view in enumerate(views):
+        rows = np.flatnonzero(tracks.view == k)
+        at, _ = view.project(tracks.points[tracks.point[rows]])
+        errors[rows] = np.linalg.norm(at - tracks.xy[rows], axis=1)
+    return np.where(np.isfinite(errors), errors, np.inf)
+
+
+def select(tracks: Tracks, keep: np.ndarray) -> Tracks:
+    """The tracks with only those observations; points stay."""
+    return Tracks(tracks.points, tracks.point[keep], tracks.view[keep], tracks.xy[keep])
 
 
 def build_model(
@@ -101,7 +128,7 @@ def build_model(
 ) -> pycolmap.Reconstruction:
     """A model with the cameras and poses of `template` and these tracks.
 
-    Points with fewer than two observations are left out.
+    Points with fewer than two observations, or with rays closer than 1.5 degrees, are left out.
     """
     model = pycolmap.Reconstruction()
     for camera_id in sorted(template.cameras):
@@ -128,6 +155,7 @@ def build_model(
         for row in rows:
             track.add_element(views[tracks.view[row]].image_id, int(place[row]))
         model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    pycolmap.ObservationManager(model).filter_all_points3D(1e9, MIN_TRI_ANGLE_DEG)
     return model
 
 
@@ -157,11 +185,6 @@ def bundle_adjust(
         config.add_image(image_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     # Not pycolmap.bundle_adjustment: it switches COLMAP's log messages on for the whole process.
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
+    native(lambda _: adjuster.solve(), "bundle adjustment", grace_s=1)
     model.update_point_3d_errors()  # the solver leaves them as they were
-
-
-def filter_points(model: pycolmap.Reconstruction, *, max_error_px: float) -> None:
-    """Drop observations with larger errors (original pixels), then points left without two, or
-    with rays closer than 1.5 degrees."""
-    pycolmap.ObservationManager(model).filter_all_points3D(max_error_px, 1.5)

@@ -17,13 +17,13 @@ THREAD = "jaxsfm-colmap"
 
 
 def native(
-    work: Callable[[pycolmap.CancellationToken], T], database: Path, *, grace_s: float = 30
+    work: Callable[[pycolmap.CancellationToken], T], what: Path | str, *, grace_s: float = 30
 ) -> T:
     """The result of `work`, run in a thread of its own.
 
     Args:
       work: gets a token that tells it to stop.
-      database: named in messages.
+      what: named in messages.
       grace_s: how long an interrupted call may take to stop.
 
     Raises:
@@ -55,7 +55,7 @@ def native(
         done.wait(grace_s)
         raise
     if failure and isinstance(failure[0], RuntimeError):
-        raise UserError(f"{database}: COLMAP failed ({failure[0]}); the matches are kept")
+        raise UserError(f"{what}: COLMAP failed ({failure[0]}); the matches are kept")
     if failure:
         raise failure[0]
     return results[0]

@@ -7,10 +7,11 @@ evidence is compared, strongest first:
 1. A pair's *strength* is its inliers relative to what its two images reach with their best partners
    (geometric mean), times how far the inliers spread over the smaller of their two regions.
 2. Pairs are joined strongest first, as in a maximum spanning tree. Where two groups of images meet,
-   all pairs between them vote, with their inliers, on the rotation between the groups; the largest
-   group of agreeing votes decides.
+   the pairs between them vote, with their strengths, on the rotation between the groups; the
+   largest group of agreeing votes decides.
 3. The rotations of all images are then averaged over the agreeing pairs (robustly), and a pair
-   whose own rotation is further than `tolerance_deg` from them is dropped.
+   whose own rotation is further than `tolerance_deg` from them is dropped, unless it is strong:
+   then its rotation may be poor (a plane, a guessed focal length), but its matches are sound.
 
 So a false pair can survive only where nothing stronger speaks against it. Nothing depends on the
 order of images or pairs. On castle-P19 the false pairs are off by 75-180 deg and hold 0.01-0.09 of
@@ -23,6 +24,11 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from jaxsfm.host.pairs import Pair
+
+STRONG = 0.3
+"""Strength above which a pair is trusted whatever its rotation; false pairs reached 0.09."""
+MAX_VOTES = 500
+"""Strongest pairs between two groups that vote: the vote is quadratic in them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,13 +101,14 @@ def trusted_pairs(
     known = [p for p in ranked if geometries[p].rotation is not None and strength[p] > 0]
     rotations = _average(_grow(known, geometries, strength, tolerance_deg), known, geometries)
     verdicts = {}
+    determined = set(known)
     for pair in sorted(geometries):
         error, reason = None, ""
-        if pair not in known:
+        if pair not in determined:
             reason = "no relative pose"
         else:
             error = float(_error_deg(pair, geometries, rotations))
-            if error > tolerance_deg:
+            if error > tolerance_deg and strength[pair] < STRONG:
                 reason = (
                     f"its rotation is {error:.0f} deg from the one that stronger pairs give "
                     f"(its strength is {strength[pair]:.3f} of 1)"
@@ -138,32 +145,33 @@ def _grow(
     tolerance_deg: float,
 ) -> Rotations:
     """Camera rotations (world to camera), each connected group of images in a frame of its own."""
-    group = {image: image for pair in ranked for image in pair}
-    members = {image: [image] for image in group}
-    rotations = {image: np.eye(3) for image in group}
-    for pair in ranked:
-        a, b = group[pair[0]], group[pair[1]]
+    names = sorted({image for pair in ranked for image in pair})
+    index = {name: k for k, name in enumerate(names)}
+    ends = np.asarray([[index[a], index[b]] for a, b in ranked]).reshape(-1, 2)
+    relative = np.asarray([_rotation(pair, geometries) for pair in ranked]).reshape(-1, 3, 3)
+    votes = np.asarray([strength[pair] for pair in ranked])
+    group = np.arange(len(names))
+    rotations = np.tile(np.eye(3), (len(names), 1, 1))
+    for i, j in ends:
+        a, b = group[i], group[j]
         if a == b:
             continue
-        between, moves = [], []
-        for i, j in ranked:
-            if {group[i], group[j]} != {a, b}:
-                continue
-            relative = _rotation((i, j), geometries)
-            if group[i] == b:
-                i, j, relative = j, i, relative.T
-            # World of b -> world of a, as this pair has it.
-            moves.append(rotations[i].T @ relative.T @ rotations[j])
-            between.append((i, j) if i < j else (j, i))
-        votes = np.asarray([strength[p] for p in between])
-        close = angle_deg(np.asarray(moves)[:, None], np.asarray(moves)[None]) < tolerance_deg
-        winner = int(np.argmax(close @ votes))  # the first of equals is the strongest
-        move = mean_rotation(np.asarray(moves)[close[winner]], votes[close[winner]])
-        for image in members[b]:
-            rotations[image] = rotations[image] @ move.T
-            group[image] = a
-        members[a] += members.pop(b)
-    return rotations
+        of = group[ends]
+        forward = (of == (a, b)).all(1)
+        rows = np.flatnonzero(forward | (of == (b, a)).all(1))[:MAX_VOTES]
+        swap = ~forward[rows]
+        in_a = np.where(swap, ends[rows, 1], ends[rows, 0])
+        in_b = np.where(swap, ends[rows, 0], ends[rows, 1])
+        turned = np.where(swap[:, None, None], relative[rows].transpose(0, 2, 1), relative[rows])
+        # World of b -> world of a, as each pair has it.
+        moves = rotations[in_a].transpose(0, 2, 1) @ turned.transpose(0, 2, 1) @ rotations[in_b]
+        close = angle_deg(moves[:, None], moves[None]) < tolerance_deg
+        winner = int(np.argmax(close @ votes[rows]))  # the first of equals is the strongest
+        move = mean_rotation(moves[close[winner]], votes[rows][close[winner]])
+        members = group == b
+        rotations[members] = rotations[members] @ move.T
+        group[members] = a
+    return dict(zip(names, rotations, strict=True))
 
 
 def mean_rotation(rotations: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -176,26 +184,27 @@ def _average(
     rotations: Rotations, pairs: Iterable[Pair], geometries: Mapping[Pair, PairGeometry]
 ) -> Rotations:
     """Robust rotation averaging: every image in turn takes the mean of what its pairs imply,
-    weighted by inliers over (1 + (error / 2 deg)^2), until nothing moves."""
-    around: dict[str, list[Pair]] = {}
-    for pair in pairs:
-        for image in pair:
-            around.setdefault(image, []).append(pair)
+    weighted by inliers over (1 + (error / 2 deg)^2)^2, until nothing moves."""
+    around: dict[str, list[tuple[str, np.ndarray, int]]] = {}
+    for pair in sorted(pairs):
+        relative, count = _rotation(pair, geometries), geometries[pair].num_inliers
+        around.setdefault(pair[1], []).append((pair[0], relative, count))
+        around.setdefault(pair[0], []).append((pair[1], relative.T, count))
+    stacked = {
+        image: (
+            [other for other, _, _ in rows],
+            *map(np.asarray, list(zip(*rows, strict=True))[1:]),
+        )
+        for image, rows in around.items()
+    }
     rotations = dict(rotations)
     for _ in range(50):
         largest = 0.0
-        for image in sorted(around):
-            implied, weights = [], []
-            for pair in sorted(around[image]):
-                relative = _rotation(pair, geometries)
-                implied.append(
-                    relative @ rotations[pair[0]]
-                    if pair[1] == image
-                    else relative.T @ rotations[pair[1]]
-                )
-                error = _error_deg(pair, geometries, rotations)
-                weights.append(geometries[pair].num_inliers / (1.0 + (error / 2.0) ** 2) ** 2)
-            new = mean_rotation(np.asarray(implied), np.asarray(weights))
+        for image in sorted(stacked):
+            others, relative, counts = stacked[image]
+            implied = relative @ np.asarray([rotations[other] for other in others])
+            error = angle_deg(implied, rotations[image])
+            new = mean_rotation(implied, counts / (1.0 + (error / 2.0) ** 2) ** 2)
             largest = max(largest, float(angle_deg(new, rotations[image])))
             rotations[image] = new
         if largest < 1e-3:
