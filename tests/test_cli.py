@@ -280,6 +280,7 @@ def test_bad_intrinsics_are_explained(scene, tmp_path, capsys, value, word):
     ("option", "value", "word"),
     [
         ("--max-size", "10", "max"),
+        ("--refine", "-1", "refine must be at least 0"),
         ("--best-pairs", "0", "at least 1"),
         ("--seed", "-1", "--seed"),
         ("--threads", "0", "--threads"),
@@ -403,6 +404,21 @@ def test_remapping_without_success_keeps_the_earlier_model(scene, tmp_path, caps
     assert {p: p.read_bytes() for p in (out / "sparse").rglob("*.bin")} == before
     assert (out / "report.json").read_bytes() == report
     assert json.loads((out / "failed" / "report.json").read_text())["models"] == []
+
+
+def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(
+    scene, tmp_path, monkeypatch, capfd
+):
+    import jaxsfm.refine
+    from jaxsfm.host.images import ImageError
+
+    def gone(*_, **__):
+        raise ImageError("view1.png: cannot be read")
+
+    monkeypatch.setattr(jaxsfm.refine, "refine_model", gone)
+    report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
+    assert report["models"][0]["registered"] == 3 and report["refinement"] == [[]]
+    assert "no refinement: view1.png" in capfd.readouterr().err
 
 
 def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatch, capsys):

@@ -95,6 +95,22 @@ def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
     assert "interrupted" in text and "Traceback" not in text
 
 
+def test_ctrl_c_during_refinement_keeps_features_and_matches(scene, tmp_path, monkeypatch, capsys):
+    import jaxsfm.refine
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    args = ["reconstruct", str(scene / "images"), "--threads", "1", "--out", str(tmp_path / "out")]
+    with monkeypatch.context() as patch:
+        patch.setattr(jaxsfm.refine, "bundle_adjust", interrupted)
+        assert main(args) == 130
+    assert len(list((tmp_path / "out" / "matches").glob("*.npz"))) == 3
+    assert not (tmp_path / "out" / "sparse").exists()
+    assert main(args) == 0
+    assert (tmp_path / "out" / "sparse" / "0" / "images.bin").is_file()
+
+
 MAP_AND_INTERRUPT = """
 import os, signal, sys, threading, time
 import jaxsfm.cli

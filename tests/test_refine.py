@@ -249,7 +249,7 @@ def test_photos_that_agree_in_nothing_leave_the_model_as_it_was(rendered):
 
 
 def test_blocks_of_points_change_nothing(rendered, monkeypatch):
-    from jaxsfm import refine as module
+    from jaxsfm import track_alignment as module
 
     model = noisy_model(rendered, 1.0)
     whole = refine(model, rendered, passes=1)

@@ -1,5 +1,6 @@
 """Second tries of the mapper, and scenes that make the first one hard."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -182,3 +183,33 @@ def test_a_given_initial_pair_gives_the_same_scene(tmp_path, scene, initial):
         return
     pair = initial_pairs(verified(tmp_path / "d.db", ONE))[initial]
     assert mapping._run(tmp_path / "d.db", ONE, pair, lambda: None)[0].num_reg_images() == 5
+
+
+def test_a_given_pair_gives_one_model_not_one_per_try(tmp_path, scene):
+    """COLMAP starts every further model from the given pair too, up to 50 times."""
+    small = [dataclasses.replace(i, name=f"s{k}.png") for k, i in enumerate(scene.images[:3])]
+    other = {
+        (f"s{i}.png", f"s{j}.png"): dataclasses.replace(
+            scene.results[scene.names[i], scene.names[j]], pair=(f"s{i}.png", f"s{j}.png")
+        )
+        for i, j in ((0, 1), (0, 2), (1, 2))
+    }
+    path = tmp_path / "d.db"
+    write_database(path, small + scene.images, scene.results | other, scene.known)
+    two_views = verified(path, ONE)
+    pair = next(p for p in initial_pairs(two_views) if p[0] in scene.names)
+    assert [m.num_reg_images() for m in mapping._run(path, ONE, pair, lambda: None)] == [5]
+    assert [m.num_reg_images() for m in build_models(path, two_views, ONE)[0]] == [5, 3]
+
+
+def test_models_of_other_images_stay_beside_a_better_attempt(monkeypatch, tmp_path):
+    runs(monkeypatch, [[model("ab"), model("xy")], [model("abcdef")]])
+    models, _ = build_models(tmp_path / "d.db", PAIRS, ONE)
+    assert [m.names for m in models] == [list("abcdef"), list("xy")]
+
+
+def test_one_missing_image_of_many_is_no_reason_to_try_again(monkeypatch, tmp_path):
+    names = [f"{k:02d}" for k in range(30)]
+    chain = {pair: two_view() for pair in zip(names, names[1:], strict=False)}
+    calls = runs(monkeypatch, [[Model(names=names[:-1], points=9)]])
+    assert len(build_models(tmp_path / "d.db", chain, ONE)[1]) == 1 == len(calls)

@@ -115,6 +115,36 @@ def test_an_image_with_one_weak_pair_keeps_it():
     assert trusted_pairs(pairs)["0.jpg", "night.jpg"].trusted
 
 
+def test_a_strong_pair_stays_whatever_its_rotation():
+    """A facade's or a telephoto's rotation can be poor where its thousand matches are not."""
+    rng = rng_of(1)
+    names, _, pairs = ring(rng)
+    turned = (
+        Rotation.from_euler("x", 30, degrees=True).as_matrix() @ pairs[names[0], names[2]].rotation
+    )
+    for inliers, stays in ((1000, True), (40, False)):
+        pairs[names[0], names[2]] = PairGeometry(num_inliers=inliers, rotation=turned)
+        verdict = trusted_pairs(pairs)[names[0], names[2]]
+        assert verdict.trusted == stays and verdict.rotation_error_deg > 15
+
+
+def test_many_pairs_between_two_groups_stay_cheap():
+    """2 x 60 images: a vote of all 3600 pairs would hold gigabytes."""
+    import tracemalloc
+
+    rotation = np.eye(3)
+    pairs = {}
+    for i, j in itertools.combinations(range(120), 2):
+        strong = (i < 60) == (j < 60)
+        pairs[f"{i:03d}", f"{j:03d}"] = PairGeometry(
+            num_inliers=1000 if strong else 100, rotation=rotation
+        )
+    tracemalloc.start()
+    assert all(v.trusted for v in trusted_pairs(pairs).values())
+    assert tracemalloc.get_traced_memory()[1] < 200e6
+    tracemalloc.stop()
+
+
 def test_pairs_without_a_pose_are_not_trusted_and_say_so():
     pairs = {
         ("a", "b"): PairGeometry(num_inliers=50, rotation=None),

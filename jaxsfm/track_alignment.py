@@ -1,0 +1,164 @@
+"""The alignment of refinement: all observations a model's points have or could have, moved onto
+their reference patches, block by block of points.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsfm import surface
+from jaxsfm.config import Refinement
+from jaxsfm.core import align as align_core
+from jaxsfm.host import interrupt
+from jaxsfm.host.model import Tracks, View
+
+ReadGray = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
+"""Image name -> float32 (h, w) intensities of the working image, original pixels per pixel."""
+CHUNK = 4096
+"""Keypoints aligned by one call of the compiled program."""
+CELLS = 10_000_000
+"""Points times views looked at together; about 100 bytes each, and 2.7 kB for each point."""
+MIN_BLOCK, MAX_BLOCK = 1000, 100_000
+"""Points of a block, whatever the number of views."""
+PAD = 128
+"""Maps are padded to multiples of this, so that few image sizes mean few compilations."""
+
+
+class AlignedBlock(NamedTuple):
+    """The outcome of alignment for some of the points."""
+
+    rows: np.ndarray
+    """The points, indices."""
+    points: np.ndarray
+    """Where they lie now: on their reference rays."""
+    reference: np.ndarray
+    xy: np.ndarray
+    """The reference keypoints."""
+    found: surface.Candidates
+    """Their `point` counts within the block."""
+    moved: np.ndarray
+    agrees: np.ndarray
+    tracked: np.ndarray
+    """Candidates that are observations of the old tracks."""
+
+
+def _padded(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    h, w = image.shape
+    wide = np.pad(image, ((0, -h % PAD), (0, -w % PAD)))
+    return wide[..., None], np.asarray([h, w], np.int32)
+
+
+def _chunks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
+    """Rows in pieces of CHUNK, the last one filled up with its first row, and how many count."""
+    for start in range(0, len(rows), CHUNK):
+        piece = rows[start : start + CHUNK]
+        filled = np.full(CHUNK, piece[0])
+        filled[: len(piece)] = piece
+        interrupt.check()
+        yield filled, len(piece)
+
+
+def _templates(
+    reference: np.ndarray,
+    xy: np.ndarray,
+    views: list[View],
+    read: ReadGray,
+    patch: align_core.Patch,
+) -> align_core.Templates:
+    """Templates of all points, one view's image in memory at a time."""
+    n, q = len(reference), len(patch.weights)
+    store = [
+        np.zeros((n, q, 1), np.float32),
+        np.zeros((n, q, 1, 2), np.float32),
+        np.zeros((n, 2, 2), np.float32),
+        np.zeros(n, np.float32),
+        np.zeros(n, bool),
+    ]
+    for k in np.unique(reference):
+        image, size = _padded(read(views[k].name)[0])
+        for piece, count in _chunks(np.flatnonzero(reference == k)):
+            made = align_core.make_templates(
+                image,  # pyright: ignore[reportArgumentType]
+                size,  # pyright: ignore[reportArgumentType]
+                np.float32(xy[piece]),  # pyright: ignore[reportArgumentType]
+                patch,
+            )
+            for held, new in zip(store, jax.device_get(made), strict=True):
+                held[piece[:count]] = new[:count]
+    return align_core.Templates(*store)  # pyright: ignore[reportArgumentType]
+
+
+def _align(
+    found: surface.Candidates,
+    templates: align_core.Templates,
+    views: list[View],
+    read: ReadGray,
+    patch: align_core.Patch,
+    config: Refinement,
+    max_shift_px: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the candidates end, and which agree with their templates."""
+    moved = found.start.copy()
+    agrees = np.zeros(len(moved), bool)
+    for k in np.unique(found.view):
+        image, size = _padded(read(views[k].name)[0])
+        for piece, count in _chunks(np.flatnonzero(found.view == k)):
+            result = jax.device_get(
+                align_core.align(
+                    image,  # pyright: ignore[reportArgumentType]
+                    size,  # pyright: ignore[reportArgumentType]
+                    jax.tree.map(lambda a, p=found.point[piece]: a[p], templates),
+                    np.float32(found.start[piece]),  # pyright: ignore[reportArgumentType]
+                    np.float32(found.affine[piece]),  # pyright: ignore[reportArgumentType]
+                    patch,
+                    iterations=config.iterations,
+                )
+            )
+            shift = np.linalg.norm(result.xy - found.start[piece], axis=1)
+            good = (
+                result.converged
+                & (result.score > config.min_score)
+                & (result.sigma < config.max_sigma_px)
+                & (shift < max_shift_px)
+            )
+            moved[piece[:count]] = result.xy[:count]
+            agrees[piece[:count]] = good[:count]
+    return moved, agrees
+
+
+def align_blocks(
+    tracks: Tracks, views: list[View], read: ReadGray, config: Refinement, max_shift_px: float
+) -> Iterator[AlignedBlock]:
+    """Align every point's observations, so many points at a time that memory stays bounded."""
+    normal = surface.normals(tracks, views, neighbours=config.neighbours)
+    patch = align_core.square_patch(config.radius)
+    step = max(MIN_BLOCK, min(CELLS // len(views), MAX_BLOCK))
+    order = np.argsort(tracks.point, kind="stable")
+    ends = np.searchsorted(tracks.point[order], np.arange(len(tracks.points) + 1))
+    for first in range(0, len(tracks.points), step):
+        rows = np.arange(first, min(first + step, len(tracks.points)))
+        own = order[ends[first] : ends[rows[-1] + 1]]
+        part = Tracks(
+            tracks.points[rows], tracks.point[own] - first, tracks.view[own], tracks.xy[own]
+        )
+        seen = surface.visibility(part, views, normal[rows])
+        reference = surface.reference_views(seen)
+        xy = seen.xy[np.arange(len(rows)), reference]
+        points = surface.on_reference_rays(part, views, normal[rows], reference, xy)
+        found = surface.candidates(
+            points,
+            views,
+            normal[rows],
+            reference,
+            xy,
+            seen,
+            margin=config.radius + 2,
+            min_cosine=config.min_cosine,
+            max_stretch=config.max_stretch,
+        )
+        templates = _templates(reference, xy, views, read, patch)
+        moved, agrees = _align(found, templates, views, read, patch, config, max_shift_px)
+        tracked = seen.tracked[found.point, found.view]
+        yield AlignedBlock(rows, points, reference, xy, found, moved, agrees, tracked)
