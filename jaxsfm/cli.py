@@ -1,23 +1,42 @@
 """The command line: parses, runs a command, turns failures into one sentence."""
 
+import functools
 import logging
+import operator
 import os
 import sys
 import threading
+from typing import Annotated, Any
 
 import tyro
 
-from jaxsfm.commands import bench, demo, evaluate, match, reconstruct, weights
+from jaxsfm.bench_commands import homography, planes, strecha, wxbs
+from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 
+BENCHMARKS = {"strecha": strecha, "wxbs": wxbs, "homography": homography, "planes": planes}
+_Benchmark = functools.reduce(
+    operator.or_,
+    (
+        Annotated[Any, tyro.conf.subcommand(name, constructor=command)]
+        for name, command in BENCHMARKS.items()
+    ),
+)
+
+
+def bench(result: _Benchmark) -> int:  # pyright: ignore[reportInvalidTypeForm]
+    """Benchmarks on public data sets."""
+    return result
+
+
 COMMANDS = {
-    "bench": bench,
     "reconstruct": reconstruct,
     "match": match,
     "evaluate": evaluate,
     "demo": demo,
     "weights": weights,
+    "bench": bench,
 }
 
 
@@ -35,7 +54,7 @@ def main(argv: list[str] | None = None) -> int:
                 prog="jaxsfm",
                 description="Structure-from-Motion from dense VGG-16 features with relocalization.",
                 args=argv,
-                config=(tyro.conf.OmitArgPrefixes,),
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
             )
     except UserError as error:
         print(f"jaxsfm: {error}", file=sys.stderr)

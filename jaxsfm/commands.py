@@ -41,7 +41,7 @@ def _config(
         raise UserError(f"--{str(error).replace('_', '-', 1)}") from error
 
 
-def _check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
+def check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
     """Fail before the work, not after it."""
     if path is None:
         return
@@ -146,8 +146,8 @@ def match(
       seed: Of the RANSAC draws.
     """
     config = _config(preset, max_size, keypoints)
-    _check_writable(out, "--out", (".npz",))
-    _check_writable(plot, "--plot", (".png", ".jpg"))
+    check_writable(out, "--out", (".npz",))
+    check_writable(plot, "--plot", (".png", ".jpg"))
     if not 0 <= seed < 2**31:
         raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
     import numpy as np
@@ -204,7 +204,7 @@ def evaluate(
       align_on: Text file: align on these images only (the paper's night protocol).
       json: Write all figures here.
     """
-    _check_writable(json, "--json", (".json",))
+    check_writable(json, "--json", (".json",))
     from jaxsfm import evaluation
     from jaxsfm.host.poses import find_model, model_poses, read_model, read_poses
     from jaxsfm.host.workfolder import write_atomic
@@ -256,59 +256,3 @@ def demo(*, out: Path | None = None, seed: int = 0) -> int:
     lines, passed = run_demo(out, seed=seed)
     print("\n".join(lines))
     return 0 if passed else 1
-
-
-def _listed(values: tuple[str, ...]) -> list[str]:
-    """Names given by commas, blanks or both."""
-    return [name for value in values for name in value.split(",") if name]
-
-
-def bench(
-    what: Positional[Literal["strecha"]],
-    *,
-    root: Path,
-    sets: tuple[str, ...] | None = None,
-    methods: tuple[str, ...] = ("rootsift,grid,reloc,default",),
-    intrinsics: Literal["known", "unknown"] = "known",
-    json: Path | None = None,
-    out: Path | None = None,
-    seed: int = 0,
-    threads: int = -1,
-) -> int:
-    """Compare our methods with COLMAP's RootSIFT on Strecha sets, in one go.
-
-    Args:
-      what: The benchmark.
-      root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
-      sets: Which of them, by commas or blanks; default: all.
-      methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc: the default
-        preset without refinement, at cell centres or relocalized. default: the default preset.
-      intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
-      json: Write all figures here.
-      out: Keep databases and models here, and go on from what is there.
-      seed: Of everything random.
-      threads: Of COLMAP's part; -1: all.
-    """
-    _check_writable(json, "--json", (".json",))
-    from jaxsfm import bench as benches
-
-    assert what == "strecha"
-    chosen = _listed(methods)
-    if unknown := [name for name in chosen if name not in benches.METHODS]:
-        raise UserError(
-            f"--methods: no method {unknown[0]!r}; there are {', '.join(benches.METHODS)}"
-        )
-    result = benches.bench_strecha(
-        root,
-        sets=None if sets is None else _listed(sets),
-        methods=[name for name in benches.METHODS if name in chosen],
-        known_intrinsics=intrinsics == "known",
-        out=out,
-        seed=seed,
-        threads=threads,
-        progress=True,
-    )
-    print("\n".join(benches.table_lines(result)))
-    if json is not None:
-        benches.write_json(json, result)
-    return 0

@@ -1,18 +1,16 @@
-"""Benchmarks on public data sets. `bench strecha` is the paper's comparison on standard scenes."""
+"""`bench strecha`: the paper's comparison on standard scenes (Strecha et al., CVPR 2008)."""
 
-import dataclasses
-import importlib.metadata
 import json
 import shutil
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
-from jaxsfm.config import Config, preset
+from jaxsfm.bench.common import check_root, choose_sets, method_config, read_rows, versions
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.colmap import read_two_views, write_models
@@ -25,21 +23,11 @@ from jaxsfm.pipeline import open_images
 from jaxsfm.report import model_figures
 from jaxsfm.run import RunOptions, run_folder
 
-Method = Literal["rootsift", "grid", "reloc", "default"]
-METHODS: tuple[Method, ...] = get_args(Method)
+METHODS = ("rootsift", "grid", "reloc", "default")
 PUBLISHED = (
     "published (Widya et al. 2018, mean over six full-size sets): "
     "DoG + RootSIFT 0.17 m, 0.90 deg; dense + relocalization 0.59 m, 2.27 deg"
 )
-
-
-def method_config(method: Method) -> Config:
-    """grid and reloc are the default preset without refinement, at cell centres or relocalized."""
-    config = preset("default")
-    if method == "default":
-        return config
-    keypoints = "grid" if method == "grid" else "relocalized"
-    return dataclasses.replace(config, refinement=None, keypoints=keypoints)
 
 
 def strecha_intrinsics(folder: Path) -> tuple[str, float]:
@@ -49,11 +37,8 @@ def strecha_intrinsics(folder: Path) -> tuple[str, float]:
     images, which is exact only there, and rotations agree better that way (docs/results.md).
     """
     path = folder / "images" / "K.txt"
-    try:
-        k = np.loadtxt(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"--root: {path} cannot be read as a camera matrix") from error
-    if k.shape != (3, 3) or not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0:
+    k = read_rows(path, 3, "a camera matrix (3 x 3)")
+    if k.shape != (3, 3) or k[0, 0] <= 0 or k[1, 1] <= 0:
         raise UserError(f"--root: {path} is not a camera matrix")
     fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
     return f"PINHOLE:{fx!r},{fy!r},{cx!r},{cy!r}", 0.5 * (fx + fy)
@@ -65,16 +50,11 @@ def find_sets(root: Path, names: Sequence[str] | None) -> list[Path]:
     Raises:
       UserError: none there, or one of `names` is not.
     """
-    if not root.is_dir():
-        raise UserError(f"--root {root}: no such folder")
+    check_root(root)
     found = {path.parent.parent.name: path.parent.parent for path in root.glob("*/images/K.txt")}
-    if names is None:
-        if not found:
-            raise UserError(f"--root {root}: no Strecha sets (SET/images/K.txt) in it")
-        return [found[name] for name in sorted(found)]
-    if unknown := [name for name in names if name not in found]:
-        raise UserError(f"--sets: no set {unknown[0]!r} in {root} (there: {sorted(found)})")
-    return [found[name] for name in names]
+    if not found:
+        raise UserError(f"--root {root}: no Strecha sets (SET/images/K.txt) in it")
+    return choose_sets(found, names, root)
 
 
 def _row(set_name: str, method: str, figures: dict[str, Any] | None) -> dict[str, Any]:
@@ -123,7 +103,7 @@ def run_rootsift(
 def run_method(
     folder: Path,
     out: Path,
-    method: Method,
+    method: str,
     intrinsics: str | None,
     *,
     seed: int,
@@ -159,7 +139,7 @@ def bench_strecha(
     root: Path,
     *,
     sets: Sequence[str] | None = None,
-    methods: Sequence[Method] = METHODS,
+    methods: Sequence[str] = METHODS,
     known_intrinsics: bool = True,
     out: Path | None = None,
     seed: int = 0,
@@ -177,8 +157,6 @@ def bench_strecha(
       out: keeps the work folders here, the models of `reloc` and `default` beside them; runs in it
         are gone on with.
     """
-    if not methods:
-        raise UserError("--methods: none given")
     folders = find_sets(root, sets)
     # All inputs are read before the first long run.
     cameras = {folder: strecha_intrinsics(folder) for folder in folders}
@@ -211,9 +189,7 @@ def bench_strecha(
                     print(row_line(rows[-1]), flush=True)
     return {
         "benchmark": "strecha",
-        "versions": {
-            name: importlib.metadata.version(name) for name in ("jaxsfm", "jax", "pycolmap")
-        },
+        "versions": versions(),
         "intrinsics": "known" if known_intrinsics else "refined from a guess",
         "seed": seed,
         "rows": rows,
@@ -277,8 +253,3 @@ def table_lines(result: dict[str, Any]) -> list[str]:
             f"points {mean['points']:.2f}, reprojection error {mean['reprojection_error']:.2f}"
         )
     return [*lines, result["published"]]
-
-
-def write_json(path: Path, result: dict[str, Any]) -> None:
-    """The figures as JSON."""
-    write_atomic(path, json.dumps(result, indent=1).encode())

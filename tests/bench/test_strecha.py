@@ -5,7 +5,8 @@ import shutil
 
 import pytest
 
-from jaxsfm.bench import METHODS, find_sets, method_config, ratios
+from jaxsfm.bench.common import method_config
+from jaxsfm.bench.strecha import METHODS, find_sets, ratios
 from jaxsfm.cli import main
 from jaxsfm.config import preset
 

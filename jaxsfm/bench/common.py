@@ -1,0 +1,99 @@
+"""What the benchmarks share: methods, figures, tables, JSON."""
+
+import dataclasses
+import importlib.metadata
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsfm.config import PRESETS, Config, Keypoints, preset
+from jaxsfm.errors import UserError
+from jaxsfm.host.workfolder import write_atomic
+
+
+def method_config(method: str, *, max_size: int | None = None) -> Config:
+    """A preset by its name; grid and reloc are the default preset without refinement, at cell
+    centres or relocalized.
+
+    Args:
+      max_size: longer side of the working images, pixels; None: the preset's.
+    """
+    if method in PRESETS:
+        config = preset(method)
+    else:
+        keypoints: Keypoints = "grid" if method == "grid" else "relocalized"
+        config = dataclasses.replace(preset("default"), refinement=None, keypoints=keypoints)
+    return config if max_size is None else dataclasses.replace(config, max_size=max_size)
+
+
+def choose_methods(names: Sequence[str], known: Sequence[str]) -> list[str]:
+    """`names` in the order of `known`.
+
+    Raises:
+      UserError: none, or one that is not known.
+    """
+    if not names:
+        raise UserError("--methods: none given")
+    if unknown := [name for name in names if name not in known]:
+        raise UserError(f"--methods: no method {unknown[0]!r}; there are {', '.join(known)}")
+    return [name for name in known if name in names]
+
+
+def choose_sets(found: dict[str, Path], names: Sequence[str] | None, root: Path) -> list[Path]:
+    """The named sets, or all by name.
+
+    Raises:
+      UserError: one of `names` is not there.
+    """
+    if names is None:
+        return [found[name] for name in sorted(found)]
+    if unknown := [name for name in names if name not in found]:
+        raise UserError(f"--sets: no set {unknown[0]!r} in {root} (there: {sorted(found)})")
+    return [found[name] for name in names]
+
+
+def check_root(root: Path) -> None:
+    """Raises UserError unless `root` is a folder."""
+    if not root.is_dir():
+        raise UserError(f"--root {root}: no such folder")
+
+
+def read_rows(path: Path, columns: int, what: str) -> np.ndarray:
+    """A text file of finite numbers, float64 (n, columns).
+
+    Args:
+      what: the file's rows in words, for the error.
+
+    Raises:
+      UserError: something else is in it, or nothing.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        rows = np.asarray([[float(v) for v in line.split()] for line in lines if line.strip()])
+    except (OSError, ValueError) as error:
+        raise UserError(f"--root: {path} cannot be read; expected {what}") from error
+    if rows.ndim != 2 or rows.shape[1] != columns or not np.isfinite(rows).all():
+        raise UserError(f"--root: {path} must hold {what}")
+    return rows
+
+
+def versions() -> dict[str, str]:
+    """Of what the figures depend on."""
+    return {
+        name: importlib.metadata.version(name)
+        for name in ("jaxsfm", "jax", "pycolmap", "opencv-python-headless")
+    }
+
+
+def spread(values: Iterable[float]) -> dict[str, float]:
+    """Mean, least and largest of the values over seeds."""
+    array = np.asarray(list(values), np.float64)
+    return {"mean": float(array.mean()), "min": float(array.min()), "max": float(array.max())}
+
+
+def write_json(path: Path, result: dict[str, Any]) -> None:
+    """The figures as JSON."""
+    write_atomic(path, json.dumps(result, indent=1).encode())

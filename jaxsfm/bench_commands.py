@@ -1,0 +1,177 @@
+"""The benchmarks' commands: `jaxsfm bench NAME`."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxsfm.commands import check_writable
+from jaxsfm.errors import UserError
+
+
+def _listed(values: tuple[str, ...] | None) -> list[str] | None:
+    """Names given by commas, blanks or both."""
+    return None if values is None else [n for value in values for n in value.split(",") if n]
+
+
+def _methods(values: tuple[str, ...], known: tuple[str, ...]) -> list[str]:
+    from jaxsfm.bench.common import choose_methods
+
+    return choose_methods(_listed(values) or [], known)
+
+
+def _finish(lines: list[str], result: dict[str, Any], json: Path | None) -> int:
+    from jaxsfm.bench.common import write_json
+
+    print("\n".join(lines))
+    if json is not None:
+        write_json(json, result)
+    return 0
+
+
+def _check(json: Path | None, seeds: int = 1, max_size: int | None = None) -> None:
+    from jaxsfm.config import MIN_SIDE
+
+    check_writable(json, "--json", (".json",))
+    if seeds < 1:
+        raise UserError(f"--seeds must be at least 1; got {seeds}")
+    if max_size is not None and max_size < MIN_SIDE:
+        raise UserError(f"--max-size must be at least {MIN_SIDE} pixels; got {max_size}")
+
+
+def strecha(
+    *,
+    root: Path,
+    sets: tuple[str, ...] | None = None,
+    methods: tuple[str, ...] = ("rootsift,grid,reloc,default",),
+    intrinsics: Literal["known", "unknown"] = "known",
+    json: Path | None = None,
+    out: Path | None = None,
+    seed: int = 0,
+    threads: int = -1,
+) -> int:
+    """Whole reconstructions of the Strecha sets, beside COLMAP's RootSIFT.
+
+    Args:
+      root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
+      sets: Which of them, by commas or blanks; default: all.
+      methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc: the default
+        preset without refinement, at cell centres or relocalized. default: the default preset.
+      intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
+      json: Write all figures here.
+      out: Keep databases and models here, and go on from what is there.
+      seed: Of everything random.
+      threads: Of COLMAP's part; -1: all.
+    """
+    _check(json)
+    from jaxsfm.bench import strecha as bench
+
+    result = bench.bench_strecha(
+        root,
+        sets=_listed(sets),
+        methods=_methods(methods, bench.METHODS),
+        known_intrinsics=intrinsics == "known",
+        out=out,
+        seed=seed,
+        threads=threads,
+        progress=True,
+    )
+    return _finish(bench.table_lines(result), result, json)
+
+
+def wxbs(
+    *,
+    root: Path,
+    sets: tuple[str, ...] | None = None,
+    methods: tuple[str, ...] = ("rootsift,paper,default",),
+    seeds: int = 5,
+    max_size: int | None = None,
+    json: Path | None = None,
+) -> int:
+    """Pairs under changes of viewpoint, illumination and season (WxBS).
+
+    Args:
+      root: Folder of the categories: CATEGORY/NAME/{01,02}.png, corrs.txt.
+      sets: CATEGORY or CATEGORY/NAME, by commas or blanks; default: all.
+      methods: By commas or blanks: rootsift, paper, grid (the default preset at cell centres),
+        default.
+      seeds: Runs of each method, with seeds 0, 1, ...
+      max_size: Longer side of our working images, pixels; default: the preset's.
+      json: Write all figures here.
+    """
+    _check(json, seeds, max_size)
+    from jaxsfm.bench import wxbs as bench
+    from jaxsfm.bench.matches import PAIR_METHODS
+
+    result = bench.bench_wxbs(
+        root,
+        sets=_listed(sets),
+        methods=_methods(methods, PAIR_METHODS),
+        seeds=seeds,
+        max_size=max_size,
+        progress=True,
+    )
+    return _finish(bench.table_lines(result), result, json)
+
+
+def homography(
+    *,
+    root: Path,
+    sets: tuple[str, ...] | None = None,
+    methods: tuple[str, ...] = ("rootsift,paper,default",),
+    seeds: int = 5,
+    max_size: int | None = None,
+    json: Path | None = None,
+) -> int:
+    """Sequences with known homographies (Oxford affine, HPatches).
+
+    Args:
+      root: Folder of the sequences: SEQUENCE/img1.png, H1to2p (or .xml); or SEQUENCE/1.ppm, H_1_2.
+      sets: Which of them, by commas or blanks; default: all.
+      methods: As in bench wxbs.
+      seeds: Runs of each method, with seeds 0, 1, ...
+      max_size: Longer side of our working images, pixels; default: the preset's.
+      json: Write all figures here.
+    """
+    _check(json, seeds, max_size)
+    from jaxsfm.bench import homography as bench
+    from jaxsfm.bench.matches import PAIR_METHODS
+
+    result = bench.bench_homography(
+        root,
+        sets=_listed(sets),
+        methods=_methods(methods, PAIR_METHODS),
+        seeds=seeds,
+        max_size=max_size,
+        progress=True,
+    )
+    return _finish(bench.table_lines(result), result, json)
+
+
+def planes(
+    *,
+    root: Path,
+    sets: tuple[str, ...] | None = None,
+    methods: tuple[str, ...] = ("paper,default",),
+    seeds: int = 5,
+    json: Path | None = None,
+) -> int:
+    """Several homographies fitted to given points (AdelaideRMF).
+
+    Args:
+      root: Folder of the points: NAME_pts.txt, rows of x1 y1 1 x2 y2 1 label.
+      sets: NAMEs, by commas or blanks; default: all.
+      methods: Presets, by commas or blanks.
+      seeds: Runs of each, with seeds 0, 1, ...
+      json: Write all figures here.
+    """
+    _check(json, seeds)
+    from jaxsfm.bench import planes as bench
+    from jaxsfm.config import PRESETS
+
+    result = bench.bench_planes(
+        root,
+        sets=_listed(sets),
+        methods=_methods(methods, tuple(PRESETS)),
+        seeds=seeds,
+        progress=True,
+    )
+    return _finish(bench.table_lines(result), result, json)

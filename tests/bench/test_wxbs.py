@@ -1,0 +1,167 @@
+"""`bench wxbs`: the measure's laws, and a run on a rendered pair."""
+
+import itertools
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from strategies import rng_of
+
+from jaxsfm.bench.wxbs import mean_average_accuracy, means, symmetric_epipolar_error
+from jaxsfm.cli import main
+from jaxsfm.host.poses import read_poses
+from jaxsfm.host.two_view import fundamental_matrix, homography
+
+
+def two_views(rng, n=60):
+    """A fundamental matrix and exact correspondences, pixels."""
+    k = np.asarray([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+    rotation = cv2.Rodrigues(rng.normal(size=3) * 0.2)[0]
+    t = rng.normal(size=3)
+    cross = np.cross(np.eye(3), t / np.linalg.norm(t)).T
+    f = np.linalg.inv(k).T @ cross @ rotation @ np.linalg.inv(k)
+    points = rng.uniform([-2, -2, 4], [2, 2, 9], size=(n, 3))
+    x0, x1 = points @ k.T, (points @ rotation.T + t) @ k.T
+    return f, x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_epipolar_error_is_the_distance_to_both_lines(seed):
+    rng = rng_of(seed)
+    f, xy0, xy1 = two_views(rng)
+    assert symmetric_epipolar_error(f, xy0, xy1).max() < 1e-6
+    off = xy1 + rng.normal(size=xy1.shape) * 5
+    got = symmetric_epipolar_error(f, xy0, off)
+    for a, b, error in zip(xy0, off, got, strict=True):
+        distances = []
+        for line, point in ((f @ [*a, 1], b), (f.T @ [*b, 1], a)):
+            distances.append(abs(line @ [*point, 1]) / np.hypot(line[0], line[1]))
+        assert error == pytest.approx(np.hypot(*distances))
+    swapped = symmetric_epipolar_error(f.T, off, xy0)
+    np.testing.assert_allclose(swapped, got)
+
+
+def test_an_undefined_line_counts_as_far_away():
+    assert (
+        symmetric_epipolar_error(np.zeros((3, 3)), np.ones((2, 2)), np.ones((2, 2))).min() == np.inf
+    )
+
+
+def test_mean_average_accuracy_counts_whole_pixels():
+    assert mean_average_accuracy(np.zeros(4)) == 1
+    assert mean_average_accuracy(np.full(4, np.inf)) == 0
+    assert mean_average_accuracy(np.asarray([10.5])) == 0.5  # within 11 .. 20 px
+    assert mean_average_accuracy(np.asarray([1.0, 20.1])) == 0.5
+
+
+def test_estimators_find_the_geometry_among_outliers_and_repeat():
+    rng = rng_of(1)
+    f, xy0, xy1 = two_views(rng, n=200)
+    noisy = xy1 + rng.normal(size=xy1.shape) * 0.3
+    noisy[:80] = rng.uniform(0, 600, size=(80, 2))
+    found = fundamental_matrix(xy0, noisy, seed=3)
+    assert found is not None
+    assert np.median(symmetric_epipolar_error(found, xy0, xy1)) < 0.5
+    assert np.array_equal(found, fundamental_matrix(xy0, noisy, seed=3))
+    assert fundamental_matrix(xy0[:7], xy1[:7], seed=0) is None
+    assert homography(xy0[:3], xy1[:3], seed=0) is None
+
+
+def test_means_average_pairs_before_seeds():
+    rows = [
+        {"category": c, "method": "paper", "scores": s}
+        for c, s in (("A", [0.0, 1.0]), ("A", [1.0, 0.0]), ("B", [0.2, 0.4]))
+    ]
+    got = means(rows)["paper"]
+    assert got["A"] == {"mean": 0.5, "min": 0.5, "max": 0.5}
+    assert got["B"]["min"] == 0.2 and set(got) == {"A", "B", "all"}
+    assert got["all"]["mean"] == pytest.approx((1 + 1 + 0.6) / 6)
+
+
+@pytest.fixture(scope="module")
+def root(scene, tmp_path_factory):
+    """CATEGORY/NAME with two views of the room; marked points on exact epipolar lines."""
+    folder = tmp_path_factory.mktemp("wxbs")
+    pair = folder / "WG" / "room"
+    pair.mkdir(parents=True)
+    names = sorted(path.name for path in (scene / "images").glob("view*"))
+    for name, target in zip((names[0], names[2]), ("01.png", "02.png"), strict=True):
+        shutil.copy(scene / "images" / name, pair / target)
+    poses = read_poses(scene / "reference")
+    a, b = (poses[name] for name in (names[0], names[2]))
+    k = np.loadtxt(scene / "K.txt")
+    rotation = b.rotation @ a.rotation.T
+    t = b.rotation @ (a.centre - b.centre)
+    f = np.linalg.inv(k).T @ np.cross(np.eye(3), t).T @ rotation @ np.linalg.inv(k)
+    rng, rows = rng_of(0), []
+    for _ in range(20):
+        x0 = rng.uniform([40, 40], [280, 200])
+        line = f @ [*x0, 1]
+        x = rng.uniform(40, 280)
+        rows.append([*x0, x, -(line[0] * x + line[2]) / line[1]])
+    np.savetxt(pair / "corrs.txt", rows)
+    return folder
+
+
+def test_a_rendered_pair_scores_well_and_repeats(root, tmp_path, capsys):
+    out = tmp_path / "figures.json"
+    args = ["bench", "wxbs", "--root", str(root), "--json", str(out), "--seeds", "2"]
+    runs = []
+    for _ in range(2):
+        assert main(args) == 0
+        figures = json.loads(out.read_text())
+        runs.append({row["method"]: row for row in figures["rows"]})
+    rows = runs[0]
+    assert set(rows) == {"rootsift", "paper", "default"}
+    for method in rows:
+        assert len(rows[method]["scores"]) == 2
+        assert rows[method]["scores"] == runs[1][method]["scores"]
+    assert rows["paper"]["maa"]["min"] > 0.6 < rows["default"]["maa"]["min"]
+    text = capsys.readouterr().out
+    assert "WG/room" in text and "mean of all" in text
+    assert figures["means"]["paper"]["WG"] == figures["means"]["paper"]["all"]
+
+
+def test_categories_and_pairs_are_chosen_by_name(root, tmp_path, capsys):
+    for chosen in ("WG", "WG/room"):
+        args = ["--root", str(root), "--sets", chosen, "--methods", "rootsift", "--seeds", "1"]
+        assert main(["bench", "wxbs", *args]) == 0
+        assert "WG/room" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}/WG"], "no pairs"),
+        (["--root", "{root}", "--sets", "WL"], "no set 'WL'"),
+        (["--root", "{root}", "--methods", "orb"], "no method 'orb'"),
+        (["--root", "{root}", "--seeds", "0"], "--seeds"),
+        (["--root", "{root}", "--max-size", "3"], "--max-size"),
+        (["--root", "{root}", "--methods", ""], "--methods"),
+    ],
+)
+def test_what_cannot_be_run_is_said(root, capsys, args, word):
+    assert main(["bench", "wxbs", *(a.format(root=root) for a in args)]) == 2
+    error = capsys.readouterr().err
+    assert word in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize("damage", ["points", "image"])
+def test_damaged_inputs_are_named_before_the_first_run(root, tmp_path, capsys, damage):
+    shutil.copytree(root, tmp_path / "w")
+    pair = tmp_path / "w" / "WG" / "room"
+    if damage == "points":
+        (pair / "corrs.txt").write_text("1 2 3\n")
+    else:
+        (pair / "02.png").unlink()
+    assert main(["bench", "wxbs", "--root", str(tmp_path / "w")]) == 2
+    assert ("corrs.txt" if damage == "points" else "02.png") in capsys.readouterr().err
+
+
+def test_reference_means_of_seeds_hold_their_bounds():
+    for scores in itertools.product([0.0, 0.5, 1.0], repeat=2):
+        figure = means([{"category": "A", "method": "m", "scores": list(scores)}])["m"]["all"]
+        assert figure["min"] <= figure["mean"] <= figure["max"]
