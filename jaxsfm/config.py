@@ -28,6 +28,8 @@ class PairShape:
     """Least-squares refits on the inliers of each new best hypothesis."""
     one_to_one: OneToOne = "first"
     """Which of a cell's several matches survives: the first in index order, or the most similar."""
+    consensus: int = 0
+    """Radius, coarse cells, of the neighbourhood that votes on coarse matches; 0: none."""
     coarse_tile: int = 1024
     """Rows of the coarse similarity matrix held at once."""
     fine_chunk: int = 128
@@ -49,6 +51,8 @@ class PairShape:
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"PairShape.{name} must be at least 1; got {getattr(self, name)}")
+        if self.consensus < 0:
+            raise ValueError(f"PairShape.consensus must be at least 0; got {self.consensus}")
         if self.correspondences_per_cell <= 0:
             raise ValueError(
                 "PairShape.correspondences_per_cell must be positive; "
@@ -138,7 +142,7 @@ MIN_SIDE = 48
 PRESETS: dict[str, Config] = {
     "paper": Config(),
     "default": Config(
-        pair=PairShape(local_refits=4, one_to_one="similarity"),
+        pair=PairShape(consensus=1, local_refits=4, one_to_one="similarity"),
         view_graph=True,
         refinement=Refinement(),
     ),

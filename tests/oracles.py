@@ -54,9 +54,34 @@ def mutual_nn(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     s = a.astype(np.float64) @ b.T.astype(np.float64)
     s[~a.any(1)] = -np.inf
     s[:, ~b.any(1)] = -np.inf
-    match = np.full(len(a), -1)
-    margin = np.full(len(a), np.inf)
-    for i in range(len(a)):
+    return _mutual(s)
+
+
+def consensus_nn(a, b, grid0, grid1, weights) -> tuple[np.ndarray, np.ndarray]:
+    """Mutual best cells under the sum of similarities over equal shifts, cell by cell."""
+    radius = len(weights) // 2
+    s = np.full((len(a), len(b)), -np.inf)
+    for i in np.flatnonzero(a.any(1)):
+        for j in np.flatnonzero(b.any(1)):
+            total = 0.0
+            for dr in range(-radius, radius + 1):
+                for dc in range(-radius, radius + 1):
+                    at = []
+                    for cell, (rows, columns) in ((i, grid0), (j, grid1)):
+                        r, c = cell // columns + dr, cell % columns + dc
+                        if 0 <= r < rows and 0 <= c < columns:
+                            at.append(r * columns + c)
+                    if len(at) == 2:
+                        w = weights[dr + radius] * weights[dc + radius]
+                        total += w * float(a[at[0]].astype(np.float64) @ b[at[1]])
+            s[i, j] = total
+    return _mutual(s)
+
+
+def _mutual(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    match = np.full(len(s), -1)
+    margin = np.full(len(s), np.inf)
+    for i in range(len(s)):
         j = int(np.argmax(s[i]))
         if not np.isfinite(s[i, j]):
             continue

@@ -1,5 +1,7 @@
 """Mutual nearest neighbours of unit descriptors, tiled: no full n x m matrix has to exist."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -28,23 +30,21 @@ def mutual(
     return jnp.where(agreed, row_best, -1)
 
 
-def mutual_nn(
-    a: Float[Array, "n c"], b: Float[Array, "m c"], *, tile: int = 1024
+def scan_mutual(
+    scores: Callable[[Array], Float[Array, "tile m"]], n: int, m: int, *, tile: int
 ) -> Int[Array, " n"]:
-    """For every row of `a` the row of `b` that is its mutual nearest neighbour, or -1.
+    """Mutual best partners of n rows and m columns; `tile` rows of scores exist at a time.
 
-    Exact; ties go to the lowest index on both sides. No ratio test: neighbouring cells look alike
-    (paper, section 3.1). `tile` rows of the similarity matrix exist at a time.
+    Exact; ties go to the lowest index on both sides.
+
+    Args:
+      scores: first row (int32) -> the scores of `tile` rows from there; -inf for what cannot match
+        and for rows past the last.
     """
-    n, m = a.shape[0], b.shape[0]
-    tile = min(tile, n)
-    num_tiles = -(-n // tile)
-    tiles = jnp.pad(a, ((0, num_tiles * tile - n), (0, 0))).reshape(num_tiles, tile, -1)
 
-    def step(best, item):
+    def step(best, start):
         col_score, col_best = best
-        start, rows = item
-        s = similarity(rows, b)
+        s = scores(start)
         row_score, row_best = argmax_first(s, axis=1)
         score, index = argmax_first(s, axis=0)
         better = score > col_score
@@ -53,7 +53,25 @@ def mutual_nn(
             jnp.where(better, index + start, col_best),
         ), (row_best, row_score)
 
-    start = (jnp.full((m,), -jnp.inf, a.dtype), jnp.zeros((m,), jnp.int32))
-    starts = jnp.arange(num_tiles, dtype=jnp.int32) * tile
-    (_, col_best), (row_best, row_score) = lax.scan(step, start, (starts, tiles))
+    begin = (jnp.full((m,), -jnp.inf, jnp.float32), jnp.zeros((m,), jnp.int32))
+    starts = jnp.arange(-(-n // tile), dtype=jnp.int32) * tile
+    (_, col_best), (row_best, row_score) = lax.scan(step, begin, starts)
     return mutual(row_best.reshape(-1)[:n], row_score.reshape(-1)[:n], col_best)
+
+
+def mutual_nn(
+    a: Float[Array, "n c"], b: Float[Array, "m c"], *, tile: int = 1024
+) -> Int[Array, " n"]:
+    """For every row of `a` the row of `b` that is its mutual nearest neighbour, or -1.
+
+    Exact; ties go to the lowest index on both sides. No ratio test: neighbouring cells look alike
+    (paper, section 3.1). `tile` rows of the similarity matrix exist at a time.
+    """
+    n = a.shape[0]
+    tile = min(tile, n)
+    padded = jnp.pad(a, ((0, -n % tile), (0, 0)))
+
+    def scores(start):
+        return similarity(lax.dynamic_slice_in_dim(padded, start, tile), b)
+
+    return scan_mutual(scores, n, b.shape[0], tile=tile)

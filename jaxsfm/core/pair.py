@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from jaxsfm.config import PairShape
 from jaxsfm.core import coarse_to_fine as c2f
+from jaxsfm.core.consensus import consensus_nn
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.numerics import HIGHEST
 from jaxsfm.core.ransac import peel_planes
@@ -49,7 +50,17 @@ def match_pair(
     """
     num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
     capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
-    coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
+    if shape.consensus:
+        coarse = consensus_nn(
+            features0.coarse,
+            features1.coarse,
+            features0.coarse_grid,
+            features1.coarse_grid,
+            radius=shape.consensus,
+            tile=shape.coarse_tile,
+        )
+    else:
+        coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
     windows = c2f.match_windows(features0, features1, coarse, chunk=shape.fine_chunk)
     cells, found = c2f.correspondences(c2f.candidates(windows, features0), capacity=capacity)
     valid = jnp.arange(cells.shape[0]) < found
