@@ -175,3 +175,47 @@ def planes(
         progress=True,
     )
     return _finish(bench.table_lines(result), result, json)
+
+
+def daynight(
+    *,
+    root: Path,
+    sets: tuple[str, ...] | None = None,
+    methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default",),
+    severity: float = 2.0,
+    denoise: bool = True,
+    jpeg: bool = True,
+    json: Path | None = None,
+    seed: int = 0,
+    threads: int = -1,
+) -> int:
+    """The paper's night protocol: day photos and one night photo, judged after a Sim3 from the day.
+
+    Args:
+      root: Folder of scenes (SCENE/{day,night,reference}), of Strecha sets (whose images are turned
+        to a synthetic night one after the other), or Aachen Day-Night.
+      sets: Which scenes, by commas or blanks; default: all.
+      methods: By commas or blanks: rootsift, paper-grid and paper (the paper's method without and
+        with relocalization), default.
+      severity: Of the synthetic night: 0: day, 1: clean, 2: noisy, 3: dark, 5: black.
+      denoise: Whether the synthetic night's camera removes noise.
+      jpeg: Whether it stores JPEG.
+      json: Write all figures here.
+      seed: Of everything random.
+      threads: Of COLMAP's part; -1: all.
+    """
+    _check(json)
+    from jaxsfm.bench import daynight as bench
+
+    result = bench.bench_daynight(
+        root,
+        sets=_listed(sets),
+        methods=_methods(methods, bench.METHODS),
+        severity=severity,
+        denoise=denoise,
+        jpeg=jpeg,
+        seed=seed,
+        threads=threads,
+        progress=True,
+    )
+    return _finish(bench.table_lines(result), result, json)

@@ -10,12 +10,18 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxsfm.bench_commands import homography, planes, strecha, wxbs
+from jaxsfm.bench_commands import daynight, homography, planes, strecha, wxbs
 from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 
-BENCHMARKS = {"strecha": strecha, "wxbs": wxbs, "homography": homography, "planes": planes}
+BENCHMARKS = {
+    "strecha": strecha,
+    "daynight": daynight,
+    "wxbs": wxbs,
+    "homography": homography,
+    "planes": planes,
+}
 _Benchmark = functools.reduce(
     operator.or_,
     (

@@ -15,14 +15,16 @@ from jaxsfm.host.workfolder import write_atomic
 
 
 def method_config(method: str, *, max_size: int | None = None) -> Config:
-    """A preset by its name; grid and reloc are the default preset without refinement, at cell
-    centres or relocalized.
+    """A preset by its name; paper-grid: paper at cell centres; grid and reloc: the default preset
+    without refinement, at cell centres or relocalized.
 
     Args:
       max_size: longer side of the working images, pixels; None: the preset's.
     """
     if method in PRESETS:
         config = preset(method)
+    elif method == "paper-grid":
+        config = dataclasses.replace(preset("paper"), keypoints="grid")
     else:
         keypoints: Keypoints = "grid" if method == "grid" else "relocalized"
         config = dataclasses.replace(preset("default"), refinement=None, keypoints=keypoints)

@@ -79,5 +79,8 @@ def _rootsift(path0: Path, path1: Path) -> tuple[np.ndarray, np.ndarray]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         database = Path(scratch) / "database.db"
         images = [inspect_image(path, name=path.name) for path in (path0, path1)]
-        write_rootsift_database(database, path0.parent, images, None, seed=0, threads=-1)
+        # Below eight there is no fundamental matrix.
+        write_rootsift_database(
+            database, path0.parent, images, None, seed=0, threads=-1, min_inliers=8
+        )
         return read_matches(database, (path0.name, path1.name))

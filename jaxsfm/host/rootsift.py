@@ -20,6 +20,7 @@ def write_rootsift_database(
     *,
     seed: int,
     threads: int,
+    min_inliers: int | None = None,
 ) -> None:
     """A new database with COLMAP's DoG + RootSIFT features, matched and verified.
 
@@ -28,6 +29,7 @@ def write_rootsift_database(
 
     Args:
       folder: the images' folder.
+      min_inliers: pairs with fewer matches or inliers are emptied; None: COLMAP's 15.
     """
     path.unlink(missing_ok=True)
     reader = pycolmap.ImageReaderOptions()
@@ -45,6 +47,8 @@ def write_rootsift_database(
     two_view = pycolmap.TwoViewGeometryOptions()
     two_view.ransac.random_seed = seed
     two_view.compute_relative_pose = True
+    if min_inliers is not None:
+        two_view.min_num_inliers = min_inliers
 
     def work(_: pycolmap.CancellationToken) -> None:
         pycolmap.extract_features(

@@ -1,0 +1,246 @@
+"""`bench daynight`: the paper's night protocol (section 4.1).
+
+Each subset holds day photos and one night photo. It is reconstructed, the day cameras alone fix the
+similarity to the reference, and the night camera is judged: registered or not, and how far away.
+"""
+
+import functools
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsfm.bench import scenes
+from jaxsfm.bench.common import method_config, versions
+from jaxsfm.bench.scenes import Scene, Subset
+from jaxsfm.errors import UserError
+from jaxsfm.evaluation import evaluate
+from jaxsfm.host.colmap import drop_pairs, read_two_views
+from jaxsfm.host.features import ImageFeatures, image_features
+from jaxsfm.host.intrinsics import Intrinsics, parse_intrinsics
+from jaxsfm.host.mapping import MapOptions, build_models
+from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.host.poses import Poses, model_poses
+from jaxsfm.host.rootsift import write_rootsift_database
+from jaxsfm.host.weights import load_weights
+from jaxsfm.pipeline import match_features, on_device, reconstruct
+
+METHODS = ("rootsift", "paper-grid", "paper", "default")
+"""paper-grid and paper are the paper's rows without and with relocalization."""
+FEATURES = 64
+"""Photos whose features are held: 38 MB each at 1536 x 1024."""
+LIMITS = ((0.1, 1.0), (0.5, 10.0), (1.0, 10.0), (5.0, 10.0), (10.0, 10.0), (20.0, 10.0))
+"""Distance (the reference's units; metres for Strecha and Aachen) and degrees."""
+PUBLISHED = (
+    "published (Widya et al. 2018, Aachen, 98 subsets of 20 day + 1 night): registered night / day "
+    "DoG + RootSIFT 48 / 1910, dense without relocalization 95 / 1924, with 96 / 1944"
+)
+
+
+def _rootsift_models(
+    scene: Scene, scratch: Path, given: Intrinsics | None, seed: int, threads: int
+) -> list[Poses]:
+    """Poses per subset: features and matches of all photos once, then what a subset has of them."""
+    database = scratch / "all.db"
+    images = [scene.images[name] for name in sorted(scene.images)]
+    write_rootsift_database(database, scene.folder, images, given, seed=seed, threads=threads)
+    every = read_two_views(database)
+    options = MapOptions(refine_intrinsics=given is None, seed=seed, threads=threads)
+    models = []
+    for subset in scene.subsets:
+        part = scratch / "part.db"
+        shutil.copyfile(database, part)
+        names = {*subset.day, subset.night}
+        drop_pairs(part, [pair for pair in every if not names.issuperset(pair)])
+        kept = {pair: view for pair, view in every.items() if names.issuperset(pair)}
+        found, _ = build_models(part, kept, options)
+        models.append(model_poses(found[0]) if found else {})
+    return models
+
+
+def _dense_models(
+    scene: Scene, scratch: Path, method: str, given: Intrinsics | None, seed: int, threads: int
+) -> list[Poses]:
+    """Poses per subset; a photo's features and a pair's matches are computed once."""
+    config = method_config(method)
+    weights = on_device(load_weights())
+
+    @functools.lru_cache(maxsize=FEATURES)
+    def features(name: str) -> ImageFeatures:
+        return image_features(weights, scene.images[name], config=config)
+
+    results: dict[Pair, PairResult] = {}
+    options = MapOptions(refine_intrinsics=given is None, seed=seed, threads=threads)
+    models = []
+    for subset in scene.subsets:
+        pairs = exhaustive_pairs({*subset.day, subset.night})
+        for a, b in pairs:
+            if (a, b) not in results:
+                results[a, b] = match_features(features(a), features(b), config=config, seed=seed)
+        made = reconstruct(
+            [scene.images[name] for name in sorted({*subset.day, subset.night})],
+            {pair: results[pair] for pair in pairs},
+            scratch / "part.db",
+            config=config,
+            intrinsics=given,
+            options=options,
+        )
+        models.append(model_poses(made.models[0]) if made.models else {})
+    return models
+
+
+def judge(poses: Poses, subset: Subset, truth: Poses) -> dict[str, Any]:
+    """One subset's figures: day cameras registered, the night camera's errors or why there are
+    none.
+
+    Args:
+      poses: of the best model.
+    """
+    day = [name for name in subset.day if name in poses]
+    row: dict[str, Any] = {
+        "night": subset.night,
+        "registered": subset.night in poses,
+        "day_registered": len(day),
+        "day_images": len(subset.day),
+    }
+    if not row["registered"] or subset.night not in truth:
+        return row
+    known = {name: truth[name] for name in (*subset.day, subset.night) if name in truth}
+    try:
+        errors = evaluate(poses, known, align_on=[name for name in day if name in known])
+    except UserError as error:  # too few day cameras, or on one line
+        return row | {"not_evaluated": str(error)}
+    night = errors.images[subset.night]
+    return row | {"position": night.position, "rotation_deg": night.rotation_deg}
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Registered nights and days, share of all nights within each limit, the cumulative curve."""
+    judged = [row for row in rows if "position" in row]
+    return {
+        "nights": len(rows),
+        "night_registered": sum(row["registered"] for row in rows),
+        "day_images": sum(row["day_images"] for row in rows),
+        "day_registered": sum(row["day_registered"] for row in rows),
+        "within": {
+            f"{d:g}; {deg:g} deg": sum(
+                row["position"] <= d and row["rotation_deg"] <= deg for row in judged
+            )
+            / max(len(rows), 1)
+            for d, deg in LIMITS
+        },
+        "sorted_positions": sorted(row["position"] for row in judged),
+        "median_rotation_deg": float(np.median([row["rotation_deg"] for row in judged]))
+        if judged
+        else None,
+    }
+
+
+def bench_daynight(
+    root: Path,
+    *,
+    sets: Sequence[str] | None = None,
+    methods: Sequence[str] = METHODS,
+    severity: float = 2.0,
+    denoise: bool = True,
+    jpeg: bool = True,
+    seed: int = 0,
+    threads: int = -1,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """All methods on all subsets of all scenes; plain JSON.
+
+    Args:
+      root: see `jaxsfm.bench.scenes`.
+      severity, denoise, jpeg: of the synthetic night, for Strecha sets.
+    """
+    scenes.check_severity(severity)
+    folders = scenes.find_scenes(root, sets)
+    rows = []
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
+        for name, folder in folders.items():
+            scratch = Path(temporary) / name
+            scratch.mkdir()
+            if scenes.is_strecha(folder):
+                scene = scenes.synthetic_scene(
+                    folder,
+                    scratch / "photos",
+                    severity=severity,
+                    seed=seed,
+                    denoise=denoise,
+                    jpeg=jpeg,
+                )
+            elif (folder / scenes.AACHEN_PAIRS).is_file():
+                scene = scenes.aachen_scene(folder)
+            else:
+                scene = scenes.simple_scene(folder)
+            given = parse_intrinsics(scene.intrinsics) if scene.intrinsics else None
+            for method in methods:
+                start = time.monotonic()
+                if method == "rootsift":
+                    models = _rootsift_models(scene, scratch, given, seed, threads)
+                else:
+                    models = _dense_models(scene, scratch, method, given, seed, threads)
+                subsets = [
+                    judge(poses, subset, scene.truth)
+                    for poses, subset in zip(models, scene.subsets, strict=True)
+                ]
+                rows.append(
+                    {
+                        "scene": name,
+                        "synthetic": scene.synthetic,
+                        "severity": severity if scene.synthetic else None,
+                        "method": method,
+                        "seconds": time.monotonic() - start,
+                        "subsets": subsets,
+                        **summary(subsets),
+                    }
+                )
+                if progress:
+                    print(row_line(rows[-1]), flush=True)
+    totals = {
+        method: summary([s for row in rows if row["method"] == method for s in row["subsets"]])
+        for method in methods
+    }
+    return {
+        "benchmark": "daynight",
+        "versions": versions(),
+        "seed": seed,
+        "denoise": denoise,
+        "jpeg": jpeg,
+        "rows": rows,
+        "totals": totals,
+        "published": PUBLISHED,
+    }
+
+
+HEADER = (
+    f"{'scene':24s} {'method':9s} {'night':>7s} {'day':>9s} "
+    + " ".join(f"{f'{d:g}; {deg:g}':>8s}" for d, deg in LIMITS)
+    + f" {'seconds':>8s}"
+)
+
+
+def _figures(row: dict[str, Any]) -> str:
+    within = " ".join(f"{share:8.0%}" for share in row["within"].values())
+    return (
+        f"{row['night_registered']:3d}/{row['nights']:<3d} "
+        f"{row['day_registered']:4d}/{row['day_images']:<4d} {within}"
+    )
+
+
+def row_line(row: dict[str, Any]) -> str:
+    """One line of the table."""
+    kind = f" synthetic {row['severity']:g}" if row["synthetic"] else ""
+    return f"{row['scene'] + kind:24s} {row['method']:9s} {_figures(row)} {row['seconds']:8.1f}"
+
+
+def table_lines(result: dict[str, Any]) -> list[str]:
+    """Nights and days registered, share of the nights within (distance; deg)."""
+    lines = [HEADER, *(row_line(row) for row in result["rows"])]
+    lines += [f"{'all':24s} {m:9s} {_figures(row)}" for m, row in result["totals"].items()]
+    return [*lines, result["published"]]

@@ -1,0 +1,158 @@
+"""Day and night scenes for `bench daynight`, from three layouts.
+
+* Strecha sets, each image turned to a synthetic night once: exact ground truth for any severity.
+* Simple: SCENE/day/*, SCENE/night/*, SCENE/reference (Strecha .camera files or a COLMAP model whose
+  image names, or their stems, are those of the photos), and, if all photos share a known camera,
+  SCENE/intrinsics.txt with MODEL:p1,p2,..
+* Aachen Day-Night: images_upright/, 3D-models/**/ (a COLMAP model), image_pairs_to_match.txt, whose
+  lines pair each night photo with its day photos.
+"""
+
+import shutil
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from jaxsfm.bench.common import check_root, choose_sets
+from jaxsfm.bench.strecha import find_sets, strecha_intrinsics
+from jaxsfm.errors import UserError
+from jaxsfm.evaluation import pair_names
+from jaxsfm.host.images import ImageFile, find_images, inspect_image, read_image
+from jaxsfm.host.poses import Poses, read_poses
+from jaxsfm.night import synthetic_night
+
+AACHEN_PAIRS = "image_pairs_to_match.txt"
+NIGHT = "night/"
+
+
+class Subset(NamedTuple):
+    """Day photos and one night photo: one reconstruction."""
+
+    day: list[str]
+    night: str
+
+
+class Scene(NamedTuple):
+    """Subsets that share photos."""
+
+    name: str
+    folder: Path
+    """Photos' names are paths below it."""
+    images: dict[str, ImageFile]
+    subsets: list[Subset]
+    truth: Poses
+    """Reference poses by the photos' names; a photo without one is only counted as registered."""
+    intrinsics: str | None
+    """Of all photos; None: guessed and refined."""
+    synthetic: bool
+
+
+def synthetic_scene(
+    folder: Path, target: Path, *, severity: float, seed: int, denoise: bool, jpeg: bool
+) -> Scene:
+    """A Strecha set with every image also at night (`night/NAME.png`), written below `target`.
+
+    Subset k: image k at night, all others by day.
+    """
+    poses = read_poses(folder, option="--root")
+    day = [name for name in find_images(folder / "images") if "/" not in name]
+    (target / NIGHT).mkdir(parents=True, exist_ok=True)
+    images, truth, subsets = {}, {}, []
+    stored = pair_names(day, poses)
+    for name in day:
+        shutil.copyfile(folder / "images" / name, target / name)
+        image = inspect_image(target / name, name=name)
+        rgb = read_image(image, max_size=max(image.size)).rgb
+        # A scene's nights differ, and do not depend on which other sets are run.
+        own = (seed + zlib.crc32(f"{folder.name}/{name}".encode())) % 2**32
+        dark = synthetic_night(rgb, severity=severity, seed=own, denoise=denoise, jpeg=jpeg)
+        night = f"{NIGHT}{Path(name).stem}.png"
+        cv2.imwrite(str(target / night), cv2.cvtColor(dark, cv2.COLOR_RGB2BGR))
+        images[name], images[night] = image, inspect_image(target / night, name=night)
+        if name in stored:
+            truth[name] = truth[night] = poses[stored[name]]
+        subsets.append(Subset([other for other in day if other != name], night))
+    intrinsics, _ = strecha_intrinsics(folder)
+    return Scene(folder.name, target, images, subsets, truth, intrinsics, True)
+
+
+def simple_scene(folder: Path) -> Scene:
+    """SCENE/{day,night,reference}: every night photo with all day photos."""
+    names = {
+        part: [f"{part}/{name}" for name in find_images(folder / part)] for part in ("day", "night")
+    }
+    images = {n: inspect_image(folder / n, name=n) for part in names.values() for n in part}
+    poses = read_poses(folder / "reference", option="--root")
+    # The reference may name the photos with or without their folder.
+    bare = {name.partition("/")[2]: name for name in images}
+    own = [*images, *(set(bare) - set(images))]
+    truth = {bare.get(n, n): poses[other] for n, other in pair_names(own, poses).items()}
+    path = folder / "intrinsics.txt"
+    intrinsics = path.read_text(encoding="utf-8").strip() if path.is_file() else None
+    subsets = [Subset(names["day"], night) for night in names["night"]]
+    return Scene(folder.name, folder, images, subsets, truth, intrinsics, False)
+
+
+def aachen_scene(root: Path) -> Scene:
+    """Aachen Day-Night in its public layout: each night photo with the day photos paired with it.
+
+    Cameras are guessed from EXIF and refined.
+    """
+    folder = root / "images_upright"
+    if not folder.is_dir():
+        raise UserError(f"--root {root}: {AACHEN_PAIRS} but no folder images_upright")
+    models = sorted(
+        path.parent
+        for pattern in ("images.bin", "images.txt")
+        for path in (root / "3D-models").rglob(pattern)
+    )
+    if not models:
+        raise UserError(f"--root {root}: no COLMAP model below 3D-models")
+    paired: dict[str, set[str]] = {}
+    for line in (root / AACHEN_PAIRS).read_text(encoding="utf-8").splitlines():
+        names = line.split()
+        dark = [name for name in names if "night" in name.split("/")]
+        if len(names) == 2 and len(dark) == 1:
+            paired.setdefault(dark[0], set()).update(set(names) - set(dark))
+    if not paired:
+        raise UserError(f"--root: {root / AACHEN_PAIRS} pairs no night photo with day photos")
+    wanted = sorted({*paired, *(name for day in paired.values() for name in day)})
+    images = {name: inspect_image(folder / name, name=name) for name in wanted}
+    subsets = [Subset(sorted(day), night) for night, day in sorted(paired.items())]
+    poses = read_poses(models[0], option="--root")
+    truth = {name: poses[other] for name, other in pair_names(wanted, poses).items()}
+    return Scene(root.name, folder, images, subsets, truth, None, False)
+
+
+def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
+    """Folders of the scenes below `root`, by name; one for Aachen.
+
+    Raises:
+      UserError: none there, or one of `names` is not.
+    """
+    check_root(root)
+    if (root / AACHEN_PAIRS).is_file():
+        return {root.name: root}
+    found = {path.parent.name: path.parent for path in root.glob("*/night") if path.is_dir()}
+    if not found and not any(root.glob("*/images/K.txt")):
+        raise UserError(
+            f"--root {root}: no scenes in it (SCENE/day and SCENE/night, Strecha sets, or Aachen's "
+            f"{AACHEN_PAIRS})"
+        )
+    folders = choose_sets(found, names, root) if found else find_sets(root, names)
+    return {folder.name: folder for folder in folders}
+
+
+def is_strecha(folder: Path) -> bool:
+    """Whether nights have to be made."""
+    return (folder / "images" / "K.txt").is_file()
+
+
+def check_severity(severity: float) -> None:
+    """Raises UserError unless it is a finite number of at least 0."""
+    if not (np.isfinite(severity) and severity >= 0):
+        raise UserError(f"--severity must be at least 0; got {severity}")

@@ -1,0 +1,91 @@
+"""A synthetic night: what a camera would make of a day photo's scene under a few lamps.
+
+It is a model, not a night: every result made with it says `synthetic`. What it has, in order:
+
+1. Light: the day fades (severity 0 to 1) into a dim bluish ambience and a few lamps of different
+   colours, each with its reach, and their glare.
+2. Blur of 0.3 px per unit of severity (longer exposure).
+3. Exposure: the brightest hundredth saturates; a pixel at saturation holds 20 000 electrons at
+   severity 0 and a tenth of that per unit. Photon noise is Poisson, read noise 2 electrons.
+4. Gain ends at 100 electrons for full scale: from severity 2.3 on the image gets darker, at 5 it is
+   black.
+5. Encoding (gamma 2.2, 8 bits), then a camera's denoising and JPEG, if wanted.
+"""
+
+import cv2
+import numpy as np
+
+GAMMA = 2.2
+AMBIENT = 0.006 * np.asarray([0.7, 0.85, 1.2])
+LAMPS = (
+    np.asarray([1.25, 0.9, 0.5]),  # sodium
+    np.asarray([1.1, 1.0, 0.8]),  # warm white
+    np.asarray([0.85, 1.05, 1.0]),  # mercury
+)
+NUM_LAMPS = 6
+SATURATED_SHARE = 0.01
+FULL_WELL = 20_000.0
+MIN_FULL_SCALE = 100.0
+READ_NOISE = 2.0
+BLUR_PX = 0.3
+
+
+def _lamp_light(shape: tuple[int, int], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Light on the surfaces and glare in front of them, float64 (h, w, 3); 1 is daylight."""
+    height, width = shape
+    diagonal = np.hypot(height, width)
+    y, x = np.mgrid[:height, :width]
+    light = np.broadcast_to(AMBIENT, (height, width, 3)).copy()
+    glare = np.zeros((height, width, 3))
+    for _ in range(NUM_LAMPS):
+        at = rng.uniform([0.05, 0.05], [0.95, 0.75]) * (width, height)
+        reach = rng.uniform(0.06, 0.16) * diagonal
+        colour = LAMPS[rng.integers(len(LAMPS))] * rng.uniform(0.4, 1.0)
+        square = (x - at[0]) ** 2 + (y - at[1]) ** 2
+        light += (1 / (1 + square / reach**2) ** 2)[..., None] * colour
+        glare += np.exp(-square / (2 * (0.006 * diagonal) ** 2))[..., None] * colour
+    return light, glare
+
+
+def synthetic_night(
+    rgb: np.ndarray, *, severity: float, seed: int, denoise: bool = True, jpeg: bool = True
+) -> np.ndarray:
+    """The photo at a synthetic night, uint8 (h, w, 3) RGB.
+
+    Args:
+      rgb: uint8 (h, w, 3), a day photo.
+      severity: 0: the photo itself; 1: a clean night; 2: noisy; 3: dark and very noisy; 5: black.
+      seed: of the lamps' places and the noise.
+      denoise, jpeg: what cameras do afterwards.
+
+    Raises:
+      ValueError: `severity` is negative, `rgb` is not such an image.
+    """
+    if severity < 0:
+        raise ValueError(f"severity must be at least 0; got {severity}")
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+        raise ValueError(f"rgb must be uint8 (h, w, 3); got {rgb.dtype} {rgb.shape}")
+    if severity == 0:
+        return rgb.copy()
+    rng = np.random.default_rng(seed)
+    light, glare = _lamp_light(rgb.shape[:2], rng)
+    dusk = min(severity, 1.0)
+    radiance = (rgb / 255.0) ** GAMMA * ((1 - dusk) + dusk * light) + dusk * glare
+    radiance = cv2.GaussianBlur(radiance, (0, 0), BLUR_PX * severity)
+    white = max(float(np.quantile(radiance.max(2), 1 - SATURATED_SHARE)), 1e-6)
+    full = FULL_WELL * 10.0**-severity
+    electrons = rng.poisson(np.minimum(radiance / white, 1.0) * full)
+    electrons = electrons + rng.normal(0.0, READ_NOISE, rgb.shape)
+    signal = np.clip(electrons / max(full, MIN_FULL_SCALE), 0.0, 1.0)
+    image = np.round(255 * signal ** (1 / GAMMA)).astype(np.uint8)
+    if denoise:
+        strength = float(np.clip(5 * severity, 3, 12))
+        image = cv2.fastNlMeansDenoisingColored(image, None, strength, strength, 5, 11)
+    if jpeg:
+        quality = int(np.clip(95 - 10 * severity, 50, 95))
+        ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+        assert ok
+        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert decoded is not None
+        image = np.ascontiguousarray(decoded[..., ::-1])
+    return image

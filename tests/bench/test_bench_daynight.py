@@ -1,0 +1,173 @@
+"""`bench daynight`: scenes in every layout, the protocol's figures, a run on the rendered room."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from jaxsfm.bench import scenes
+from jaxsfm.bench.daynight import judge, summary
+from jaxsfm.bench.scenes import Subset
+from jaxsfm.cli import main
+from jaxsfm.errors import UserError
+from jaxsfm.host.poses import CameraPose, read_poses
+
+
+@pytest.fixture(scope="module")
+def strecha(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sets")
+    shutil.copytree(scene / "images", folder / "room" / "images")
+    shutil.copy(scene / "K.txt", folder / "room" / "images" / "K.txt")
+    shutil.copytree(scene / "reference", folder / "room" / "gt_dense_cameras")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def simple(tmp_path_factory):
+    """Four day views and a night view of the room, rendered."""
+    from jaxsfm.synthetic import camera_matrix, write_scene
+
+    source = tmp_path_factory.mktemp("rendered")
+    write_scene(source, num_views=5, size=(320, 240))
+    folder = tmp_path_factory.mktemp("simple") / "room"
+    for part in ("day", "night"):
+        (folder / part).mkdir(parents=True)
+    for path in (source / "images").iterdir():
+        shutil.copy(path, folder / ("night" if "night" in path.name else "day") / path.name)
+    shutil.copytree(source / "reference", folder / "reference")
+    k = camera_matrix((320, 240))
+    (folder / "intrinsics.txt").write_text(
+        f"PINHOLE:{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}\n"
+    )
+    return folder.parent
+
+
+def test_every_image_of_a_strecha_set_is_the_night_once(strecha, tmp_path):
+    options = {"seed": 0, "denoise": True, "jpeg": True}
+    made = scenes.synthetic_scene(strecha / "room", tmp_path / "a", severity=1, **options)
+    day = sorted(name for name in made.images if not name.startswith("night/"))
+    assert len(made.subsets) == len(day) == 3 and len(made.images) == 6 and made.synthetic
+    for subset in made.subsets:
+        own = next(n for n in day if subset.night == f"night/{n.rpartition('.')[0]}.png")
+        assert subset.day == [name for name in day if name != own]
+        assert made.truth[subset.night] is made.truth[own]
+    again = scenes.synthetic_scene(strecha / "room", tmp_path / "b", severity=1, **options)
+    assert {n: i.sha256 for n, i in made.images.items()} == {
+        n: i.sha256 for n, i in again.images.items()
+    }
+
+
+def test_the_simple_layout(simple):
+    made = scenes.simple_scene(simple / "room")
+    assert len(made.subsets) == 1 and len(made.subsets[0].day) == 4 and not made.synthetic
+    assert set(made.truth) == set(made.images) and made.intrinsics.startswith("PINHOLE:")
+    poses = read_poses(simple / "room" / "reference")
+    night = made.subsets[0].night
+    assert np.array_equal(made.truth[night].centre, poses[night.rpartition("/")[2]].centre)
+
+
+def test_aachens_layout(simple, tmp_path):
+    """Each night photo with the day photos of its lines; other lines do not count."""
+    day = sorted(path.name for path in (simple / "room" / "day").iterdir())
+    night = next((simple / "room" / "night").iterdir()).name
+    photos = tmp_path / "images_upright"
+    shutil.copytree(simple / "room" / "day", photos / "db")
+    (photos / "query" / "night").mkdir(parents=True)
+    shutil.copy(simple / "room" / "night" / night, photos / "query" / "night" / night)
+    lines = [f"db/{day[0]} query/night/{night}", f"query/night/{night} db/{day[2]}"]
+    (tmp_path / scenes.AACHEN_PAIRS).write_text("\n".join([*lines, f"db/{day[0]} db/{day[1]}"]))
+    with pytest.raises(UserError, match="3D-models"):
+        scenes.aachen_scene(tmp_path)
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            model="PINHOLE", width=320, height=240, params=[320, 320, 160, 120], camera_id=1
+        )
+    )
+    poses = read_poses(simple / "room" / "reference")
+    for k, name in enumerate(day, 1):
+        pose = poses[name]
+        image = pycolmap.Image(name=f"db/{name}", camera_id=1, image_id=k)
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), -pose.rotation @ pose.centre)
+        model.add_image_with_trivial_frame(image, rigid)
+    (tmp_path / "3D-models" / "aachen").mkdir(parents=True)
+    model.write_binary(str(tmp_path / "3D-models" / "aachen"))
+    made = scenes.aachen_scene(tmp_path)
+    assert made.subsets == [Subset([f"db/{day[0]}", f"db/{day[2]}"], f"query/night/{night}")]
+    assert set(made.truth) == {f"db/{day[0]}", f"db/{day[2]}"}
+    assert list(scenes.find_scenes(tmp_path, None)) == [tmp_path.name]
+
+
+def poses_on_arc(names):
+    return {
+        name: CameraPose(np.eye(3), np.asarray([k, 0.3 * k * k, 0.1 * k]))
+        for k, name in enumerate(names)
+    }
+
+
+def test_the_night_camera_is_judged_after_a_similarity_from_the_day():
+    names = ["a", "b", "c", "d", "n"]
+    truth = poses_on_arc(names)
+    moved = {name: CameraPose(pose.rotation, 3 * pose.centre + 5) for name, pose in truth.items()}
+    moved["n"] = CameraPose(moved["n"].rotation, moved["n"].centre + [0.6, 0, 0])
+    subset = Subset(names[:4], "n")
+    row = judge(moved, subset, truth)
+    assert row["registered"] and row["day_registered"] == 4
+    assert row["position"] == pytest.approx(0.2) and row["rotation_deg"] < 1e-6
+    del moved["n"]
+    assert "position" not in judge(moved, subset, truth)
+    lonely = {name: truth[name] for name in ("a", "n")}
+    row = judge(lonely, subset, truth)
+    assert row["registered"] and "not_evaluated" in row and row["day_registered"] == 1
+    assert judge({}, subset, truth)["registered"] is False
+
+
+def test_unregistered_nights_count_in_the_shares():
+    base = {"day_registered": 3, "day_images": 4}
+    rows = [
+        base | {"registered": True, "position": 0.05, "rotation_deg": 0.5},
+        base | {"registered": True, "position": 0.05, "rotation_deg": 20.0},
+        base | {"registered": True},
+        base | {"registered": False},
+    ]
+    got = summary(rows)
+    assert got["nights"] == 4 and got["night_registered"] == 3
+    assert (got["day_registered"], got["day_images"]) == (12, 16)
+    assert got["within"]["0.1; 1 deg"] == 0.25 == got["within"]["20; 10 deg"]
+    assert got["sorted_positions"] == [0.05, 0.05]
+    assert summary([])["within"]["20; 10 deg"] == 0
+
+
+def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
+    out = tmp_path / "figures.json"
+    args = ["bench", "daynight", "--root", str(simple), "--json", str(out), "--threads", "1"]
+    assert main(args) == 0
+    figures = json.loads(out.read_text())
+    rows = {row["method"]: row for row in figures["rows"]}
+    assert set(rows) == {"rootsift", "paper-grid", "paper", "default"}
+    for row in rows.values():
+        assert row["nights"] == 1 and row["day_images"] == 4 and not row["synthetic"]
+    for method in ("paper", "default"):
+        assert rows[method]["night_registered"] == 1 and rows[method]["day_registered"] == 4
+        assert rows[method]["within"]["0.5; 10 deg"] == 1
+    assert rows["default"]["within"]["0.1; 1 deg"] == 1
+    assert "published" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}/room"], "no scenes"),
+        (["--root", "{root}", "--sets", "hall"], "no set 'hall'"),
+        (["--root", "{root}", "--severity", "-1"], "--severity"),
+        (["--root", "{root}", "--methods", "orb"], "no method 'orb'"),
+    ],
+)
+def test_what_cannot_be_run_is_said(simple, capsys, args, word):
+    assert main(["bench", "daynight", *(a.format(root=simple) for a in args)]) == 2
+    error = capsys.readouterr().err
+    assert word in error and "Traceback" not in error
