@@ -1,5 +1,6 @@
 """The benchmarks' commands: `jaxsfm bench NAME`."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,9 +28,24 @@ def _finish(lines: list[str], result: dict[str, Any], json: Path | None) -> int:
     return 0
 
 
-def _check(json: Path | None, seeds: int = 1, max_size: int | None = None) -> None:
-    from jaxsfm.config import MIN_SIDE
+def _keeper(json: Path | None) -> Callable[[dict[str, Any]], None]:
+    from jaxsfm.bench.common import write_json
 
+    return lambda result: None if json is None else write_json(json, result)
+
+
+def _check(
+    json: Path | None,
+    seeds: int = 1,
+    max_size: int | None = None,
+    *,
+    seed: int = 0,
+    threads: int = -1,
+) -> None:
+    from jaxsfm.config import MIN_SIDE
+    from jaxsfm.run import check_seed_and_threads
+
+    check_seed_and_threads(seed, threads)
     check_writable(json, "--json", (".json",))
     if seeds < 1:
         raise UserError(f"--seeds must be at least 1; got {seeds}")
@@ -54,14 +70,14 @@ def strecha(
       root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
       sets: Which of them, by commas or blanks; default: all.
       methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc: the default
-        preset without refinement, at cell centres or relocalized. default: the default preset.
+        preset without refinement, at cell centres or relocalized. default, robust: the presets.
       intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
       json: Write all figures here.
       out: Keep databases and models here, and go on from what is there.
       seed: Of everything random.
       threads: Of COLMAP's part; -1: all.
     """
-    _check(json)
+    _check(json, seed=seed, threads=threads)
     from jaxsfm.bench import strecha as bench
 
     result = bench.bench_strecha(
@@ -73,6 +89,7 @@ def strecha(
         seed=seed,
         threads=threads,
         progress=True,
+        keep=_keeper(json),
     )
     return _finish(bench.table_lines(result), result, json)
 
@@ -81,7 +98,7 @@ def wxbs(
     *,
     root: Path,
     sets: tuple[str, ...] | None = None,
-    methods: tuple[str, ...] = ("rootsift,paper,default",),
+    methods: tuple[str, ...] = ("rootsift,paper,default,robust",),
     seeds: int = 5,
     max_size: int | None = None,
     json: Path | None = None,
@@ -92,7 +109,7 @@ def wxbs(
       root: Folder of the categories: CATEGORY/NAME/{01,02}.png, corrs.txt.
       sets: CATEGORY or CATEGORY/NAME, by commas or blanks; default: all.
       methods: By commas or blanks: rootsift, paper, grid (the default preset at cell centres),
-        default.
+        default, robust.
       seeds: Runs of each method, with seeds 0, 1, ...
       max_size: Longer side of our working images, pixels; default: the preset's.
       json: Write all figures here.
@@ -108,6 +125,7 @@ def wxbs(
         seeds=seeds,
         max_size=max_size,
         progress=True,
+        keep=_keeper(json),
     )
     return _finish(bench.table_lines(result), result, json)
 
@@ -116,7 +134,7 @@ def homography(
     *,
     root: Path,
     sets: tuple[str, ...] | None = None,
-    methods: tuple[str, ...] = ("rootsift,paper,default",),
+    methods: tuple[str, ...] = ("rootsift,paper,default,robust",),
     seeds: int = 5,
     max_size: int | None = None,
     json: Path | None = None,
@@ -142,6 +160,7 @@ def homography(
         seeds=seeds,
         max_size=max_size,
         progress=True,
+        keep=_keeper(json),
     )
     return _finish(bench.table_lines(result), result, json)
 
@@ -173,6 +192,7 @@ def planes(
         methods=_methods(methods, tuple(PRESETS)),
         seeds=seeds,
         progress=True,
+        keep=_keeper(json),
     )
     return _finish(bench.table_lines(result), result, json)
 
@@ -181,7 +201,7 @@ def daynight(
     *,
     root: Path,
     sets: tuple[str, ...] | None = None,
-    methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default",),
+    methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default,robust",),
     severity: float = 2.0,
     denoise: bool = True,
     jpeg: bool = True,
@@ -195,16 +215,16 @@ def daynight(
       root: Folder of scenes (SCENE/{day,night,reference}), of Strecha sets (whose images are turned
         to a synthetic night one after the other), or Aachen Day-Night.
       sets: Which scenes, by commas or blanks; default: all.
-      methods: By commas or blanks: rootsift, paper-grid and paper (the paper's method without and
-        with relocalization), default.
-      severity: Of the synthetic night: 0: day, 1: clean, 2: noisy, 3: dark, 5: black.
+      methods: By commas or blanks: rootsift, paper-grid and paper (the paper's method at cell
+        centres and relocalized), default, robust.
+      severity: Of the synthetic night: 0: day, 1: clean, 2: noisy, 3: dark, 5: noise.
       denoise: Whether the synthetic night's camera removes noise.
       jpeg: Whether it stores JPEG.
       json: Write all figures here.
       seed: Of everything random.
       threads: Of COLMAP's part; -1: all.
     """
-    _check(json)
+    _check(json, seed=seed, threads=threads)
     from jaxsfm.bench import daynight as bench
 
     result = bench.bench_daynight(
@@ -217,5 +237,6 @@ def daynight(
         seed=seed,
         threads=threads,
         progress=True,
+        keep=_keeper(json),
     )
     return _finish(bench.table_lines(result), result, json)

@@ -68,7 +68,7 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(
             "jaxsfm: interrupted; what reconstruct had finished is kept: the same command goes on "
-            "from there",
+            "from there (bench: finished rows are in --json)",
             file=sys.stderr,
         )
         if any(thread.name == "jaxsfm-colmap" for thread in threading.enumerate()):

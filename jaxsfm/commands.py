@@ -16,7 +16,7 @@ from jaxsfm.config import Config, Keypoints, Refinement, preset
 from jaxsfm.errors import UserError
 
 Positional = tyro.conf.Positional
-Preset = Literal["paper", "default"]
+Preset = Literal["paper", "default", "robust"]
 Switch = Literal["preset", "yes", "no"]
 
 
@@ -79,7 +79,8 @@ def reconstruct(
       images: Folder with the photos; sub-folders are included.
       out: Folder for the results; a run that was interrupted goes on there.
       preset: paper: the constants of the authors' code. default: iterated refits, the most
-        similar of several matches, view graph, two passes of refinement.
+        similar of several matches, view graph, two passes of refinement. robust: default, and
+        neighbouring cells vote for each other (night, seasons, weather).
       intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
         model, COLMAP's pixels) for all photos; without it one camera per photo.
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.

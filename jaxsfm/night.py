@@ -7,8 +7,8 @@ It is a model, not a night: every result made with it says `synthetic`. What it 
 2. Blur of 0.3 px per unit of severity (longer exposure).
 3. Exposure: the brightest hundredth saturates; a pixel at saturation holds 20 000 electrons at
    severity 0 and a tenth of that per unit. Photon noise is Poisson, read noise 2 electrons.
-4. Gain ends at 100 electrons for full scale: from severity 2.3 on the image gets darker, at 5 it is
-   black.
+4. Gain ends at 100 electrons for full scale: from severity 2.3 on the image gets darker; at 5 a
+   pixel holds less than one, and there is nothing but read noise to see.
 5. Encoding (gamma 2.2, 8 bits), then a camera's denoising and JPEG, if wanted.
 """
 
@@ -54,7 +54,7 @@ def synthetic_night(
 
     Args:
       rgb: uint8 (h, w, 3), a day photo.
-      severity: 0: the photo itself; 1: a clean night; 2: noisy; 3: dark and very noisy; 5: black.
+      severity: 0: the photo itself; 1: a clean night; 2: noisy; 3: dark and very noisy; 5: noise.
       seed: of the lamps' places and the noise.
       denoise, jpeg: what cameras do afterwards.
 
@@ -72,9 +72,9 @@ def synthetic_night(
     dusk = min(severity, 1.0)
     radiance = (rgb / 255.0) ** GAMMA * ((1 - dusk) + dusk * light) + dusk * glare
     radiance = cv2.GaussianBlur(radiance, (0, 0), BLUR_PX * severity)
-    white = max(float(np.quantile(radiance.max(2), 1 - SATURATED_SHARE)), 1e-6)
+    white = (1 - dusk) + dusk * float(np.quantile(radiance.max(2), 1 - SATURATED_SHARE))
     full = FULL_WELL * 10.0**-severity
-    electrons = rng.poisson(np.minimum(radiance / white, 1.0) * full)
+    electrons = rng.poisson(np.minimum(radiance / max(white, 1e-6), 1.0) * full)
     electrons = electrons + rng.normal(0.0, READ_NOISE, rgb.shape)
     signal = np.clip(electrons / max(full, MIN_FULL_SCALE), 0.0, 1.0)
     image = np.round(255 * signal ** (1 / GAMMA)).astype(np.uint8)

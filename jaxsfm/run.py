@@ -205,10 +205,15 @@ def _map(
 def _check_options(options: RunOptions) -> None:
     if options.best_pairs is not None and options.best_pairs < 1:
         raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
-    if not 0 <= options.seed < 2**31:
-        raise UserError(f"--seed must lie in 0 .. 2147483647; got {options.seed}")
-    if options.threads == 0 or options.threads < -1:
-        raise UserError(f"--threads must be positive, or -1 for all; got {options.threads}")
+    check_seed_and_threads(options.seed, options.threads)
+
+
+def check_seed_and_threads(seed: int, threads: int) -> None:
+    """Raises UserError unless COLMAP takes both."""
+    if not 0 <= seed < 2**31:
+        raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
+    if threads == 0 or threads < -1:
+        raise UserError(f"--threads must be positive, or -1 for all; got {threads}")
 
 
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:

@@ -1,4 +1,5 @@
 """Benchmarks on public data sets, beside COLMAP's RootSIFT.
 
-`strecha`: whole reconstructions. `wxbs`, `homography`: pairs of images. `planes`: given points.
+`strecha`: whole reconstructions; `daynight`: the paper's night protocol. `wxbs`, `homography`:
+pairs of images. `planes`: given points.
 """

@@ -3,7 +3,7 @@
 import dataclasses
 import importlib.metadata
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,11 @@ import numpy as np
 
 from jaxsfm.config import PRESETS, Config, Keypoints, preset
 from jaxsfm.errors import UserError
+from jaxsfm.host.images import inspect_image
 from jaxsfm.host.workfolder import write_atomic
+
+Keep = Callable[[dict[str, Any]], None]
+"""Takes the figures so far, after every row: nothing measured is lost."""
 
 
 def method_config(method: str, *, max_size: int | None = None) -> Config:
@@ -25,9 +29,11 @@ def method_config(method: str, *, max_size: int | None = None) -> Config:
         config = preset(method)
     elif method == "paper-grid":
         config = dataclasses.replace(preset("paper"), keypoints="grid")
-    else:
+    elif method in ("grid", "reloc"):
         keypoints: Keypoints = "grid" if method == "grid" else "relocalized"
         config = dataclasses.replace(preset("default"), refinement=None, keypoints=keypoints)
+    else:
+        raise ValueError(f"method must be a preset, paper-grid, grid or reloc; got {method!r}")
     return config if max_size is None else dataclasses.replace(config, max_size=max_size)
 
 
@@ -52,6 +58,8 @@ def choose_sets(found: dict[str, Path], names: Sequence[str] | None, root: Path)
     """
     if names is None:
         return [found[name] for name in sorted(found)]
+    if not names:
+        raise UserError("--sets: none given")
     if unknown := [name for name in names if name not in found]:
         raise UserError(f"--sets: no set {unknown[0]!r} in {root} (there: {sorted(found)})")
     return [found[name] for name in names]
@@ -82,6 +90,11 @@ def read_rows(path: Path, columns: int, what: str) -> np.ndarray:
     return rows
 
 
+def check_image(path: Path) -> None:
+    """Raises UserError, naming the whole path, unless the image can be used."""
+    inspect_image(path, name=str(path))
+
+
 def versions() -> dict[str, str]:
     """Of what the figures depend on."""
     return {
@@ -98,4 +111,4 @@ def spread(values: Iterable[float]) -> dict[str, float]:
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
     """The figures as JSON."""
-    write_atomic(path, json.dumps(result, indent=1).encode())
+    write_atomic(path, json.dumps(result, indent=1, allow_nan=False).encode())

@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.common import method_config, versions
+from jaxsfm.bench.common import Keep, method_config, versions
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.colmap import drop_pairs, read_two_views
 from jaxsfm.host.features import ImageFeatures, image_features
-from jaxsfm.host.intrinsics import Intrinsics, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.host.poses import Poses, model_poses
@@ -29,10 +28,11 @@ from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import load_weights
 from jaxsfm.pipeline import match_features, on_device, reconstruct
 
-METHODS = ("rootsift", "paper-grid", "paper", "default")
-"""paper-grid and paper are the paper's rows without and with relocalization."""
+METHODS = ("rootsift", "paper-grid", "paper", "default", "robust")
+"""paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has
+corners of cells and 80 px.)"""
 FEATURES = 64
-"""Photos whose features are held: 38 MB each at 1536 x 1024."""
+"""Photos whose features are held, or as many as a subset has: 38 MB each at 1536 x 1024."""
 LIMITS = ((0.1, 1.0), (0.5, 10.0), (1.0, 10.0), (5.0, 10.0), (10.0, 10.0), (20.0, 10.0))
 """Distance (the reference's units; metres for Strecha and Aachen) and degrees."""
 PUBLISHED = (
@@ -42,14 +42,24 @@ PUBLISHED = (
 
 
 def _rootsift_models(
-    scene: Scene, scratch: Path, given: Intrinsics | None, seed: int, threads: int
+    scene: Scene, scratch: Path, _method: str, seed: int, threads: int
 ) -> list[Poses]:
     """Poses per subset: features and matches of all photos once, then what a subset has of them."""
     database = scratch / "all.db"
     images = [scene.images[name] for name in sorted(scene.images)]
-    write_rootsift_database(database, scene.folder, images, given, seed=seed, threads=threads)
+    blanks = any(" " in name for name in scene.images)  # COLMAP's pair lists cannot hold them
+    pairs = {p for subset in scene.subsets for p in exhaustive_pairs([*subset.day, subset.night])}
+    write_rootsift_database(
+        database,
+        scene.folder,
+        images,
+        scene.camera,
+        seed=seed,
+        threads=threads,
+        pairs=None if blanks else sorted(pairs),
+    )
     every = read_two_views(database)
-    options = MapOptions(refine_intrinsics=given is None, seed=seed, threads=threads)
+    options = MapOptions(refine_intrinsics=scene.camera is None, seed=seed, threads=threads)
     models = []
     for subset in scene.subsets:
         part = scratch / "part.db"
@@ -62,22 +72,27 @@ def _rootsift_models(
     return models
 
 
-def _dense_models(
-    scene: Scene, scratch: Path, method: str, given: Intrinsics | None, seed: int, threads: int
-) -> list[Poses]:
+def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: int) -> list[Poses]:
     """Poses per subset; a photo's features and a pair's matches are computed once."""
     config = method_config(method)
     weights = on_device(load_weights())
 
-    @functools.lru_cache(maxsize=FEATURES)
+    largest = max(len(subset.day) + 1 for subset in scene.subsets)
+
+    @functools.lru_cache(maxsize=max(FEATURES, largest))
     def features(name: str) -> ImageFeatures:
         return image_features(weights, scene.images[name], config=config)
 
+    last_use = {
+        pair: k
+        for k, subset in enumerate(scene.subsets)
+        for pair in exhaustive_pairs([*subset.day, subset.night])
+    }
     results: dict[Pair, PairResult] = {}
-    options = MapOptions(refine_intrinsics=given is None, seed=seed, threads=threads)
+    options = MapOptions(refine_intrinsics=scene.camera is None, seed=seed, threads=threads)
     models = []
-    for subset in scene.subsets:
-        pairs = exhaustive_pairs({*subset.day, subset.night})
+    for k, subset in enumerate(scene.subsets):
+        pairs = exhaustive_pairs([*subset.day, subset.night])
         for a, b in pairs:
             if (a, b) not in results:
                 results[a, b] = match_features(features(a), features(b), config=config, seed=seed)
@@ -86,10 +101,11 @@ def _dense_models(
             {pair: results[pair] for pair in pairs},
             scratch / "part.db",
             config=config,
-            intrinsics=given,
+            intrinsics=scene.camera,
             options=options,
         )
         models.append(model_poses(made.models[0]) if made.models else {})
+        results = {pair: result for pair, result in results.items() if last_use[pair] > k}
     return models
 
 
@@ -104,6 +120,7 @@ def judge(poses: Poses, subset: Subset, truth: Poses) -> dict[str, Any]:
     row: dict[str, Any] = {
         "night": subset.night,
         "registered": subset.night in poses,
+        "has_truth": subset.night in truth,
         "day_registered": len(day),
         "day_images": len(subset.day),
     }
@@ -119,8 +136,12 @@ def judge(poses: Poses, subset: Subset, truth: Poses) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Registered nights and days, share of all nights within each limit, the cumulative curve."""
+    """Registered nights and days, share of the nights within each limit, the cumulative curve.
+
+    The share is of all nights with a reference pose, registered or not; None without any.
+    """
     judged = [row for row in rows if "position" in row]
+    known = sum(row["has_truth"] for row in rows)
     return {
         "nights": len(rows),
         "night_registered": sum(row["registered"] for row in rows),
@@ -130,9 +151,12 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             f"{d:g}; {deg:g} deg": sum(
                 row["position"] <= d and row["rotation_deg"] <= deg for row in judged
             )
-            / max(len(rows), 1)
+            / known
             for d, deg in LIMITS
-        },
+        }
+        if known
+        else None,
+        "not_evaluated": sum("not_evaluated" in row for row in rows),
         "sorted_positions": sorted(row["position"] for row in judged),
         "median_rotation_deg": float(np.median([row["rotation_deg"] for row in judged]))
         if judged
@@ -151,6 +175,7 @@ def bench_daynight(
     seed: int = 0,
     threads: int = -1,
     progress: bool = False,
+    keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
     """All methods on all subsets of all scenes; plain JSON.
 
@@ -160,31 +185,26 @@ def bench_daynight(
     """
     scenes.check_severity(severity)
     folders = scenes.find_scenes(root, sets)
-    rows = []
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
-        for name, folder in folders.items():
-            scratch = Path(temporary) / name
-            scratch.mkdir()
-            if scenes.is_strecha(folder):
-                scene = scenes.synthetic_scene(
-                    folder,
-                    scratch / "photos",
-                    severity=severity,
-                    seed=seed,
-                    denoise=denoise,
-                    jpeg=jpeg,
-                )
-            elif (folder / scenes.AACHEN_PAIRS).is_file():
-                scene = scenes.aachen_scene(folder)
-            else:
-                scene = scenes.simple_scene(folder)
-            given = parse_intrinsics(scene.intrinsics) if scene.intrinsics else None
+    ready: dict[str, Scene] = {}
+    for name, folder in folders.items():  # all inputs are read before the first long run
+        if scenes.is_strecha(folder):
+            scenes.check_strecha(folder)
+        elif (folder / scenes.AACHEN_PAIRS).is_file():
+            ready[name] = scenes.aachen_scene(folder)
+        else:
+            ready[name] = scenes.simple_scene(folder)
+    rows: list[dict[str, Any]] = []
+    setting = {"seed": seed, "denoise": denoise, "jpeg": jpeg}
+    for name, folder in folders.items():
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
+            scratch = Path(temporary)
+            scene = ready.get(name) or scenes.synthetic_scene(
+                folder, scratch / "photos", severity=severity, **setting
+            )
             for method in methods:
                 start = time.monotonic()
-                if method == "rootsift":
-                    models = _rootsift_models(scene, scratch, given, seed, threads)
-                else:
-                    models = _dense_models(scene, scratch, method, given, seed, threads)
+                make = _rootsift_models if method == "rootsift" else _dense_models
+                models = make(scene, scratch, method, seed, threads)
                 subsets = [
                     judge(poses, subset, scene.truth)
                     for poses, subset in zip(models, scene.subsets, strict=True)
@@ -202,16 +222,19 @@ def bench_daynight(
                 )
                 if progress:
                     print(row_line(rows[-1]), flush=True)
+                keep(_result(rows, setting))
+    return _result(rows, setting)
+
+
+def _result(rows: list[dict[str, Any]], setting: dict[str, Any]) -> dict[str, Any]:
     totals = {
         method: summary([s for row in rows if row["method"] == method for s in row["subsets"]])
-        for method in methods
+        for method in dict.fromkeys(row["method"] for row in rows)
     }
     return {
         "benchmark": "daynight",
         "versions": versions(),
-        "seed": seed,
-        "denoise": denoise,
-        "jpeg": jpeg,
+        **setting,
         "rows": rows,
         "totals": totals,
         "published": PUBLISHED,
@@ -226,7 +249,8 @@ HEADER = (
 
 
 def _figures(row: dict[str, Any]) -> str:
-    within = " ".join(f"{share:8.0%}" for share in row["within"].values())
+    shares = row["within"].values() if row["within"] else [None] * len(LIMITS)
+    within = " ".join(f"{'-':>8s}" if share is None else f"{share:8.0%}" for share in shares)
     return (
         f"{row['night_registered']:3d}/{row['nights']:<3d} "
         f"{row['day_registered']:4d}/{row['day_images']:<4d} {within}"
@@ -243,4 +267,11 @@ def table_lines(result: dict[str, Any]) -> list[str]:
     """Nights and days registered, share of the nights within (distance; deg)."""
     lines = [HEADER, *(row_line(row) for row in result["rows"])]
     lines += [f"{'all':24s} {m:9s} {_figures(row)}" for m, row in result["totals"].items()]
+    for row in result["rows"]:
+        if row["not_evaluated"]:
+            why = next(s["not_evaluated"] for s in row["subsets"] if "not_evaluated" in s)
+            lines.append(
+                f"{row['scene']} {row['method']}: {row['not_evaluated']} nights registered but not "
+                f"evaluated, e.g. {why}"
+            )
     return [*lines, result["published"]]

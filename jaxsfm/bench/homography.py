@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from jaxsfm.bench.common import check_root, choose_sets, read_rows, spread, versions
+from jaxsfm.bench.common import (
+    Keep,
+    check_image,
+    check_root,
+    choose_sets,
+    read_rows,
+    spread,
+    versions,
+)
 from jaxsfm.bench.matches import Matcher
 from jaxsfm.errors import UserError
 from jaxsfm.host.images import SUFFIXES, inspect_image
@@ -62,9 +70,22 @@ def corner_error(found: np.ndarray | None, truth: np.ndarray, size: tuple[int, i
     return error if np.isfinite(error) else np.inf
 
 
-def area_under_curve(errors: Sequence[float], limit: float) -> float:
-    """Area under the cumulative curve of the errors up to `limit`, as a share of the best."""
-    return float(np.maximum(0.0, 1.0 - np.asarray(errors, np.float64) / limit).mean())
+def _finite(value: float) -> float | None:
+    """For JSON, which has no infinity."""
+    return value if np.isfinite(value) else None
+
+
+def _with_inf(errors: Sequence[float | None]) -> list[float]:
+    return [np.inf if error is None else error for error in errors]
+
+
+def area_under_curve(errors: Sequence[float | None], limit: float) -> float:
+    """Area under the cumulative curve of the errors up to `limit`, as a share of the best.
+
+    Args:
+      errors: None where there was no estimate.
+    """
+    return float(np.maximum(0.0, 1.0 - np.asarray(_with_inf(errors)) / limit).mean())
 
 
 def read_homography(path: Path) -> np.ndarray:
@@ -98,17 +119,20 @@ def read_sequence(folder: Path) -> list[KnownPair]:
         number = re.fullmatch(r"(?:img)?(\d+)", path.stem)
         if number and path.suffix.lower() in SUFFIXES:
             images[int(number[1])] = path
-    pairs = []
-    for path in folder.iterdir():
+    pairs: dict[int, KnownPair] = {}
+    for path in sorted(folder.iterdir()):
         if (named := TRUTH_NAME.fullmatch(path.name)) is None:
             continue
         other = int(named[1])
         for k in (1, other):
             if k not in images:
                 raise UserError(f"--root: {folder}: image {k} is missing, named by {path.name}")
-        name = f"{folder.name} 1-{other}"
-        pairs.append(KnownPair(name, images[1], images[other], read_homography(path)))
-    return sorted(pairs, key=lambda pair: int(pair.name.rpartition("-")[2]))
+            check_image(images[k])
+        h = read_homography(path)
+        if other in pairs and not np.allclose(h, pairs[other].h):
+            raise UserError(f"--root: {path} contradicts another homography of image {other}")
+        pairs[other] = KnownPair(f"{folder.name} 1-{other}", images[1], images[other], h)
+    return [pairs[other] for other in sorted(pairs)]
 
 
 def bench_homography(
@@ -119,6 +143,7 @@ def bench_homography(
     seeds: int = 5,
     max_size: int | None = None,
     progress: bool = False,
+    keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
     """All methods on all sequences; plain JSON.
 
@@ -163,7 +188,9 @@ def bench_homography(
                             for t in ACCURACY_PX
                         },
                         "corner_error_px": [
-                            corner_error(homography(run.xy0, run.xy1, seed=seed), pair.h, size)
+                            _finite(
+                                corner_error(homography(run.xy0, run.xy1, seed=seed), pair.h, size)
+                            )
                             for seed, run in enumerate(runs)
                         ],
                         "seconds": float(np.median([run.seconds for run in runs])),
@@ -171,6 +198,11 @@ def bench_homography(
                 )
                 if progress:
                     print(row_line(rows[-1]), flush=True)
+                keep(_result(rows, seeds, max_size))
+    return _result(rows, seeds, max_size)
+
+
+def _result(rows: list[dict[str, Any]], seeds: int, max_size: int | None) -> dict[str, Any]:
     return {
         "benchmark": "homography",
         "versions": versions(),
@@ -215,7 +247,7 @@ def row_line(row: dict[str, Any]) -> str:
     return (
         f"{row['pair']:20s} {row['method']:9s} {row['matches']['mean']:8.0f} "
         f"{row['correct']['3']['mean']:8.0f} {accuracy} "
-        f"{np.median(row['corner_error_px']):9.2f} {row['seconds']:8.2f}"
+        f"{np.median(_with_inf(row['corner_error_px'])):9.2f} {row['seconds']:8.2f}"
     )
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxsfm.bench.common import check_root, choose_sets, read_rows, spread, versions
+from jaxsfm.bench.common import Keep, check_root, choose_sets, read_rows, spread, versions
 from jaxsfm.config import Config, preset
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.errors import UserError
@@ -78,6 +78,7 @@ def bench_planes(
     methods: Sequence[str],
     seeds: int = 5,
     progress: bool = False,
+    keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
     """Presets' plane fitting on all files NAME_pts.txt; plain JSON.
 
@@ -109,6 +110,11 @@ def bench_planes(
             )
             if progress:
                 print(row_line(rows[-1]), flush=True)
+            keep(_result(rows, seeds))
+    return _result(rows, seeds)
+
+
+def _result(rows: list[dict[str, Any]], seeds: int) -> dict[str, Any]:
     return {"benchmark": "planes", "versions": versions(), "seeds": seeds, "rows": rows}
 
 

@@ -3,7 +3,7 @@
 * Strecha sets, each image turned to a synthetic night once: exact ground truth for any severity.
 * Simple: SCENE/day/*, SCENE/night/*, SCENE/reference (Strecha .camera files or a COLMAP model whose
   image names, or their stems, are those of the photos), and, if all photos share a known camera,
-  SCENE/intrinsics.txt with MODEL:p1,p2,..
+  SCENE/intrinsics.txt with MODEL:p1,p2,.. (COLMAP's pixels) or a 3 x 3 matrix
 * Aachen Day-Night: images_upright/, 3D-models/**/ (a COLMAP model), image_pairs_to_match.txt, whose
   lines pair each night photo with its day photos.
 """
@@ -17,11 +17,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxsfm.bench.common import check_root, choose_sets
-from jaxsfm.bench.strecha import find_sets, strecha_intrinsics
+from jaxsfm.bench.common import check_image, check_root, choose_sets
+from jaxsfm.bench.strecha import strecha_intrinsics
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import pair_names
 from jaxsfm.host.images import ImageFile, find_images, inspect_image, read_image
+from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.poses import Poses, read_poses
 from jaxsfm.night import synthetic_night
 
@@ -46,7 +47,7 @@ class Scene(NamedTuple):
     subsets: list[Subset]
     truth: Poses
     """Reference poses by the photos' names; a photo without one is only counted as registered."""
-    intrinsics: str | None
+    camera: Intrinsics | None
     """Of all photos; None: guessed and refined."""
     synthetic: bool
 
@@ -76,8 +77,22 @@ def synthetic_scene(
         if name in stored:
             truth[name] = truth[night] = poses[stored[name]]
         subsets.append(Subset([other for other in day if other != name], night))
-    intrinsics, _ = strecha_intrinsics(folder)
-    return Scene(folder.name, target, images, subsets, truth, intrinsics, True)
+    camera = parse_intrinsics(strecha_intrinsics(folder)[0])
+    return Scene(folder.name, target, images, subsets, truth, camera, True)
+
+
+def _known_camera(path: Path, images: dict[str, ImageFile]) -> Intrinsics | None:
+    """From MODEL:p1,p2,.. or a 3 x 3 matrix in a file; None without the file."""
+    if not path.is_file():
+        return None
+    try:
+        text = path.read_text(encoding="utf-8").strip()
+        found = parse_intrinsics(text if ":" in text else str(path))
+        check_fits(found, {name: image.size for name, image in images.items()})
+    except (OSError, UnicodeDecodeError, UserError) as error:
+        why = str(error).removeprefix("--intrinsics").strip(" :")
+        raise UserError(f"--root: {path}: {why}") from error
+    return found
 
 
 def simple_scene(folder: Path) -> Scene:
@@ -85,16 +100,30 @@ def simple_scene(folder: Path) -> Scene:
     names = {
         part: [f"{part}/{name}" for name in find_images(folder / part)] for part in ("day", "night")
     }
-    images = {n: inspect_image(folder / n, name=n) for part in names.values() for n in part}
-    poses = read_poses(folder / "reference", option="--root")
-    # The reference may name the photos with or without their folder.
-    bare = {name.partition("/")[2]: name for name in images}
-    own = [*images, *(set(bare) - set(images))]
-    truth = {bare.get(n, n): poses[other] for n, other in pair_names(own, poses).items()}
-    path = folder / "intrinsics.txt"
-    intrinsics = path.read_text(encoding="utf-8").strip() if path.is_file() else None
+    images = _inspected(folder, [n for part in names.values() for n in part])
+    truth = _reference(folder.name, images, read_poses(folder / "reference", option="--root"))
+    if sum(name in truth for name in names["day"]) < 3:
+        raise UserError(
+            f"--root: {folder / 'reference'} has fewer than 3 of the day photos (by name, or by a "
+            "name without suffix that only one photo has)"
+        )
+    camera = _known_camera(folder / "intrinsics.txt", images)
     subsets = [Subset(names["day"], night) for night in names["night"]]
-    return Scene(folder.name, folder, images, subsets, truth, intrinsics, False)
+    return Scene(folder.name, folder, images, subsets, truth, camera, False)
+
+
+def _inspected(folder: Path, names: Sequence[str]) -> dict[str, ImageFile]:
+    images = {}
+    for name in names:
+        check_image(folder / name)
+        images[name] = inspect_image(folder / name, name=name)
+    return images
+
+
+def _reference(scene: str, images: dict[str, ImageFile], poses: Poses) -> Poses:
+    if not poses:
+        raise UserError(f"--root: the reference of {scene} has no poses")
+    return {name: poses[other] for name, other in pair_names(list(images), poses).items()}
 
 
 def aachen_scene(root: Path) -> Scene:
@@ -113,7 +142,11 @@ def aachen_scene(root: Path) -> Scene:
     if not models:
         raise UserError(f"--root {root}: no COLMAP model below 3D-models")
     paired: dict[str, set[str]] = {}
-    for line in (root / AACHEN_PAIRS).read_text(encoding="utf-8").splitlines():
+    try:
+        lines = (root / AACHEN_PAIRS).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"--root: {root / AACHEN_PAIRS} cannot be read as text") from error
+    for line in lines:
         names = line.split()
         dark = [name for name in names if "night" in name.split("/")]
         if len(names) == 2 and len(dark) == 1:
@@ -121,10 +154,9 @@ def aachen_scene(root: Path) -> Scene:
     if not paired:
         raise UserError(f"--root: {root / AACHEN_PAIRS} pairs no night photo with day photos")
     wanted = sorted({*paired, *(name for day in paired.values() for name in day)})
-    images = {name: inspect_image(folder / name, name=name) for name in wanted}
+    images = _inspected(folder, wanted)
     subsets = [Subset(sorted(day), night) for night, day in sorted(paired.items())]
-    poses = read_poses(models[0], option="--root")
-    truth = {name: poses[other] for name, other in pair_names(wanted, poses).items()}
+    truth = _reference(root.name, images, read_poses(models[0], option="--root"))
     return Scene(root.name, folder, images, subsets, truth, None, False)
 
 
@@ -135,16 +167,26 @@ def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
       UserError: none there, or one of `names` is not.
     """
     check_root(root)
+    root = root.resolve()  # so that it has a name
     if (root / AACHEN_PAIRS).is_file():
-        return {root.name: root}
-    found = {path.parent.name: path.parent for path in root.glob("*/night") if path.is_dir()}
-    if not found and not any(root.glob("*/images/K.txt")):
+        found = {root.name: root}
+    else:
+        found = {path.parent.name: path.parent for path in root.glob("*/night") if path.is_dir()}
+        found |= {path.parents[1].name: path.parents[1] for path in root.glob("*/images/K.txt")}
+    if not found:
         raise UserError(
             f"--root {root}: no scenes in it (SCENE/day and SCENE/night, Strecha sets, or Aachen's "
             f"{AACHEN_PAIRS})"
         )
-    folders = choose_sets(found, names, root) if found else find_sets(root, names)
-    return {folder.name: folder for folder in folders}
+    return {folder.name: folder for folder in choose_sets(found, names, root)}
+
+
+def check_strecha(folder: Path) -> None:
+    """Raises UserError, before the first long run, for what `synthetic_scene` cannot use."""
+    strecha_intrinsics(folder)
+    read_poses(folder, option="--root")
+    for name in find_images(folder / "images"):
+        check_image(folder / "images" / name)
 
 
 def is_strecha(folder: Path) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsfm.bench.common import check_root, choose_sets, method_config, read_rows, versions
+from jaxsfm.bench.common import Keep, check_root, choose_sets, method_config, read_rows, versions
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.colmap import read_two_views, write_models
@@ -23,7 +23,7 @@ from jaxsfm.pipeline import open_images
 from jaxsfm.report import model_figures
 from jaxsfm.run import RunOptions, run_folder
 
-METHODS = ("rootsift", "grid", "reloc", "default")
+METHODS = ("rootsift", "grid", "reloc", "default", "robust")
 PUBLISHED = (
     "published (Widya et al. 2018, mean over six full-size sets): "
     "DoG + RootSIFT 0.17 m, 0.90 deg; dense + relocalization 0.59 m, 2.27 deg"
@@ -139,12 +139,13 @@ def bench_strecha(
     root: Path,
     *,
     sets: Sequence[str] | None = None,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] = METHODS[:4],
     known_intrinsics: bool = True,
     out: Path | None = None,
     seed: int = 0,
     threads: int = -1,
     progress: bool = False,
+    keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
     """All methods on all sets, same images, camera, verification and mapper; plain JSON.
 
@@ -187,6 +188,11 @@ def bench_strecha(
                         shutil.copytree(work / "sparse", kept)
                 if progress:
                     print(row_line(rows[-1]), flush=True)
+                keep(_result(rows, known_intrinsics, seed))
+    return _result(rows, known_intrinsics, seed)
+
+
+def _result(rows: list[dict[str, Any]], known_intrinsics: bool, seed: int) -> dict[str, Any]:
     return {
         "benchmark": "strecha",
         "versions": versions(),

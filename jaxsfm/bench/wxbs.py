@@ -10,9 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from jaxsfm.bench.common import check_root, choose_sets, read_rows, spread, versions
+from jaxsfm.bench.common import (
+    Keep,
+    check_image,
+    check_root,
+    choose_sets,
+    read_rows,
+    spread,
+    versions,
+)
 from jaxsfm.bench.matches import Matcher
 from jaxsfm.errors import UserError
+from jaxsfm.host.images import SUFFIXES
 from jaxsfm.host.two_view import fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)
@@ -42,9 +51,10 @@ def mean_average_accuracy(errors: np.ndarray) -> float:
 
 
 def _image(folder: Path, stem: str) -> Path:
-    found = sorted(p for p in folder.glob(f"{stem}.*") if p.suffix.lower() in (".png", ".jpg"))
+    found = sorted(p for p in folder.glob(f"{stem}.*") if p.suffix.lower() in SUFFIXES)
     if not found:
         raise UserError(f"--root: {folder / stem}.png (or .jpg) is missing")
+    check_image(found[0])
     return found[0]
 
 
@@ -56,6 +66,7 @@ def bench_wxbs(
     seeds: int = 5,
     max_size: int | None = None,
     progress: bool = False,
+    keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
     """All methods on all pairs (CATEGORY/NAME/{01,02}.png, corrs.txt); plain JSON.
 
@@ -112,6 +123,11 @@ def bench_wxbs(
             )
             if progress:
                 print(row_line(rows[-1]), flush=True)
+            keep(_result(rows, seeds, max_size))
+    return _result(rows, seeds, max_size)
+
+
+def _result(rows: list[dict[str, Any]], seeds: int, max_size: int | None) -> dict[str, Any]:
     return {
         "benchmark": "wxbs",
         "versions": versions(),

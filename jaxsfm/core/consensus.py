@@ -1,10 +1,10 @@
 """Neighbourhood consensus: a match counts for more where its neighbours match alike.
 
-    S'(i, j) = sum over shifts d of w(d) S(i + d, j + d),  w(d) = exp(-|d|^2 / (2 r^2)), |d| <= r
+    S'(i, j) = sum over shifts d of w(d) S(i + d, j + d),  w(d) = exp(-|d|^2 / (2 r^2))
 
-with S the similarity of coarse cells i and j and the same shift in both images. Nothing is learnt;
-what lies outside either image adds nothing. The idea is that of learnt consensus networks (Rocco
-et al. 2018, "Neighbourhood Consensus Networks"), with one fixed kernel on the diagonal.
+with S the similarity of coarse cells i and j, the same shift d in both images, both parts of d from
+-r to r. Nothing is learnt; what lies outside either image adds nothing. The idea is that of learnt
+consensus networks (Rocco et al. 2018, "Neighbourhood Consensus Networks"), with one fixed kernel.
 """
 
 import math
@@ -59,7 +59,12 @@ def consensus_nn(
       a, b: unit descriptors, cell (row, column) at row * columns + column, zero past the grid.
       grid0, grid1: (rows, columns).
       radius: 1: 3 x 3 cells, 2: 5 x 5.
+
+    Raises:
+      ValueError: the radius is below 1.
     """
+    if radius < 1:
+        raise ValueError(f"radius must be at least 1; got {radius}")
     n, m = a.shape[0], b.shape[0]
     tile = min(tile, n)
     rows = jnp.pad(stack_rows(a, grid0, radius=radius), ((radius, -n % tile + radius), (0, 0)))

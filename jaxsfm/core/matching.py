@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -53,7 +54,10 @@ def scan_mutual(
             jnp.where(better, index + start, col_best),
         ), (row_best, row_score)
 
-    begin = (jnp.full((m,), -jnp.inf, jnp.float32), jnp.zeros((m,), jnp.int32))
+    begin = (
+        jnp.full((m,), -jnp.inf, jax.eval_shape(scores, jnp.int32(0)).dtype),
+        jnp.zeros((m,), jnp.int32),
+    )
     starts = jnp.arange(-(-n // tile), dtype=jnp.int32) * tile
     (_, col_best), (row_best, row_score) = lax.scan(step, begin, starts)
     return mutual(row_best.reshape(-1)[:n], row_score.reshape(-1)[:n], col_best)

@@ -1,15 +1,19 @@
 """COLMAP's own features as the baseline: RootSIFT, exhaustive matching, the same verification."""
 
+import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
 import numpy as np
 import pycolmap
 
+from jaxsfm.errors import UserError
 from jaxsfm.host.colmap import PIXEL_OFFSET
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.native import native
+from jaxsfm.host.pairs import Pair
 
 
 def write_rootsift_database(
@@ -21,6 +25,7 @@ def write_rootsift_database(
     seed: int,
     threads: int,
     min_inliers: int | None = None,
+    pairs: Iterable[Pair] | None = None,
 ) -> None:
     """A new database with COLMAP's DoG + RootSIFT features, matched and verified.
 
@@ -29,7 +34,12 @@ def write_rootsift_database(
 
     Args:
       folder: the images' folder.
+      pairs: the ones matched; None: all.
       min_inliers: pairs with fewer matches or inliers are emptied; None: COLMAP's 15.
+
+    Raises:
+      UserError: an image that COLMAP leaves out (a format it does not read, or, with given
+        intrinsics, another size).
     """
     path.unlink(missing_ok=True)
     reader = pycolmap.ImageReaderOptions()
@@ -59,9 +69,22 @@ def write_rootsift_database(
             reader_options=reader,
             extraction_options=extraction,
         )
-        pycolmap.match_exhaustive(path, matching_options=matching, verification_options=two_view)
+        options = {"matching_options": matching, "verification_options": two_view}
+        if pairs is None:
+            pycolmap.match_exhaustive(path, **options)
+            return
+        chosen = pycolmap.ImportedPairingOptions()
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+            chosen.match_list_path = Path(scratch) / "pairs.txt"
+            text = "".join(f"{a} {b}\n" for a, b in pairs)
+            Path(chosen.match_list_path).write_text(text, encoding="utf-8")
+            pycolmap.match_image_pairs(path, pairing_options=chosen, **options)
 
     native(work, path, grace_s=1)
+    with pycolmap.Database.open(path) as db:
+        there = {image.name for image in db.read_all_images()}
+    if lost := sorted({image.name for image in images} - there):
+        raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, so not for RootSIFT")
 
 
 def read_matches(path: Path, names: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:

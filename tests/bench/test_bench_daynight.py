@@ -61,10 +61,79 @@ def test_every_image_of_a_strecha_set_is_the_night_once(strecha, tmp_path):
 def test_the_simple_layout(simple):
     made = scenes.simple_scene(simple / "room")
     assert len(made.subsets) == 1 and len(made.subsets[0].day) == 4 and not made.synthetic
-    assert set(made.truth) == set(made.images) and made.intrinsics.startswith("PINHOLE:")
+    assert set(made.truth) == set(made.images) and made.camera.model == "PINHOLE"
     poses = read_poses(simple / "room" / "reference")
     night = made.subsets[0].night
     assert np.array_equal(made.truth[night].centre, poses[night.rpartition("/")[2]].centre)
+
+
+def test_photos_are_found_in_the_reference_without_suffix(simple, tmp_path):
+    shutil.copytree(simple / "room", tmp_path / "room")
+    for path in (tmp_path / "room" / "reference").iterdir():
+        path.rename(path.with_name(path.name.replace(".png", ".jpg")))
+    made = scenes.simple_scene(tmp_path / "room")
+    assert set(made.truth) == set(made.images)
+
+
+def test_a_day_and_a_night_photo_of_one_name_do_not_share_a_pose(simple, tmp_path):
+    shutil.copytree(simple / "room", tmp_path / "room")
+    day = min((tmp_path / "room" / "day").iterdir())
+    shutil.copy(day, tmp_path / "room" / "night" / day.name)
+    made = scenes.simple_scene(tmp_path / "room")
+    assert not {f"day/{day.name}", f"night/{day.name}"} & set(made.truth)
+
+
+@pytest.mark.parametrize(
+    ("damage", "word"),
+    [
+        ("empty camera", "intrinsics.txt"),
+        ("odd camera", "intrinsics.txt"),
+        ("binary camera", "intrinsics.txt"),
+        ("other size", "differ in size"),
+        ("reference", "fewer than 3"),
+        ("no day", "no images"),
+        ("photo", "view0.png"),
+    ],
+)
+def test_damaged_scenes_are_named_before_the_first_run(simple, tmp_path, capsys, damage, word):
+    import cv2
+
+    room = tmp_path / "room"
+    shutil.copytree(simple / "room", room)
+    if damage.endswith("camera"):
+        text = {"empty": b"", "odd": b"PINHOLE:1,2", "binary": bytes(range(128, 256))}
+        (room / "intrinsics.txt").write_bytes(text[damage.partition(" ")[0]])
+    elif damage == "other size":
+        cv2.imwrite(str(room / "night" / "x.png"), np.zeros((100, 100, 3), np.uint8))
+    elif damage == "reference":
+        for path in list((room / "reference").iterdir())[2:]:
+            path.unlink()
+    elif damage == "no day":
+        shutil.rmtree(room / "day")
+        (room / "day").mkdir()
+    else:
+        (room / "day" / "view0.png").write_bytes(b"no image")
+    assert main(["bench", "daynight", "--root", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    assert word in said.err and "Traceback" not in said.err and "rootsift" not in said.out
+
+
+def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monkeypatch):
+    """Two nights: neither reconstruction may hold the other's night photo."""
+    from jaxsfm.bench import daynight
+
+    room = tmp_path / "room"
+    shutil.copytree(simple / "room", room)
+    night = next((room / "night").iterdir())
+    shutil.copy(night, room / "night" / "again.png")
+    made = scenes.simple_scene(room)
+    assert len(made.subsets) == 2
+    for make, method in (
+        (daynight._rootsift_models, "rootsift"),
+        (daynight._dense_models, "paper"),
+    ):
+        for poses, subset in zip(make(made, tmp_path, method, 0, 1), made.subsets, strict=True):
+            assert subset.night in poses and set(poses) <= {*subset.day, subset.night}
 
 
 def test_aachens_layout(simple, tmp_path):
@@ -126,11 +195,11 @@ def test_the_night_camera_is_judged_after_a_similarity_from_the_day():
 
 
 def test_unregistered_nights_count_in_the_shares():
-    base = {"day_registered": 3, "day_images": 4}
+    base = {"day_registered": 3, "day_images": 4, "has_truth": True}
     rows = [
         base | {"registered": True, "position": 0.05, "rotation_deg": 0.5},
         base | {"registered": True, "position": 0.05, "rotation_deg": 20.0},
-        base | {"registered": True},
+        base | {"registered": True, "not_evaluated": "on one line"},
         base | {"registered": False},
     ]
     got = summary(rows)
@@ -138,7 +207,10 @@ def test_unregistered_nights_count_in_the_shares():
     assert (got["day_registered"], got["day_images"]) == (12, 16)
     assert got["within"]["0.1; 1 deg"] == 0.25 == got["within"]["20; 10 deg"]
     assert got["sorted_positions"] == [0.05, 0.05]
-    assert summary([])["within"]["20; 10 deg"] == 0
+    assert got["not_evaluated"] == 1
+    unknown = {"registered": True, "has_truth": False, "day_registered": 3, "day_images": 4}
+    assert summary([*rows, unknown])["within"] == got["within"]
+    assert summary([unknown])["within"] is None and summary([])["within"] is None
 
 
 def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
@@ -147,7 +219,7 @@ def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
     assert main(args) == 0
     figures = json.loads(out.read_text())
     rows = {row["method"]: row for row in figures["rows"]}
-    assert set(rows) == {"rootsift", "paper-grid", "paper", "default"}
+    assert set(rows) == {"rootsift", "paper-grid", "paper", "default", "robust"}
     for row in rows.values():
         assert row["nights"] == 1 and row["day_images"] == 4 and not row["synthetic"]
     for method in ("paper", "default"):
@@ -161,7 +233,11 @@ def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
     ("args", "word"),
     [
         (["--root", "/nowhere"], "no such folder"),
-        (["--root", "{root}/room"], "no scenes"),
+        (["--root", "{root}/room/day"], "no scenes"),
+        (["--root", "{root}", "--seed", "-1"], "--seed"),
+        (["--root", "{root}", "--seed", "3000000000"], "--seed"),
+        (["--root", "{root}", "--threads", "0"], "--threads"),
+        (["--root", "{root}", "--sets", ","], "--sets"),
         (["--root", "{root}", "--sets", "hall"], "no set 'hall'"),
         (["--root", "{root}", "--severity", "-1"], "--severity"),
         (["--root", "{root}", "--methods", "orb"], "no method 'orb'"),

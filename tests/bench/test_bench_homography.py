@@ -70,6 +70,16 @@ def test_what_is_no_homography_is_named(tmp_path, name, text):
         read_homography(tmp_path / name)
 
 
+def test_two_files_of_one_homography_are_one_pair(root, truth, tmp_path):
+    for path in (root / "wall").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    write_xml(tmp_path / "H1to2p.xml", truth)
+    assert len(read_sequence(tmp_path)) == 1
+    write_xml(tmp_path / "H1to2p.xml", 2 * np.eye(3) + truth)
+    with pytest.raises(UserError, match="contradicts"):
+        read_sequence(tmp_path)
+
+
 def test_a_missing_image_is_named(root, tmp_path):
     np.savetxt(tmp_path / "H_1_5", np.eye(3))
     with pytest.raises(UserError, match="image 1 is missing"):
@@ -100,7 +110,7 @@ def test_area_under_the_curve_is_that_of_the_steps():
     grid = np.linspace(0, 5, 100_001)
     curve = (errors[:, None] <= grid).mean(0)
     assert area_under_curve(errors, 5) == pytest.approx(curve.mean(), abs=1e-4)
-    assert area_under_curve([0, 0], 3) == 1 and area_under_curve([np.inf, 3], 3) == 0
+    assert area_under_curve([0, 0], 3) == 1 and area_under_curve([None, 3], 3) == 0
 
 
 def test_a_warped_photograph_is_matched(root, tmp_path, capsys):

@@ -114,7 +114,7 @@ def test_a_rendered_pair_scores_well_and_repeats(root, tmp_path, capsys):
         figures = json.loads(out.read_text())
         runs.append({row["method"]: row for row in figures["rows"]})
     rows = runs[0]
-    assert set(rows) == {"rootsift", "paper", "default"}
+    assert set(rows) == {"rootsift", "paper", "default", "robust"}
     for method in rows:
         assert len(rows[method]["scores"]) == 2
         assert rows[method]["scores"] == runs[1][method]["scores"]
@@ -149,16 +149,20 @@ def test_what_cannot_be_run_is_said(root, capsys, args, word):
     assert word in error and "Traceback" not in error
 
 
-@pytest.mark.parametrize("damage", ["points", "image"])
+@pytest.mark.parametrize("damage", ["points", "image", "broken"])
 def test_damaged_inputs_are_named_before_the_first_run(root, tmp_path, capsys, damage):
     shutil.copytree(root, tmp_path / "w")
     pair = tmp_path / "w" / "WG" / "room"
     if damage == "points":
         (pair / "corrs.txt").write_text("1 2 3\n")
-    else:
+    elif damage == "image":
         (pair / "02.png").unlink()
+    else:
+        (pair / "02.png").write_bytes(b"no image")
     assert main(["bench", "wxbs", "--root", str(tmp_path / "w")]) == 2
-    assert ("corrs.txt" if damage == "points" else "02.png") in capsys.readouterr().err
+    said = capsys.readouterr()
+    name = "corrs.txt" if damage == "points" else "02"
+    assert str(pair / name) in said.err and "rootsift" not in said.out
 
 
 def test_reference_means_of_seeds_hold_their_bounds():
