@@ -19,12 +19,8 @@ def _methods(values: tuple[str, ...], known: tuple[str, ...]) -> list[str]:
     return choose_methods(_listed(values) or [], known)
 
 
-def _finish(lines: list[str], result: dict[str, Any], json: Path | None) -> int:
-    from jaxsfm.bench.common import write_json
-
+def _finish(lines: list[str]) -> int:
     print("\n".join(lines))
-    if json is not None:
-        write_json(json, result)
     return 0
 
 
@@ -43,14 +39,38 @@ def _check(
     threads: int = -1,
 ) -> None:
     from jaxsfm.config import MIN_SIDE
-    from jaxsfm.run import check_seed_and_threads
+    from jaxsfm.run import check_seed, check_threads
 
-    check_seed_and_threads(seed, threads)
+    check_seed(seed)
+    check_threads(threads)
     check_writable(json, "--json", (".json",))
     if seeds < 1:
         raise UserError(f"--seeds must be at least 1; got {seeds}")
     if max_size is not None and max_size < MIN_SIDE:
         raise UserError(f"--max-size must be at least {MIN_SIDE} pixels; got {max_size}")
+
+
+def _of_pairs(
+    bench: Callable[..., dict[str, Any]],
+    root: Path,
+    sets: tuple[str, ...] | None,
+    methods: tuple[str, ...],
+    seeds: int,
+    max_size: int | None,
+    json: Path | None,
+) -> dict[str, Any]:
+    from jaxsfm.bench.matches import PAIR_METHODS
+
+    _check(json, seeds, max_size)
+    return bench(
+        root,
+        sets=_listed(sets),
+        methods=_methods(methods, PAIR_METHODS),
+        seeds=seeds,
+        max_size=max_size,
+        progress=True,
+        keep=_keeper(json),
+    )
 
 
 def strecha(
@@ -91,7 +111,7 @@ def strecha(
         progress=True,
         keep=_keeper(json),
     )
-    return _finish(bench.table_lines(result), result, json)
+    return _finish(bench.table_lines(result))
 
 
 def wxbs(
@@ -114,20 +134,10 @@ def wxbs(
       max_size: Longer side of our working images, pixels; default: the preset's.
       json: Write all figures here.
     """
-    _check(json, seeds, max_size)
     from jaxsfm.bench import wxbs as bench
-    from jaxsfm.bench.matches import PAIR_METHODS
 
-    result = bench.bench_wxbs(
-        root,
-        sets=_listed(sets),
-        methods=_methods(methods, PAIR_METHODS),
-        seeds=seeds,
-        max_size=max_size,
-        progress=True,
-        keep=_keeper(json),
-    )
-    return _finish(bench.table_lines(result), result, json)
+    figures = _of_pairs(bench.bench_wxbs, root, sets, methods, seeds, max_size, json)
+    return _finish(bench.table_lines(figures))
 
 
 def homography(
@@ -149,20 +159,10 @@ def homography(
       max_size: Longer side of our working images, pixels; default: the preset's.
       json: Write all figures here.
     """
-    _check(json, seeds, max_size)
     from jaxsfm.bench import homography as bench
-    from jaxsfm.bench.matches import PAIR_METHODS
 
-    result = bench.bench_homography(
-        root,
-        sets=_listed(sets),
-        methods=_methods(methods, PAIR_METHODS),
-        seeds=seeds,
-        max_size=max_size,
-        progress=True,
-        keep=_keeper(json),
-    )
-    return _finish(bench.table_lines(result), result, json)
+    figures = _of_pairs(bench.bench_homography, root, sets, methods, seeds, max_size, json)
+    return _finish(bench.table_lines(figures))
 
 
 def planes(
@@ -194,7 +194,7 @@ def planes(
         progress=True,
         keep=_keeper(json),
     )
-    return _finish(bench.table_lines(result), result, json)
+    return _finish(bench.table_lines(result))
 
 
 def daynight(
@@ -239,4 +239,4 @@ def daynight(
         progress=True,
         keep=_keeper(json),
     )
-    return _finish(bench.table_lines(result), result, json)
+    return _finish(bench.table_lines(result))

@@ -149,8 +149,6 @@ def match(
     config = _config(preset, max_size, keypoints)
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
-    if not 0 <= seed < 2**31:
-        raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
     import numpy as np
 
     from jaxsfm.host.features import image_features
@@ -158,7 +156,9 @@ def match(
     from jaxsfm.host.weights import load_weights
     from jaxsfm.host.workfolder import atomic_file
     from jaxsfm.pipeline import match_features, on_device
+    from jaxsfm.run import check_seed
 
+    check_seed(seed)
     files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
     weights = on_device(load_weights())
     features = [image_features(weights, file, config=config) for file in files]

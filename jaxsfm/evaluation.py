@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxsfm.errors import UserError
 from jaxsfm.host.poses import CameraPose, Poses
+from jaxsfm.host.viewgraph import rotation_angle_deg
 
 DISTANCES = (0.5, 1.0, 5.0, 10.0, 20.0)
 MAX_ROTATION_DEG = 10.0
@@ -80,12 +81,6 @@ class Evaluation:
             "images": {n: dataclasses.asdict(e) for n, e in sorted(self.images.items())},
             "missing": self.missing,
         }
-
-
-def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> float:
-    """Angle between two rotations, degrees; accurate near zero, where arccos is not."""
-    half_sine = np.linalg.norm(a - b) / (2 * np.sqrt(2))
-    return float(np.degrees(2 * np.arcsin(min(half_sine, 1.0))))
 
 
 def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, str]:
@@ -209,7 +204,7 @@ def evaluate(
         )
         errors[name] = ImageError(
             position=float(np.linalg.norm(moved.centre - truth.centre)),
-            rotation_deg=rotation_angle_deg(moved.rotation, truth.rotation),
+            rotation_deg=float(rotation_angle_deg(moved.rotation, truth.rotation)),
         )
     missing = sorted(set(reference) - set(names.values()))
     return Evaluation(images=errors, missing=missing, aligned_on=len(chosen))

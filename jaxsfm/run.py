@@ -205,13 +205,18 @@ def _map(
 def _check_options(options: RunOptions) -> None:
     if options.best_pairs is not None and options.best_pairs < 1:
         raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
-    check_seed_and_threads(options.seed, options.threads)
+    check_seed(options.seed)
+    check_threads(options.threads)
 
 
-def check_seed_and_threads(seed: int, threads: int) -> None:
-    """Raises UserError unless COLMAP takes both."""
+def check_seed(seed: int) -> None:
+    """Raises UserError unless COLMAP takes it."""
     if not 0 <= seed < 2**31:
         raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
+
+
+def check_threads(threads: int) -> None:
+    """Raises UserError unless COLMAP takes it."""
     if threads == 0 or threads < -1:
         raise UserError(f"--threads must be positive, or -1 for all; got {threads}")
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsfm.config import PRESETS, Config, Keypoints, preset
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import inspect_image
+from jaxsfm.host.images import ImageFile, inspect_image
 from jaxsfm.host.workfolder import write_atomic
 
 Keep = Callable[[dict[str, Any]], None]
@@ -90,9 +90,13 @@ def read_rows(path: Path, columns: int, what: str) -> np.ndarray:
     return rows
 
 
-def check_image(path: Path) -> None:
-    """Raises UserError, naming the whole path, unless the image can be used."""
-    inspect_image(path, name=str(path))
+def usable_image(path: Path, *, name: str | None = None) -> ImageFile:
+    """The image, called `name` (default: the file's).
+
+    Raises:
+      UserError: it cannot be used; names the whole path.
+    """
+    return dataclasses.replace(inspect_image(path, name=str(path)), name=name or path.name)
 
 
 def versions() -> dict[str, str]:

@@ -65,8 +65,8 @@ def _rootsift_models(
         part = scratch / "part.db"
         shutil.copyfile(database, part)
         names = {*subset.day, subset.night}
-        drop_pairs(part, [pair for pair in every if not names.issuperset(pair)])
         kept = {pair: view for pair, view in every.items() if names.issuperset(pair)}
+        drop_pairs(part, every.keys() - kept.keys())
         found, _ = build_models(part, kept, options)
         models.append(model_poses(found[0]) if found else {})
     return models
@@ -76,7 +76,6 @@ def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: 
     """Poses per subset; a photo's features and a pair's matches are computed once."""
     config = method_config(method)
     weights = on_device(load_weights())
-
     largest = max(len(subset.day) + 1 for subset in scene.subsets)
 
     @functools.lru_cache(maxsize=max(FEATURES, largest))

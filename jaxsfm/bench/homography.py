@@ -15,16 +15,15 @@ import numpy as np
 
 from jaxsfm.bench.common import (
     Keep,
-    check_image,
     check_root,
     choose_sets,
     read_rows,
     spread,
-    versions,
+    usable_image,
 )
-from jaxsfm.bench.matches import Matcher
+from jaxsfm.bench.matches import Matcher, pair_figures
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import SUFFIXES, inspect_image
+from jaxsfm.host.images import SUFFIXES, ImageFile
 from jaxsfm.host.two_view import homography
 
 ACCURACY_PX = (1, 3, 5, 10)
@@ -37,8 +36,8 @@ class KnownPair(NamedTuple):
     """The first image of a sequence against another one."""
 
     name: str
-    path0: Path
-    path1: Path
+    image0: ImageFile
+    image1: ImageFile
     h: np.ndarray
     """float64 (3, 3): first image to the other, pixels."""
 
@@ -114,20 +113,22 @@ def read_sequence(folder: Path) -> list[KnownPair]:
     Raises:
       UserError: an image or a homography is missing or damaged.
     """
-    images = {}
+    files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         number = re.fullmatch(r"(?:img)?(\d+)", path.stem)
         if number and path.suffix.lower() in SUFFIXES:
-            images[int(number[1])] = path
+            files[int(number[1])] = path
+    images: dict[int, ImageFile] = {}
     pairs: dict[int, KnownPair] = {}
     for path in sorted(folder.iterdir()):
         if (named := TRUTH_NAME.fullmatch(path.name)) is None:
             continue
         other = int(named[1])
         for k in (1, other):
-            if k not in images:
+            if k not in files:
                 raise UserError(f"--root: {folder}: image {k} is missing, named by {path.name}")
-            check_image(images[k])
+            if k not in images:
+                images[k] = usable_image(files[k])
         h = read_homography(path)
         if other in pairs and not np.allclose(h, pairs[other].h):
             raise UserError(f"--root: {path} contradicts another homography of image {other}")
@@ -165,10 +166,10 @@ def bench_homography(
     rows = []
     for set_name, pairs in sequences.items():
         for pair in pairs:
-            size = inspect_image(pair.path0, name=pair.path0.name).size
+            size = pair.image0.size
             for method in methods:
                 runs = matcher.match(
-                    pair.path0, pair.path1, method, range(seeds), max_size=max_size
+                    pair.image0, pair.image1, method, range(seeds), max_size=max_size
                 )
                 errors = [match_errors(pair.h, run.xy0, run.xy1) for run in runs]
                 rows.append(
@@ -198,19 +199,8 @@ def bench_homography(
                 )
                 if progress:
                     print(row_line(rows[-1]), flush=True)
-                keep(_result(rows, seeds, max_size))
-    return _result(rows, seeds, max_size)
-
-
-def _result(rows: list[dict[str, Any]], seeds: int, max_size: int | None) -> dict[str, Any]:
-    return {
-        "benchmark": "homography",
-        "versions": versions(),
-        "seeds": seeds,
-        "max_size": max_size,
-        "rows": rows,
-        "means": means(rows),
-    }
+                keep(pair_figures("homography", rows, means(rows), seeds, max_size))
+    return pair_figures("homography", rows, means(rows), seeds, max_size)
 
 
 def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:

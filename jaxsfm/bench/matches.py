@@ -1,21 +1,25 @@
 """Matches of pairs of images by each method, for the benchmarks of two views."""
 
+import functools
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.common import method_config
-from jaxsfm.host.features import image_features
-from jaxsfm.host.images import inspect_image
+from jaxsfm.bench.common import method_config, versions
+from jaxsfm.config import Config, Keypoints
+from jaxsfm.host.features import ImageFeatures, image_features
+from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import read_matches, write_rootsift_database
 from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.pipeline import match_features, on_device
 
 PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust")
+FEATURES = 4
+"""Features held: of two images, at two kinds of keypoints."""
 
 
 class Matches(NamedTuple):
@@ -29,60 +33,87 @@ class Matches(NamedTuple):
 
 
 class Matcher:
-    """Matches pairs; loads the weights once, when they are first needed."""
+    """Matches pairs; an image's features are computed once for all methods that share them."""
 
     def __init__(self) -> None:
         self._weights: Weights | None = None
+        self._extract = functools.lru_cache(maxsize=FEATURES)(self._timed_features)
 
     def match(
-        self, path0: Path, path1: Path, method: str, seeds: Sequence[int], *, max_size: int | None
+        self,
+        image0: ImageFile,
+        image1: ImageFile,
+        method: str,
+        seeds: Sequence[int],
+        *,
+        max_size: int | None,
     ) -> list[Matches]:
         """One result per seed.
 
         Args:
-          path0, path1: two images of one folder.
+          image0, image1: two images of one folder, called by their files' names.
           method: of PAIR_METHODS. rootsift: COLMAP's own features and its matcher with ratio test,
             before any geometry; the others verified by homographies, as they leave our pipeline.
           max_size: longer side of the working images, pixels; None: the preset's.
         """
         if method == "rootsift":
             start = time.monotonic()
-            xy0, xy1 = _rootsift(path0, path1)
+            xy0, xy1 = _rootsift(image0, image1)
             taken = time.monotonic() - start
             return [Matches(xy0, xy1, taken)] * len(seeds)  # nothing random in it
-        return self._dense(path0, path1, method, seeds, max_size)
-
-    def _dense(
-        self, path0: Path, path1: Path, method: str, seeds: Sequence[int], max_size: int | None
-    ) -> list[Matches]:
         config = method_config(method, max_size=max_size)
-        if self._weights is None:
-            self._weights = on_device(load_weights())
-        start = time.monotonic()
-        features = [
-            image_features(self._weights, inspect_image(path, name=path.name), config=config)
-            for path in (path0, path1)
-        ]
-        extraction = time.monotonic() - start
+        (features0, seconds0), (features1, seconds1) = (
+            self._extract(image, config.max_size, config.keypoints) for image in (image0, image1)
+        )
         results = []
         for seed in seeds:
             start = time.monotonic()
-            found = match_features(features[0], features[1], config=config, seed=seed)
-            taken = extraction + time.monotonic() - start
-            results.append(
-                Matches(
-                    found.keypoints0.astype(np.float64), found.keypoints1.astype(np.float64), taken
-                )
-            )
+            found = match_features(features0, features1, config=config, seed=seed)
+            taken = seconds0 + seconds1 + time.monotonic() - start
+            xy0, xy1 = found.keypoints0, found.keypoints1
+            results.append(Matches(xy0.astype(np.float64), xy1.astype(np.float64), taken))
         return results
 
+    def _timed_features(
+        self, image: ImageFile, max_size: int, keypoints: Keypoints
+    ) -> tuple[ImageFeatures, float]:
+        if self._weights is None:
+            self._weights = on_device(load_weights())
+        start = time.monotonic()
+        config = Config(max_size=max_size, keypoints=keypoints)  # what features depend on
+        features = image_features(self._weights, image, config=config)
+        return features, time.monotonic() - start
 
-def _rootsift(path0: Path, path1: Path) -> tuple[np.ndarray, np.ndarray]:
+
+def _rootsift(image0: ImageFile, image1: ImageFile) -> tuple[np.ndarray, np.ndarray]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         database = Path(scratch) / "database.db"
-        images = [inspect_image(path, name=path.name) for path in (path0, path1)]
         # Below eight there is no fundamental matrix.
         write_rootsift_database(
-            database, path0.parent, images, None, seed=0, threads=-1, min_inliers=8
+            database,
+            image0.path.parent,
+            [image0, image1],
+            None,
+            seed=0,
+            threads=-1,
+            min_inliers=8,
         )
-        return read_matches(database, (path0.name, path1.name))
+        return read_matches(database, (image0.name, image1.name))
+
+
+def pair_figures(
+    benchmark: str,
+    rows: list[dict[str, Any]],
+    means: dict[str, Any],
+    seeds: int,
+    max_size: int | None,
+) -> dict[str, Any]:
+    """The plain JSON of a benchmark of pairs."""
+    return {
+        "benchmark": benchmark,
+        "versions": versions(),
+        "seeds": seeds,
+        "max_size": max_size,
+        "rows": rows,
+        "means": means,
+    }

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxsfm.bench.common import check_image, check_root, choose_sets
+from jaxsfm.bench.common import check_root, choose_sets, usable_image
 from jaxsfm.bench.strecha import strecha_intrinsics
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import pair_names
@@ -40,7 +40,6 @@ class Subset(NamedTuple):
 class Scene(NamedTuple):
     """Subsets that share photos."""
 
-    name: str
     folder: Path
     """Photos' names are paths below it."""
     images: dict[str, ImageFile]
@@ -78,7 +77,7 @@ def synthetic_scene(
             truth[name] = truth[night] = poses[stored[name]]
         subsets.append(Subset([other for other in day if other != name], night))
     camera = parse_intrinsics(strecha_intrinsics(folder)[0])
-    return Scene(folder.name, target, images, subsets, truth, camera, True)
+    return Scene(target, images, subsets, truth, camera, True)
 
 
 def _known_camera(path: Path, images: dict[str, ImageFile]) -> Intrinsics | None:
@@ -109,15 +108,11 @@ def simple_scene(folder: Path) -> Scene:
         )
     camera = _known_camera(folder / "intrinsics.txt", images)
     subsets = [Subset(names["day"], night) for night in names["night"]]
-    return Scene(folder.name, folder, images, subsets, truth, camera, False)
+    return Scene(folder, images, subsets, truth, camera, False)
 
 
 def _inspected(folder: Path, names: Sequence[str]) -> dict[str, ImageFile]:
-    images = {}
-    for name in names:
-        check_image(folder / name)
-        images[name] = inspect_image(folder / name, name=name)
-    return images
+    return {name: usable_image(folder / name, name=name) for name in names}
 
 
 def _reference(scene: str, images: dict[str, ImageFile], poses: Poses) -> Poses:
@@ -157,7 +152,7 @@ def aachen_scene(root: Path) -> Scene:
     images = _inspected(folder, wanted)
     subsets = [Subset(sorted(day), night) for night, day in sorted(paired.items())]
     truth = _reference(root.name, images, read_poses(models[0], option="--root"))
-    return Scene(root.name, folder, images, subsets, truth, None, False)
+    return Scene(folder, images, subsets, truth, None, False)
 
 
 def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
@@ -186,7 +181,7 @@ def check_strecha(folder: Path) -> None:
     strecha_intrinsics(folder)
     read_poses(folder, option="--root")
     for name in find_images(folder / "images"):
-        check_image(folder / "images" / name)
+        usable_image(folder / "images" / name)
 
 
 def is_strecha(folder: Path) -> bool:

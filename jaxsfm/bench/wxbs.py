@@ -12,16 +12,15 @@ import numpy as np
 
 from jaxsfm.bench.common import (
     Keep,
-    check_image,
     check_root,
     choose_sets,
     read_rows,
     spread,
-    versions,
+    usable_image,
 )
-from jaxsfm.bench.matches import Matcher
+from jaxsfm.bench.matches import Matcher, pair_figures
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import SUFFIXES
+from jaxsfm.host.images import SUFFIXES, ImageFile
 from jaxsfm.host.two_view import fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)
@@ -50,12 +49,11 @@ def mean_average_accuracy(errors: np.ndarray) -> float:
     return float((errors[None] <= THRESHOLDS_PX[:, None]).mean())
 
 
-def _image(folder: Path, stem: str) -> Path:
+def _image(folder: Path, stem: str) -> ImageFile:
     found = sorted(p for p in folder.glob(f"{stem}.*") if p.suffix.lower() in SUFFIXES)
     if not found:
         raise UserError(f"--root: {folder / stem}.png (or .jpg) is missing")
-    check_image(found[0])
-    return found[0]
+    return usable_image(found[0])
 
 
 def bench_wxbs(
@@ -99,9 +97,9 @@ def bench_wxbs(
     }
     matcher = Matcher()
     rows = []
-    for folder, (path0, path1, marked) in inputs.items():
+    for folder, (image0, image1, marked) in inputs.items():
         for method in methods:
-            runs = matcher.match(path0, path1, method, range(seeds), max_size=max_size)
+            runs = matcher.match(image0, image1, method, range(seeds), max_size=max_size)
             scores = []
             for seed, run in enumerate(runs):
                 f = fundamental_matrix(run.xy0, run.xy1, seed=seed)
@@ -123,19 +121,8 @@ def bench_wxbs(
             )
             if progress:
                 print(row_line(rows[-1]), flush=True)
-            keep(_result(rows, seeds, max_size))
-    return _result(rows, seeds, max_size)
-
-
-def _result(rows: list[dict[str, Any]], seeds: int, max_size: int | None) -> dict[str, Any]:
-    return {
-        "benchmark": "wxbs",
-        "versions": versions(),
-        "seeds": seeds,
-        "max_size": max_size,
-        "rows": rows,
-        "means": means(rows),
-    }
+            keep(pair_figures("wxbs", rows, means(rows), seeds, max_size))
+    return pair_figures("wxbs", rows, means(rows), seeds, max_size)
 
 
 def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:

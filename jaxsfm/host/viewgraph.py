@@ -65,8 +65,8 @@ def spread(xy: np.ndarray, size: tuple[int, int], *, cells: int = 8) -> float:
     return len(np.unique(at[:, 1] * cells + at[:, 0])) / cells**2
 
 
-def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between rotations (..., 3, 3), degrees; accurate near zero."""
+def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between rotations (..., 3, 3), degrees; accurate near zero, where arccos is not."""
     half_sine = np.linalg.norm(a - b, axis=(-2, -1)) / (2 * np.sqrt(2))
     return np.degrees(2 * np.arcsin(np.minimum(half_sine, 1.0)))
 
@@ -135,7 +135,7 @@ def _error_deg(
     pair: Pair, geometries: Mapping[Pair, PairGeometry], rotations: Rotations
 ) -> np.ndarray:
     predicted = rotations[pair[1]] @ rotations[pair[0]].T
-    return angle_deg(_rotation(pair, geometries), predicted)
+    return rotation_angle_deg(_rotation(pair, geometries), predicted)
 
 
 def _grow(
@@ -165,7 +165,7 @@ def _grow(
         turned = np.where(swap[:, None, None], relative[rows].transpose(0, 2, 1), relative[rows])
         # World of b -> world of a, as each pair has it.
         moves = rotations[in_a].transpose(0, 2, 1) @ turned.transpose(0, 2, 1) @ rotations[in_b]
-        close = angle_deg(moves[:, None], moves[None]) < tolerance_deg
+        close = rotation_angle_deg(moves[:, None], moves[None]) < tolerance_deg
         winner = int(np.argmax(close @ votes[rows]))  # the first of equals is the strongest
         move = mean_rotation(moves[close[winner]], votes[rows][close[winner]])
         members = group == b
@@ -203,9 +203,9 @@ def _average(
         for image in sorted(stacked):
             others, relative, counts = stacked[image]
             implied = relative @ np.asarray([rotations[other] for other in others])
-            error = angle_deg(implied, rotations[image])
+            error = rotation_angle_deg(implied, rotations[image])
             new = mean_rotation(implied, counts / (1.0 + (error / 2.0) ** 2) ** 2)
-            largest = max(largest, float(angle_deg(new, rotations[image])))
+            largest = max(largest, float(rotation_angle_deg(new, rotations[image])))
             rotations[image] = new
         if largest < 1e-3:
             break

@@ -15,15 +15,6 @@ from jaxsfm.host.poses import CameraPose, read_poses
 
 
 @pytest.fixture(scope="module")
-def strecha(scene, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sets")
-    shutil.copytree(scene / "images", folder / "room" / "images")
-    shutil.copy(scene / "K.txt", folder / "room" / "images" / "K.txt")
-    shutil.copytree(scene / "reference", folder / "room" / "gt_dense_cameras")
-    return folder
-
-
-@pytest.fixture(scope="module")
 def simple(tmp_path_factory):
     """Four day views and a night view of the room, rendered."""
     from jaxsfm.synthetic import camera_matrix, write_scene

@@ -57,7 +57,7 @@ def test_all_layouts_give_the_same_pair(root, truth, tmp_path):
         write_xml(path, truth) if name.endswith("xml") else np.savetxt(path, truth)
         (pair,) = read_sequence(folder)
         np.testing.assert_allclose(pair.h, truth, rtol=1e-12)
-        assert pair.path1.name == image.format(2) and pair.name.endswith("1-2")
+        assert pair.image1.name == image.format(2) and pair.name.endswith("1-2")
 
 
 @pytest.mark.parametrize(

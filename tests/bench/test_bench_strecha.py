@@ -12,13 +12,8 @@ from jaxsfm.config import preset
 
 
 @pytest.fixture(scope="module")
-def root(scene, tmp_path_factory):
-    """One set: SET/images with K.txt, SET/gt_dense_cameras."""
-    folder = tmp_path_factory.mktemp("sets")
-    shutil.copytree(scene / "images", folder / "room" / "images")
-    shutil.copy(scene / "K.txt", folder / "room" / "images" / "K.txt")
-    shutil.copytree(scene / "reference", folder / "room" / "gt_dense_cameras")
-    return folder
+def root(strecha):
+    return strecha
 
 
 def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys):

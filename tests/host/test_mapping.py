@@ -13,7 +13,7 @@ from jaxsfm.host import mapping
 from jaxsfm.host.colmap import TwoView, drop_pairs, read_two_views, write_database
 from jaxsfm.host.mapping import MapOptions, build_models, initial_pairs
 from jaxsfm.host.pairs import PairResult, exhaustive_pairs
-from jaxsfm.host.viewgraph import PairGeometry, angle_deg
+from jaxsfm.host.viewgraph import PairGeometry, rotation_angle_deg
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)
 
@@ -151,7 +151,7 @@ def test_two_view_rotations_spreads_and_angles_are_the_scenes(tmp_path, scene):
     points = np.asarray([p.xyz for p in scene.truth.points3D.values()])
     for (a, b), view in verified(tmp_path / "d.db", ONE).items():
         assert a < b and 0 < view.geometry.spread <= 1 and not view.planar
-        assert angle_deg(view.geometry.rotation, rotation[b] @ rotation[a].T) < 0.1
+        assert rotation_angle_deg(view.geometry.rotation, rotation[b] @ rotation[a].T) < 0.1
         rays = [centre[name] - points for name in (a, b)]
         sine = np.linalg.norm(np.cross(*rays), axis=1)
         sine /= np.prod([np.linalg.norm(r, axis=1) for r in rays], axis=0)

@@ -10,8 +10,8 @@ from strategies import rng_of, seeds
 
 from jaxsfm.host.viewgraph import (
     PairGeometry,
-    angle_deg,
     mean_rotation,
+    rotation_angle_deg,
     spread,
     strengths,
     trusted_pairs,
@@ -187,5 +187,5 @@ def test_angles_and_means_of_rotations_are_scipys(seed):
     weights = rng.uniform(0.1, 1, 5)
     want = some.mean(weights).as_matrix()
     np.testing.assert_allclose(mean_rotation(some.as_matrix(), weights), want, atol=1e-6)
-    got = angle_deg(some[0].as_matrix(), some[1].as_matrix())
+    got = rotation_angle_deg(some[0].as_matrix(), some[1].as_matrix())
     assert got == pytest.approx(np.degrees((some[0].inv() * some[1]).magnitude()), abs=1e-5)
