@@ -174,7 +174,9 @@ def match(
     if plot is not None:
         from jaxsfm.plot import draw_matches, save_figure
 
-        working = [read_image(file, max_size=max_size) for file in files]
+        working = [
+            read_image(file, max_size=config.max_size, enlarge=config.enlarge) for file in files
+        ]
         figure = draw_matches(
             working[0].rgb,
             working[1].rgb,

@@ -26,10 +26,14 @@ class PairShape:
     """Inlier test in both images instead of image 1 only."""
     local_refits: int = 1
     """Least-squares refits on the inliers of each new best hypothesis."""
+    plane_rounds: int = 0
+    """Rounds in which the peeled planes compete for their correspondences (one-way errors)."""
     one_to_one: OneToOne = "first"
     """Which of a cell's several matches survives: the first in index order, or the most similar."""
     consensus: int = 0
     """Radius, coarse cells, of the neighbourhood that votes on coarse matches; 0: none."""
+    coarse_columns: int = 128
+    """Widest coarse grid the votes reach across: 2048 px; the pipeline widens it where needed."""
     coarse_tile: int = 1024
     """Rows of the coarse similarity matrix held at once."""
     fine_chunk: int = 128
@@ -45,14 +49,16 @@ class PairShape:
             "max_hypotheses",
             "hypotheses_per_step",
             "local_refits",
+            "coarse_columns",
             "coarse_tile",
             "fine_chunk",
             "score_chunk",
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"PairShape.{name} must be at least 1; got {getattr(self, name)}")
-        if self.consensus < 0:
-            raise ValueError(f"PairShape.consensus must be at least 0; got {self.consensus}")
+        for name in ("consensus", "plane_rounds"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"PairShape.{name} must be at least 0; got {getattr(self, name)}")
         if self.correspondences_per_cell <= 0:
             raise ValueError(
                 "PairShape.correspondences_per_cell must be positive; "
@@ -102,7 +108,13 @@ class Config:
     """Everything that decides which matches a pair of images has, and what is made of them."""
 
     max_size: int = 1600
-    """Longer side of the working image, pixels; larger images are reduced, never enlarged."""
+    """Longer side of the working image, pixels; larger images are reduced."""
+    enlarge: float = 1.0
+    """Smaller images are enlarged up to this factor, no further than `max_size`."""
+    octaves: int = 1
+    """Sizes at which an image is described: working size, half of it, ..."""
+    centred: bool = False
+    """Subtract an image's mean descriptor from its descriptors."""
     keypoints: Keypoints = "relocalized"
     """Where a fine cell's keypoint lies: at its relocalized pixel, or at the cell's centre."""
     threshold_px: float = 10.0
@@ -117,6 +129,11 @@ class Config:
     refinement: Refinement | None = None
     """None: the mapper's model is the last."""
 
+    def extraction(self) -> "Config":
+        """The part that an image's features depend on; the rest at its defaults."""
+        names = ("max_size", "enlarge", "octaves", "centred", "keypoints")
+        return Config(**{name: getattr(self, name) for name in names})
+
     def matching(self) -> dict[str, object]:
         """The part that the matches depend on, as plain data."""
         parts = dataclasses.asdict(self)
@@ -126,6 +143,10 @@ class Config:
     def __post_init__(self) -> None:
         if self.max_size < MIN_SIDE:
             raise ValueError(f"max_size must be at least {MIN_SIDE} pixels; got {self.max_size}")
+        if not self.enlarge >= 1:
+            raise ValueError(f"enlarge must be at least 1; got {self.enlarge}")
+        if not 1 <= self.octaves <= MAX_OCTAVES:
+            raise ValueError(f"octaves must lie in 1..{MAX_OCTAVES}; got {self.octaves}")
         if self.keypoints not in ("relocalized", "grid"):
             raise ValueError(f"keypoints must be 'relocalized' or 'grid'; got {self.keypoints!r}")
         if not self.threshold_px > 0:
@@ -139,15 +160,20 @@ class Config:
 MIN_SIDE = 48
 """Shortest usable side, pixels: three coarse cells, one full window of the coarse-to-fine step."""
 
+MAX_OCTAVES = 4
+"""At an eighth of a 1600 px image 12 x 9 coarse cells are left."""
+
 _DEFAULT = Config(
-    pair=PairShape(local_refits=4, one_to_one="similarity"),
+    octaves=4,
+    centred=True,
+    pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
     view_graph=True,
     refinement=Refinement(),
 )
 PRESETS: dict[str, Config] = {
     "paper": Config(),
     "default": _DEFAULT,
-    "robust": dataclasses.replace(_DEFAULT, pair=dataclasses.replace(_DEFAULT.pair, consensus=1)),
+    "robust": dataclasses.replace(_DEFAULT, enlarge=2.0),
 }
 """`paper`: the constants of the authors' code. `default`: local refits iterated (one refit leaves
 up to a fifth of a plane's inliers behind, tests/core/test_ransac.py), the most similar of a cell's

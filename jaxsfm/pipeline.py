@@ -21,7 +21,14 @@ from jaxsfm.core.pair import match_pair, pair_key
 from jaxsfm.core.types import PairMatches, Status, Thresholds
 from jaxsfm.errors import UserError
 from jaxsfm.host.features import ImageFeatures, image_features, pad_features
-from jaxsfm.host.images import ImageError, ImageFile, find_images, inspect_image, read_image
+from jaxsfm.host.images import (
+    ImageError,
+    ImageFile,
+    find_images,
+    inspect_image,
+    read_image,
+    working_size,
+)
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.viewgraph import Verdict, trusted_pairs
 from jaxsfm.host.weights import Weights
@@ -97,14 +104,18 @@ def match_features(
     features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int = 0
 ) -> PairResult:
     """Verified matches of two images, in the order given."""
-    room = max(features0.dense.coarse.shape[0], features1.dense.coarse.shape[0])
+    sides = (features0.dense, features1.dense)
+    room = max(dense.coarse[0].shape[0] for dense in sides)
+    widest = max(int(dense.coarse_grid[1]) for dense in sides)
+    shape = config.pair
+    if widest > shape.coarse_columns:
+        shape = dataclasses.replace(shape, coarse_columns=-(-widest // 64) * 64)
     key = pair_key(jax.random.key(seed), features0.image.identity, features1.image.identity)
     found = match_pair(
         key,
-        pad_features(features0.dense, room),
-        pad_features(features1.dense, room),
+        *(pad_features(dense, room) for dense in sides),
         thresholds(config),
-        shape=config.pair,
+        shape=shape,
     )
     return to_original_pixels(jax.device_get(found), features0, features1)
 
@@ -153,9 +164,11 @@ def _scale_matrix(scale: tuple[float, float]) -> np.ndarray:
     return np.asarray([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1.0]])
 
 
-def pixel_scale(images: list[ImageFile], *, max_size: int) -> float:
+def pixel_scale(images: list[ImageFile], *, config: Config) -> float:
     """Median of original pixels per working pixel: localisation errors grow with it."""
-    return float(np.median([max(1.0, max(image.size) / max_size) for image in images]))
+    working = [working_size(image.size, config.max_size, config.enlarge) for image in images]
+    ratios = [max(i.size) / max(size) for i, size in zip(images, working, strict=True)]
+    return float(np.median(ratios))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,7 +218,7 @@ def reconstruct(
 
     if options is None:
         options = mapping.MapOptions(refine_intrinsics=intrinsics is None)
-    options = dataclasses.replace(options, scale=pixel_scale(images, max_size=config.max_size))
+    options = dataclasses.replace(options, scale=pixel_scale(images, config=config))
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in images})
     colmap.write_database(database, images, matches, intrinsics)
@@ -230,7 +243,7 @@ def reconstruct(
     by_name = {image.name: image for image in images}
 
     def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        working = read_image(by_name[name], max_size=config.max_size)
+        working = read_image(by_name[name], max_size=config.max_size, enlarge=config.enlarge)
         return working.rgb, working.scale
 
     passes = []

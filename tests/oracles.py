@@ -126,3 +126,31 @@ def transfer(h: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """h applied to points, float64."""
     p = np.concatenate([xy, np.ones((len(xy), 1))], axis=1).astype(np.float64) @ h.T
     return p[:, :2] / p[:, 2:]
+
+
+def join_octaves(levels: list[np.ndarray], grid: np.ndarray) -> np.ndarray:
+    """Bilinear values of each octave at the first one's cell centres, side by side, unit."""
+
+    def normal(x):
+        return x / np.linalg.norm(x) if x.any() else x
+
+    result = np.zeros((len(levels[0]), sum(x.shape[1] for x in levels)))
+    for row in range(grid[0]):
+        for col in range(grid[1]):
+            cell = row * grid[1] + col
+            if not levels[0][cell].any():
+                continue
+            parts = [levels[0][cell].astype(np.float64)]
+            for k, x in enumerate(levels[1:], start=1):
+                rows, cols = grid[0] >> k, grid[1] >> k
+                total = np.zeros(x.shape[1])
+                y, z = (row + 0.5) / 2**k - 0.5, (col + 0.5) / 2**k - 0.5
+                for r in range(-1, rows + 1):
+                    for c in range(-1, cols + 1):
+                        w = max(0.0, 1 - abs(y - r)) * max(0.0, 1 - abs(z - c))
+                        if w and rows and cols:
+                            at = min(max(r, 0), rows - 1) * cols + min(max(c, 0), cols - 1)
+                            total += w * x[at]
+                parts.append(normal(total))
+            result[cell] = normal(np.concatenate(parts)) if len(parts) > 1 else parts[0]
+    return result

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsfm.bench.common import method_config, versions
-from jaxsfm.config import Config, Keypoints
+from jaxsfm.config import Config
 from jaxsfm.host.features import ImageFeatures, image_features
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import read_matches, write_rootsift_database
@@ -63,7 +63,7 @@ class Matcher:
             return [Matches(xy0, xy1, taken)] * len(seeds)  # nothing random in it
         config = method_config(method, max_size=max_size)
         (features0, seconds0), (features1, seconds1) = (
-            self._extract(image, config.max_size, config.keypoints) for image in (image0, image1)
+            self._extract(image, config.extraction()) for image in (image0, image1)
         )
         results = []
         for seed in seeds:
@@ -74,13 +74,10 @@ class Matcher:
             results.append(Matches(xy0.astype(np.float64), xy1.astype(np.float64), taken))
         return results
 
-    def _timed_features(
-        self, image: ImageFile, max_size: int, keypoints: Keypoints
-    ) -> tuple[ImageFeatures, float]:
+    def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
         if self._weights is None:
             self._weights = on_device(load_weights())
         start = time.monotonic()
-        config = Config(max_size=max_size, keypoints=keypoints)  # what features depend on
         features = image_features(self._weights, image, config=config)
         return features, time.monotonic() - start
 

@@ -4,6 +4,7 @@ Points are labelled by hand: outlier, or one of the scene's planes. Misclassific
 of points with a wrong label under the best assignment of found planes to true ones.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,12 @@ from jaxsfm.errors import UserError
 from jaxsfm.pipeline import thresholds
 
 SUFFIX = "_pts.txt"
+POINT_PX = 2.0
+"""Inlier radius: detected points lie within a pixel, cells of dense features within ten."""
+LEAST_POINTS = 20
+"""Of a plane: five minimal samples."""
+MAX_PLANES = 12
+ROUNDS = 20
 _peel = jax.jit(peel_planes, static_argnames=("shape",))
 
 
@@ -56,6 +63,16 @@ def misclassification(found: np.ndarray, truth: np.ndarray) -> float:
     rows, columns = linear_sum_assignment(table, maximize=True)
     right = table[rows, columns].sum() + ((found < 0) & (truth < 0)).sum()
     return float(1.0 - right / len(truth))
+
+
+def method_for_points(method: str) -> Config:
+    """A preset made for given points: `paper` keeps its five planes of 10 px, the others fit
+    points, as many planes as there are, and let them compete."""
+    config = preset(method)
+    if method == "paper":
+        return config
+    shape = dataclasses.replace(config.pair, max_planes=MAX_PLANES, plane_rounds=ROUNDS)
+    return dataclasses.replace(config, threshold_px=POINT_PX, min_inliers=LEAST_POINTS, pair=shape)
 
 
 def fit_planes(points: LabelledPoints, config: Config, *, seed: int) -> np.ndarray:
@@ -97,7 +114,8 @@ def bench_planes(
     rows = []
     for name, points in inputs.items():
         for method in methods:
-            labels = [fit_planes(points, preset(method), seed=seed) for seed in range(seeds)]
+            config = method_for_points(method)
+            labels = [fit_planes(points, config, seed=seed) for seed in range(seeds)]
             rows.append(
                 {
                     "set": name,

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.matching import mutual
 from jaxsfm.core.numerics import HIGHEST, argmax_first, compact
-from jaxsfm.core.types import DenseFeatures
+from jaxsfm.core.types import JoinedFeatures
 
 RADIUS = 1
 """Coarse cells on each side of the match: 3 x 3 windows."""
@@ -45,7 +45,7 @@ def window_cells(
 
 
 def _match_windows(
-    f0: DenseFeatures, f1: DenseFeatures, cell0: Int[Array, " b"], cell1: Int[Array, " b"]
+    f0: JoinedFeatures, f1: JoinedFeatures, cell0: Int[Array, " b"], cell1: Int[Array, " b"]
 ) -> Int[Array, "b w"]:
     """The fine cell of image 1 for every window cell of image 0, or -1."""
     index0, inside0 = window_cells(cell0, f0.coarse_grid, f0.fine_grid)
@@ -62,7 +62,7 @@ def _match_windows(
 
 
 def match_windows(
-    f0: DenseFeatures, f1: DenseFeatures, coarse: Int[Array, " n"], *, chunk: int = 128
+    f0: JoinedFeatures, f1: JoinedFeatures, coarse: Int[Array, " n"], *, chunk: int = 128
 ) -> Int[Array, "n w"]:
     """`_match_windows` for every coarse match, `chunk` at a time; -1 where there is none.
 
@@ -87,7 +87,7 @@ def match_windows(
     return lax.while_loop(lambda s: s[0] * chunk < count, body, (jnp.int32(0), table))[1]
 
 
-def candidates(windows: Int[Array, "n w"], f0: DenseFeatures) -> Int[Array, "m slots"]:
+def candidates(windows: Int[Array, "n w"], f0: JoinedFeatures) -> Int[Array, "m slots"]:
     """The distinct partners of every fine cell of image 0, ascending, then -1.
 
     Args:

@@ -23,23 +23,6 @@ def weights(radius: int) -> list[float]:
     return [math.exp(-(d * d) / (2 * radius * radius)) for d in range(-radius, radius + 1)]
 
 
-def stack_rows(
-    x: Float[Array, "n c"], grid: Int[Array, " 2"], *, radius: int
-) -> Float[Array, "n k"]:
-    """Each cell's descriptor beside those above and below it, times the roots of their weights.
-
-    Products of such stacks are sums over shifts by whole rows.
-    """
-    cell = jnp.arange(x.shape[0], dtype=jnp.int32)
-    parts = []
-    for d, w in zip(range(-radius, radius + 1), weights(radius), strict=True):
-        other = cell + d * grid[1]
-        there = (cell < grid[0] * grid[1]) & (other >= 0) & (other < grid[0] * grid[1])
-        shifted = jnp.take(x, jnp.where(there, other, 0), axis=0)
-        parts.append(jnp.where(there[:, None], math.sqrt(w) * shifted, 0.0))
-    return jnp.concatenate(parts, axis=1)
-
-
 def consensus_nn(
     a: Float[Array, "n c"],
     b: Float[Array, "m c"],
@@ -47,45 +30,52 @@ def consensus_nn(
     grid1: Int[Array, " 2"],
     *,
     radius: int,
+    columns: int,
     tile: int = 1024,
 ) -> Int[Array, " n"]:
     """For every cell of image 0 its mutual best cell of image 1 under S', or -1.
 
     Exact; ties go to the lowest index on both sides; a zero descriptor never matches. `tile` rows
-    of S' exist at a time. Costs 2 radius + 1 times the products of `mutual_nn`: shifts by rows
-    are stacked descriptors, shifts by columns are shifts of the product itself.
+    of S' exist at a time, from the products of `tile` rows and of a margin on either side that
+    holds their neighbours: with cells in row order, a shift of the cell is a shift of the product.
 
     Args:
       a, b: unit descriptors, cell (row, column) at row * columns + column, zero past the grid.
       grid0, grid1: (rows, columns).
       radius: 1: 3 x 3 cells, 2: 5 x 5.
+      columns: at least those of either grid; fixes the margin. A wider grid has no matches.
 
     Raises:
-      ValueError: the radius is below 1.
+      ValueError: radius or columns are below 1.
     """
-    if radius < 1:
-        raise ValueError(f"radius must be at least 1; got {radius}")
+    if radius < 1 or columns < 1:
+        raise ValueError(f"radius and columns must be at least 1; got {radius}, {columns}")
     n, m = a.shape[0], b.shape[0]
-    tile = min(tile, n)
-    rows = jnp.pad(stack_rows(a, grid0, radius=radius), ((radius, -n % tile + radius), (0, 0)))
-    columns = jnp.pad(stack_rows(b, grid1, radius=radius), ((radius, radius), (0, 0)))
+    tile, margin = min(tile, n), radius * (columns + 1)
+    rows = jnp.pad(a, ((margin, -n % tile + margin), (0, 0)))
+    others = jnp.pad(b, ((margin, margin), (0, 0)))
     alive0 = jnp.pad(jnp.any(a != 0, axis=1), (0, -n % tile))
     alive1 = jnp.any(b != 0, axis=1)
     column0 = cell_rows_cols(n + -n % tile, grid0[1])[1]
     column1 = cell_rows_cols(m, grid1[1])[1]
+    fits = (grid0[1] <= columns) & (grid1[1] <= columns)
+    kernel = list(zip(range(-radius, radius + 1), weights(radius), strict=True))
 
     def scores(start):
-        block = lax.dynamic_slice_in_dim(rows, start, tile + 2 * radius)
-        product = jnp.einsum("nc,mc->nm", block, columns, precision=HIGHEST)
+        block = lax.dynamic_slice_in_dim(rows, start, tile + 2 * margin)
+        product = jnp.einsum("nc,mc->nm", block, others, precision=HIGHEST)
         at = lax.dynamic_slice_in_dim(column0, start, tile)
         total = jnp.zeros((tile, m), a.dtype)
-        for k, (d, w) in enumerate(zip(range(-radius, radius + 1), weights(radius), strict=True)):
+        for right, w in kernel:
+            line = jnp.zeros((tile, m), a.dtype)
+            for down, v in kernel:
+                corner = (margin + down * grid0[1] + right, margin + down * grid1[1] + right)
+                line += v * lax.dynamic_slice(product, corner, (tile, m))
             # The cell before a row's first one is the last of another row: not a neighbour.
-            inside0 = (at + d >= 0) & (at + d < grid0[1])
-            inside1 = (column1 + d >= 0) & (column1 + d < grid1[1])
-            shifted = lax.slice(product, (k, k), (k + tile, k + m))
-            total += jnp.where(inside0[:, None] & inside1[None, :], w * shifted, 0.0)
+            inside0 = (at + right >= 0) & (at + right < grid0[1])
+            inside1 = (column1 + right >= 0) & (column1 + right < grid1[1])
+            total += jnp.where(inside0[:, None] & inside1[None, :], w * line, 0.0)
         alive = lax.dynamic_slice_in_dim(alive0, start, tile)
-        return jnp.where(alive[:, None] & alive1[None, :], total, -jnp.inf)
+        return jnp.where(fits & alive[:, None] & alive1[None, :], total, -jnp.inf)
 
     return scan_mutual(scores, n, m, tile=tile)

@@ -144,6 +144,18 @@ def transfer_inliers(
     return (du * du + dv * dv < reach * reach) & (w > 0)
 
 
+def transfer_error(
+    h: Float[Array, "*b 3 3"], xy0: Float[Array, "k 2"], xy1: Float[Array, "k 2"]
+) -> Float[Array, "*b k"]:
+    """|xy1 - h xy0|^2; infinite behind the camera."""
+    m = h[..., None]
+    x, y = xy0[:, 0], xy0[:, 1]
+    u, v, w = (m[..., i, 0, :] * x + m[..., i, 1, :] * y + m[..., i, 2, :] for i in range(3))
+    safe = jnp.where(w > 0, w, 1.0)
+    square = (u / safe - xy1[:, 0]) ** 2 + (v / safe - xy1[:, 1]) ** 2
+    return jnp.where(w > 0, square, jnp.inf)
+
+
 def inliers(
     h: Float[Array, "*b 3 3"],
     xy0: Float[Array, "k 2"],

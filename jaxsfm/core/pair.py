@@ -16,6 +16,7 @@ from jaxsfm.core import coarse_to_fine as c2f
 from jaxsfm.core.consensus import consensus_nn
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.numerics import HIGHEST
+from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.core.types import DenseFeatures, PairMatches, PRNGKey, Status, Thresholds
 
@@ -48,29 +49,31 @@ def match_pair(
       features0, features1: of the two working images.
       thresholds: pixels of the working images.
     """
-    num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
+    joined0, joined1 = join_octaves(features0), join_octaves(features1)
+    num_fine = max(joined0.fine.shape[0], joined1.fine.shape[0])
     capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
     if shape.consensus:
         coarse = consensus_nn(
-            features0.coarse,
-            features1.coarse,
-            features0.coarse_grid,
-            features1.coarse_grid,
+            joined0.coarse,
+            joined1.coarse,
+            joined0.coarse_grid,
+            joined1.coarse_grid,
             radius=shape.consensus,
+            columns=shape.coarse_columns,
             tile=shape.coarse_tile,
         )
     else:
-        coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
-    windows = c2f.match_windows(features0, features1, coarse, chunk=shape.fine_chunk)
-    cells, found = c2f.correspondences(c2f.candidates(windows, features0), capacity=capacity)
+        coarse = mutual_nn(joined0.coarse, joined1.coarse, tile=shape.coarse_tile)
+    windows = c2f.match_windows(joined0, joined1, coarse, chunk=shape.fine_chunk)
+    cells, found = c2f.correspondences(c2f.candidates(windows, joined0), capacity=capacity)
     valid = jnp.arange(cells.shape[0]) < found
-    xy0, xy1 = features0.keypoints[cells[:, 0]], features1.keypoints[cells[:, 1]]
+    xy0, xy1 = joined0.keypoints[cells[:, 0]], joined1.keypoints[cells[:, 1]]
     planes = peel_planes(key, xy0, xy1, valid, thresholds, shape=shape)
     if shape.one_to_one == "similarity":
         score = jnp.einsum(
             "kd,kd->k",
-            features0.fine[cells[:, 0]],
-            features1.fine[cells[:, 1]],
+            joined0.fine[cells[:, 0]],
+            joined1.fine[cells[:, 1]],
             precision=HIGHEST,
         )
     else:

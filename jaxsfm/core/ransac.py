@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsfm.config import PairShape
 from jaxsfm.core import homography as hg
 from jaxsfm.core.numerics import compact
+from jaxsfm.core.planes import settle
 from jaxsfm.core.types import Planes, PRNGKey, Thresholds
 
 
@@ -177,16 +178,14 @@ def peel_planes(
         h, num, used = _one_plane(jax.random.fold_in(key, p), problem, thresholds, going, shape)
         going = going & (num >= floor)
         member = going & left & hg.inliers(h, n0, n1, reach0, reach1, two_way=shape.two_way)
-        pixels = hg.orient(hg.compose(hg.adjugate(t1), hg.compose(h, t0)))
-        out = (
-            jnp.where(going, pixels, 0.0),
-            member.sum(dtype=jnp.int32),
-            used,
-            member,
-        )
-        return (left & ~member, going), out
+        return (left & ~member, going), (jnp.where(going, h, 0.0), used, member)
 
     planes = jnp.arange(shape.max_planes, dtype=jnp.int32)
-    _, (h, num, used, member) = lax.scan(peel, (valid, jnp.bool_(True)), planes)
+    _, (h, used, member) = lax.scan(peel, (valid, jnp.bool_(True)), planes)
     plane = jnp.where(member.any(0), jnp.argmax(member, axis=0), -1).astype(jnp.int32)
-    return Planes(h, num, used, plane)
+    num = member.sum(axis=1, dtype=jnp.int32)
+    if shape.plane_rounds:
+        h, num, plane = settle(h, num, n0, n1, valid, reach1, floor, rounds=shape.plane_rounds)
+    to_pixels = jax.vmap(lambda h: hg.orient(hg.compose(hg.adjugate(t1), hg.compose(h, t0))))
+    pixels = to_pixels(h)
+    return Planes(jnp.where((num > 0)[:, None, None], pixels, 0.0), num, used, plane)

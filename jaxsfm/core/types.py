@@ -25,12 +25,33 @@ class Pyramid(NamedTuple):
 
 
 class DenseFeatures(NamedTuple):
-    """What one image brings to every pair. Cell (row, col) is entry row * columns + col."""
+    """What one image brings to every pair: descriptors at its size, at half its size, ...
+
+    Octave k has `grid >> k` cells; cell (row, col) is entry row * columns + col of its octave.
+    """
+
+    coarse: tuple[Float[Array, "_ c"], ...]
+    """L2-normalised pool4 descriptors per octave; rows past its grid are zero."""
+    fine: tuple[Float[Array, "_ d"], ...]
+    """L2-normalised pool3 descriptors per octave; rows past its grid are zero."""
+    keypoints: Float[Array, "m 2"]
+    """(x, y) of every fine cell's keypoint, pixels of the working image."""
+    coarse_grid: Int[Array, " 2"]
+    """(rows, columns) of the first octave's pool4 grid."""
+    fine_grid: Int[Array, " 2"]
+    """(rows, columns) of the first octave's pool3 grid."""
+
+
+class JoinedFeatures(NamedTuple):
+    """What one image brings to a pair, its octaves joined (`jaxsfm.core.octaves`).
+
+    Cell (row, col) is entry row * columns + col.
+    """
 
     coarse: Float[Array, "n c"]
-    """L2-normalised pool4 descriptors; rows past the grid are zero."""
+    """L2-normalised descriptors of the coarse cells; rows past the grid are zero."""
     fine: Float[Array, "m d"]
-    """L2-normalised pool3 descriptors; rows past the grid are zero."""
+    """L2-normalised descriptors of the fine cells; rows past the grid are zero."""
     keypoints: Float[Array, "m 2"]
     """(x, y) of every fine cell's keypoint, pixels of the working image."""
     coarse_grid: Int[Array, " 2"]

@@ -11,9 +11,11 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from jaxsfm.config import Config
 from jaxsfm.core.features import extract
+from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.host.images import (
@@ -69,6 +71,8 @@ def compute_features(weights: Weights, working: WorkingImage, *, config: Config)
         num_coarse=num_coarse,
         num_fine=4 * num_coarse,
         relocalized=config.keypoints == "relocalized",
+        octaves=config.octaves,
+        centred=config.centred,
     )
     return jax.device_get(dense)
 
@@ -76,15 +80,18 @@ def compute_features(weights: Weights, working: WorkingImage, *, config: Config)
 def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
     """The same features with room for `num_coarse` coarse and 4 x as many fine cells."""
 
-    def pad(array: np.ndarray, rows: int) -> np.ndarray:
-        return np.pad(array, ((0, rows - array.shape[0]), (0, 0)))
+    def pad(array: Array, rows: int) -> np.ndarray:
+        return np.pad(np.asarray(array), ((0, rows - array.shape[0]), (0, 0)))
 
-    if dense.coarse.shape[0] == num_coarse:
+    def pad_octaves(octaves: tuple[Array, ...], rows: int) -> tuple[np.ndarray, ...]:
+        return tuple(pad(array, octave_capacity(rows, k)) for k, array in enumerate(octaves))
+
+    if dense.coarse[0].shape[0] == num_coarse:
         return dense
     return dense._replace(
-        coarse=pad(np.asarray(dense.coarse), num_coarse),
-        fine=pad(np.asarray(dense.fine), 4 * num_coarse),
-        keypoints=pad(np.asarray(dense.keypoints), 4 * num_coarse),
+        coarse=pad_octaves(dense.coarse, num_coarse),
+        fine=pad_octaves(dense.fine, 4 * num_coarse),
+        keypoints=pad(dense.keypoints, 4 * num_coarse),
     )
 
 
@@ -104,13 +111,13 @@ def total_memory() -> int | None:
     return total
 
 
-def check_memory(image: ImageFile, *, max_size: int) -> None:
+def check_memory(image: ImageFile, *, config: Config) -> None:
     """Refuse an image whose features cannot fit, before the system kills the process.
 
     Raises:
       UserError: what it needs and what there is.
     """
-    width, height = working_size(image.size, max_size)
+    width, height = working_size(image.size, config.max_size, config.enlarge)
     needed = BYTES_PER_PIXEL * width * height
     total = total_memory() if jax.default_backend() == "cpu" else None
     if total is not None and needed > total:
@@ -128,6 +135,6 @@ def image_features(weights: Weights, image: ImageFile, *, config: Config) -> Ima
       ImageError: the image cannot be used.
       UserError: it needs more memory than there is.
     """
-    check_memory(image, max_size=config.max_size)
-    working = read_image(image, max_size=config.max_size)
+    check_memory(image, config=config)
+    working = read_image(image, max_size=config.max_size, enlarge=config.enlarge)
     return ImageFeatures(image, working.scale, compute_features(weights, working, config=config))

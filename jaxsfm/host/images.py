@@ -203,30 +203,34 @@ def _decode(image: ImageFile) -> np.ndarray:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
-def working_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
-    """(width, height) with the longer side at most `max_size`; never enlarged, at least 1."""
-    longer = max(size)
-    if longer <= max_size:
-        return size
-    width, height = (max(1, round(side * max_size / longer)) for side in size)
+def working_size(size: tuple[int, int], max_size: int, enlarge: float = 1.0) -> tuple[int, int]:
+    """(width, height) with the longer side at most `max_size`, at least 1.
+
+    Args:
+      enlarge: largest factor; 1: images are reduced only.
+    """
+    factor = min(max_size / max(size), enlarge)
+    width, height = (max(1, round(side * factor)) for side in size)
     return width, height
 
 
-def read_image(image: ImageFile, *, max_size: int) -> WorkingImage:
-    """Decode and reduce; grey, alpha, 16-bit and CMYK become 8-bit RGB.
+def read_image(image: ImageFile, *, max_size: int, enlarge: float = 1.0) -> WorkingImage:
+    """Decode and resize; grey, alpha, 16-bit and CMYK become 8-bit RGB.
 
     Raises:
       ImageError: the file cannot be decoded, or its reduced size is too narrow.
     """
     rgb = _decode(image)
-    width, height = working_size(image.size, max_size)
+    width, height = working_size(image.size, max_size, enlarge)
     if min(width, height) < MIN_SIDE:
         raise ImageError(
             f"{shown_name(image.name)}: {width} x {height} pixels after reduction to "
             f"{max_size} is too narrow (at least {MIN_SIDE} per side)"
         )
     if rgb.shape[:2] != (height, width):
-        rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
+        larger = width > image.size[0]
+        how = cv2.INTER_CUBIC if larger else cv2.INTER_AREA
+        rgb = cv2.resize(rgb, (width, height), interpolation=how)
     return WorkingImage(
         rgb=np.ascontiguousarray(rgb), scale=(image.size[0] / width, image.size[1] / height)
     )

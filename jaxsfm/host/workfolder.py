@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
+import jax
 import numpy as np
 
 from jaxsfm.core.types import DenseFeatures, Status
@@ -30,6 +31,8 @@ logger = logging.getLogger(__name__)
 
 MEMORY_BYTES = 2 << 30
 """Features kept in memory; the others are read again from the folder."""
+_OCTAVES = ("coarse", "fine")
+"""Fields of DenseFeatures that hold an array per octave."""
 RESULTS = ("report.json", "sparse", "database.db")
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile)
 
@@ -77,7 +80,12 @@ class WorkFolder:
         return self.path / "features" / f"{image.sha256[:32]}.npz"
 
     def save_features(self, features: ImageFeatures) -> None:
-        arrays = {**features.dense._asdict(), "scale": np.asarray(features.scale, np.float64)}
+        arrays = {"scale": np.asarray(features.scale, np.float64)}
+        for name, value in features.dense._asdict().items():
+            if name in _OCTAVES:
+                arrays |= {f"octave{k}_{name}": array for k, array in enumerate(value)}
+            else:
+                arrays[name] = value
         _save_npz(self._feature_path(features.image), arrays)
         self._remember(features)
 
@@ -94,7 +102,12 @@ class WorkFolder:
                 self._feature_path(image).open("rb") as raw,
                 np.load(raw, allow_pickle=False) as file,
             ):
-                dense = DenseFeatures(*(file[name] for name in DenseFeatures._fields))
+                octaves = sum(name.endswith("_coarse") for name in file)
+                coarse, fine = (
+                    tuple(file[f"octave{k}_{name}"] for k in range(octaves)) for name in _OCTAVES
+                )
+                rest = (file[name] for name in DenseFeatures._fields if name not in _OCTAVES)
+                dense = DenseFeatures(coarse, fine, *rest)
                 scale = file["scale"]
         except _DAMAGED:
             return None
@@ -104,7 +117,9 @@ class WorkFolder:
 
     def _remember(self, features: ImageFeatures) -> None:
         self._cache[features.image.name] = features
-        sizes = {name: sum(a.nbytes for a in f.dense) for name, f in self._cache.items()}
+        sizes = {
+            name: sum(a.nbytes for a in jax.tree.leaves(f.dense)) for name, f in self._cache.items()
+        }
         total = sum(sizes.values())
         while total > MEMORY_BYTES and len(self._cache) > 2:
             name, _ = self._cache.popitem(last=False)

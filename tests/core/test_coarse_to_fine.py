@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 from strategies import rng_of, seeds, unit_rows
 
 from jaxsfm.core import coarse_to_fine as c2f
-from jaxsfm.core.types import DenseFeatures
+from jaxsfm.core.types import JoinedFeatures
 
 GRIDS = [((4, 5), (8, 10)), ((4, 5), (9, 11)), ((3, 3), (6, 7)), ((5, 4), (10, 9))]
 N, M = 24, 128
 
 
-def features(rng, coarse_grid, fine_grid) -> DenseFeatures:
+def features(rng, coarse_grid, fine_grid) -> JoinedFeatures:
     fine = np.zeros((M, 8), np.float32)
     used = fine_grid[0] * fine_grid[1]
     fine[:used] = unit_rows(rng, used, 8)
     fine[rng.integers(0, used)] = 0  # a cell where nothing is seen
-    return DenseFeatures(
+    return JoinedFeatures(
         coarse=jnp.zeros((N, 8)),
         fine=jnp.asarray(fine),
         keypoints=jnp.zeros((M, 2)),

@@ -12,7 +12,11 @@ from tolerances import NEAR_TIE
 from jaxsfm.core.consensus import consensus_nn, weights
 from jaxsfm.core.matching import mutual_nn
 
-match = jax.jit(consensus_nn, static_argnames=("radius", "tile"))
+_match = jax.jit(consensus_nn, static_argnames=("radius", "columns", "tile"))
+
+
+def match(*args, columns: int = 16, **kwargs):
+    return _match(*args, columns=columns, **kwargs)
 
 
 def padded(x: np.ndarray, rows: int) -> np.ndarray:
@@ -97,3 +101,9 @@ def test_neighbours_find_what_noise_hides(seed):
     alone = (np.asarray(jax.jit(mutual_nn)(a, b)) == truth).sum()
     together = (np.asarray(match(a, b, *sizes, radius=1)) == truth).sum()
     assert together > 1.5 * alone and together > 0.7 * (truth >= 0).sum()
+
+
+def test_a_grid_wider_than_said_has_no_matches():
+    (a, b), sizes = grids(0, (5, 7), (6, 6))
+    assert (np.asarray(match(a, b, *sizes, radius=1, columns=6)) == -1).all()
+    assert (np.asarray(match(a, b, *sizes, radius=1, columns=7)) >= 0).any()

@@ -1,6 +1,8 @@
 """Laws of the pair program, on real photographs under a known map."""
 
 import dataclasses
+import functools
+from pathlib import Path
 
 import cv2
 import jax
@@ -13,8 +15,9 @@ from strategies import random_homography, rng_of
 from jaxsfm.config import PRESETS, Config
 from jaxsfm.core.pair import match_pair, match_pairs, pair_key
 from jaxsfm.core.types import Status, Thresholds
-from jaxsfm.host.features import capacity, compute_features, pad_features
-from jaxsfm.host.images import WorkingImage
+from jaxsfm.host.features import ImageFeatures, capacity, compute_features, pad_features
+from jaxsfm.host.images import ImageFile, WorkingImage
+from jaxsfm.pipeline import match_features
 
 THRESHOLDS = Thresholds(np.float32(10), np.int32(26), np.float32(0.999))
 SIZE = (384, 320)
@@ -31,12 +34,22 @@ def warped(photos):
 
 
 @pytest.fixture(scope="module")
-def features(weights, warped):
-    def compute(rgb, keypoints="relocalized"):
-        working = WorkingImage(rgb=rgb, scale=(1.0, 1.0))
-        return compute_features(weights, working, config=Config(keypoints=keypoints))
+def features_of(weights, warped):
+    """Features of the three images as a config wants them (at their size)."""
 
-    return [compute(rgb) for rgb in warped[:3]]
+    @functools.cache
+    def compute(config: Config):
+        return [
+            compute_features(weights, WorkingImage(rgb=rgb, scale=(1.0, 1.0)), config=config)
+            for rgb in warped[:3]
+        ]
+
+    return lambda config: compute(config.extraction())
+
+
+@pytest.fixture(scope="module")
+def features(features_of):
+    return features_of(PRESETS["paper"])
 
 
 def matches_of(found, f0, f1):
@@ -51,8 +64,8 @@ def equal(a, b):
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_matches_follow_the_known_map(features, warped, key, preset):
-    f0, f1, _ = features
+def test_matches_follow_the_known_map(features_of, warped, key, preset):
+    f0, f1, _ = features_of(PRESETS[preset])
     found = match_pair(key, f0, f1, THRESHOLDS, shape=PRESETS[preset].pair)
     assert found.status == Status.VERIFIED and found.num_dropped == 0
     cells, xy0, xy1 = matches_of(found, f0, f1)
@@ -91,7 +104,8 @@ def test_no_keypoint_is_matched_twice(features, key):
             assert len(np.unique(cells[:, side])) == len(cells)
 
 
-def test_a_batch_is_its_pairs_one_by_one_bit_for_bit(features):
+def test_a_batch_is_its_pairs_one_by_one_bit_for_bit(features_of):
+    features = features_of(PRESETS["default"])
     pairs = [(0, 1), (1, 0), (0, 2)]
     shape = PRESETS["default"].pair
     keys = jnp.stack([pair_key(jax.random.key(0), a, b) for a, b in pairs])
@@ -117,7 +131,7 @@ def test_more_room_changes_nothing(features, key):
     f0, f1, _ = features
     shape = PRESETS["paper"].pair
     small = match_pair(key, f0, f1, THRESHOLDS, shape=shape)
-    room = 2 * f0.coarse.shape[0]
+    room = 2 * f0.coarse[0].shape[0]
     large = match_pair(key, pad_features(f0, room), pad_features(f1, room), THRESHOLDS, shape=shape)
     np.testing.assert_array_equal(
         matches_of(small, f0, f1)[0],
@@ -125,9 +139,9 @@ def test_more_room_changes_nothing(features, key):
     )
 
 
-def test_swapping_the_images_swaps_the_matches(features, key):
-    f0, f1, _ = features
+def test_swapping_the_images_swaps_the_matches(features_of, key):
     for preset in PRESETS.values():
+        f0, f1, _ = features_of(preset)
         forward = match_pair(key, f0, f1, THRESHOLDS, shape=preset.pair)
         backward = match_pair(key, f1, f0, THRESHOLDS, shape=preset.pair)
         assert forward.num_coarse == backward.num_coarse
@@ -165,6 +179,14 @@ def test_one_compilation_serves_all_values(features, key):
     assert run._cache_size() == before + 1
 
 
+def test_the_pipeline_widens_the_votes_for_wide_images(features):
+    image = ImageFile(name="a", path=Path("a"), size=SIZE, sha256=64 * "0")
+    sides = [ImageFeatures(image, (1.0, 1.0), dense) for dense in features[:2]]
+    narrow = dataclasses.replace(PRESETS["robust"].pair, coarse_columns=8)
+    config = dataclasses.replace(PRESETS["robust"], pair=narrow)
+    assert match_features(*sides, config=config).num_inliers > 400
+
+
 def test_grid_keypoints_are_the_cells_centres(weights, warped):
     working = WorkingImage(rgb=warped[0], scale=(1.0, 1.0))
     grid = compute_features(weights, working, config=Config(keypoints="grid"))
@@ -175,7 +197,7 @@ def test_grid_keypoints_are_the_cells_centres(weights, warped):
     n = cols * (SIZE[1] // 8)
     assert np.abs(moved.keypoints[:n] - grid.keypoints[:n]).max() <= 3.5
     assert (moved.keypoints[:n] != grid.keypoints[:n]).any(1).mean() > 0.9
-    np.testing.assert_array_equal(moved.fine, grid.fine)
+    equal(moved.fine, grid.fine)
 
 
 def test_capacities_hold_what_they_must_and_are_few():

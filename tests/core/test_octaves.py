@@ -1,0 +1,147 @@
+"""Laws of octaves: descriptors of smaller copies of the image, at the cells of the image."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import tolerances
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import rng_of, seeds
+
+from jaxsfm.config import Config, preset
+from jaxsfm.core.octaves import halve, join_octaves
+from jaxsfm.core.types import DenseFeatures
+from jaxsfm.host.features import compute_features, pad_features
+from jaxsfm.host.images import WorkingImage
+
+join = jax.jit(join_octaves)
+SHAPES = [(8, 12), (5, 7), (9, 4), (1, 6), (3, 3)]
+
+
+def random_features(seed: int, shape: tuple[int, int], octaves: int) -> DenseFeatures:
+    """Unit descriptors, some of them blank, in more room than there are cells."""
+    rng = rng_of(seed)
+
+    def levels(grid, room):
+        for k in range(octaves):
+            cells = (grid[0] >> k) * (grid[1] >> k)
+            x = rng.normal(size=(cells, 6)) * (rng.random((cells, 1)) > 0.1)
+            x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+            yield jnp.asarray(np.pad(x, ((0, -(-room // 4**k) - cells), (0, 0))), jnp.float32)
+
+    fine = (2 * shape[0] + 1, 2 * shape[1])
+    return DenseFeatures(
+        tuple(levels(shape, 112)),
+        tuple(levels(fine, 448)),
+        jnp.zeros((448, 2)),
+        jnp.asarray(shape, jnp.int32),
+        jnp.asarray(fine, jnp.int32),
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.sampled_from(SHAPES), st.sampled_from([1, 2, 4]))
+def test_joining_equals_interpolating_cell_by_cell(seed, shape, octaves):
+    features = random_features(seed, shape, octaves)
+    joined = join(features)
+    for ours, levels, grid in (
+        (joined.coarse, features.coarse, features.coarse_grid),
+        (joined.fine, features.fine, features.fine_grid),
+    ):
+        expected = oracles.join_octaves([np.asarray(x) for x in levels], np.asarray(grid))
+        np.testing.assert_allclose(ours, expected, **tolerances.UNIT)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds, st.sampled_from(SHAPES))
+def test_products_are_means_over_the_octaves(seed, shape):
+    features = random_features(seed, shape, 3)
+    joined = np.asarray(join(features).coarse)
+    n = joined.shape[0]
+    alive = joined.any(1)
+    parts = joined.reshape(n, 3, -1)[alive]
+    norms = np.linalg.norm(parts, axis=2, keepdims=True)
+    present = norms > 0
+    weight = np.sqrt(1 / present.sum(1, keepdims=True))
+    np.testing.assert_allclose(norms, np.where(present, weight, 0), **tolerances.UNIT)
+
+
+def test_one_octave_is_left_as_it_is():
+    features = random_features(0, (5, 7), 1)
+    np.testing.assert_array_equal(join(features).coarse, features.coarse[0])
+
+
+def test_halving_takes_means_of_two_by_two_pixels():
+    x = rng_of(1).random((6, 4, 3), np.float32)
+    ours = np.asarray(halve(jnp.asarray(x)))
+    np.testing.assert_allclose(ours[2, 1], x[4:6, 2:4].mean((0, 1)), **tolerances.UNIT)
+    assert ours.shape == (3, 2, 3)
+
+
+def of(weights, rgb, **options) -> DenseFeatures:
+    working = WorkingImage(rgb=np.ascontiguousarray(rgb), scale=(1.0, 1.0))
+    return compute_features(weights, working, config=Config(**options))
+
+
+def cells_of(x, grid):
+    return np.asarray(x)[: grid[0] * grid[1]]
+
+
+@pytest.mark.parametrize("size", [(256, 192), (250, 181)])
+def test_an_octave_is_the_smaller_image_described_alone(weights, photos, size):
+    small = photos[2][: size[1], : size[0]]
+    whole = np.repeat(np.repeat(small, 2, axis=0), 2, axis=1)  # halving gives it back exactly
+    octaves, alone = of(weights, whole, octaves=2), of(weights, small)
+    for ours, expected, grid in (
+        (octaves.coarse[1], alone.coarse[0], alone.coarse_grid),
+        (octaves.fine[1], alone.fine[0], alone.fine_grid),
+    ):
+        np.testing.assert_allclose(
+            cells_of(ours, grid), cells_of(expected, grid), **tolerances.FEATURES
+        )
+        assert not np.asarray(ours)[grid[0] * grid[1] :].any()
+
+
+def test_more_room_changes_no_octave(weights, photos):
+    features = of(weights, photos[1][:192, :256], octaves=3, centred=True)
+    wide = pad_features(features, 4 * features.coarse[0].shape[0])
+    near, far = join(features), join(wide)
+    np.testing.assert_array_equal(far.coarse[: len(near.coarse)], near.coarse)
+    np.testing.assert_array_equal(far.fine[: len(near.fine)], near.fine)
+    assert not np.asarray(far.coarse[len(near.coarse) :]).any()
+
+
+def test_the_smallest_image_has_octaves_without_cells(weights, photos):
+    features = of(weights, photos[0][:48, :50], octaves=4, centred=True)
+    joined = np.asarray(join(features).coarse)
+    assert np.isfinite(joined).all() and joined[:9].any(1).all() and not joined[9:].any()
+
+
+def test_centred_descriptors_have_no_common_part(weights, photos):
+    plain = of(weights, photos[3][:384, :512])
+    centred = of(weights, photos[3][:384, :512], centred=True)
+    n = 24 * 32
+    x = np.asarray(plain.coarse[0])[:n]
+    rest = x - x.mean(0)
+    expected = rest / np.linalg.norm(rest, axis=1, keepdims=True)
+    np.testing.assert_allclose(np.asarray(centred.coarse[0])[:n], expected, **tolerances.FEATURES)
+    common = np.linalg.norm(np.asarray(centred.coarse[0])[:n].mean(0))
+    assert common < 0.5 * np.linalg.norm(x.mean(0))
+
+
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_a_blank_image_has_nothing_to_centre(weights, level):
+    features = of(weights, np.full((320, 320, 3), level, np.uint8), centred=True)
+    inner = np.asarray(features.coarse[0])[:400].reshape(20, 20, -1)[7:-7, 7:-7]
+    edge = np.asarray(of(weights, np.full((320, 320, 3), level, np.uint8)).coarse[0])
+    spread = np.ptp(edge[:400].reshape(20, 20, -1)[7:-7, 7:-7], axis=(0, 1)).max()
+    assert spread < 1e-5  # all cells away from the border are alike
+    assert len(np.unique(np.round(inner.reshape(-1, 512), 3), axis=0)) == 1
+
+
+def test_presets_extract_what_they_say():
+    assert preset("paper").extraction() == Config()
+    assert preset("default").extraction().octaves == 4
+    assert preset("robust").extraction().enlarge == 2.0

@@ -1,0 +1,127 @@
+"""Laws of planes that compete for their correspondences."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+from strategies import random_homography, rng_of
+
+from jaxsfm.config import PairShape
+from jaxsfm.core.planes import nearest_plane, settle
+from jaxsfm.core.ransac import peel_planes
+from jaxsfm.core.types import Thresholds
+
+peel = jax.jit(peel_planes, static_argnames=("shape",))
+LIMITS = Thresholds(np.float32(4), np.int32(20), np.float32(0.999))
+GREEDY = PairShape(local_refits=4)
+FAIR = dataclasses.replace(GREEDY, plane_rounds=10)
+
+
+def two_walls(seed: int, angle: float, *, noise: float = 0.5, outliers: int = 60):
+    """Two planes that agree along an edge and part from it, 150 points each."""
+    rng = rng_of(seed)
+    left = np.asarray([[1.02, 0.01, 12], [-0.01, 0.99, 5], [1e-5, 0, 1]])
+    right = left.copy()
+    right[0, 0] += angle
+    right[0, 2] -= angle * 500  # the same along x = 500
+    xy0 = rng.uniform([0, 0], [500, 800], (150, 2)), rng.uniform([500, 0], [1000, 800], (150, 2))
+    xy1 = [oracles.transfer(h, x) for h, x in zip((left, right), xy0, strict=True)]
+    off = rng.uniform(0, 1000, (2, outliers, 2))
+    xy0 = np.concatenate([*xy0, off[0]])
+    xy1 = np.concatenate([*xy1, off[1]]) + rng.normal(size=xy0.shape) * noise
+    label = np.r_[np.zeros(150, int), np.ones(150, int), np.full(outliers, -1)]
+    return jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32), label
+
+
+def wrong(found, label) -> float:
+    found = np.asarray(found)
+    named = [np.where(found >= 0, np.abs(found - flip), -1) for flip in (0, 1)]
+    return min((x != label).mean() for x in named)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_competing_planes_part_where_greedy_ones_take_too_much(seed):
+    xy0, xy1, label = two_walls(seed, 0.1)
+    valid = jnp.ones(len(label), bool)
+    greedy, fair = (
+        peel(jax.random.key(seed), xy0, xy1, valid, LIMITS, shape=shape).plane
+        for shape in (GREEDY, FAIR)
+    )
+    assert wrong(fair, label) < 0.12
+    assert wrong(fair, label) <= wrong(greedy, label)
+
+
+def test_every_member_is_nearest_to_its_own_plane():
+    xy0, xy1, _ = two_walls(0, 0.1)
+    valid = jnp.arange(len(xy0)) % 7 != 0
+    found = peel(jax.random.key(0), xy0, xy1, valid, LIMITS, shape=FAIR)
+    plane = np.asarray(found.plane)
+    errors = np.stack(
+        [
+            np.linalg.norm(oracles.transfer(h, np.asarray(xy0)) - xy1, axis=1)
+            for h in np.asarray(found.homographies, np.float64)[np.asarray(found.num_inliers) > 0]
+        ]
+    )
+    best, least = errors.argmin(0), errors.min(0)
+    clear = np.abs(np.sort(errors, axis=0)[1] - least) > 0.05
+    clear &= np.abs(least - 4) > 0.05
+    expected = np.where((least < 4) & np.asarray(valid), best, -1)
+    np.testing.assert_array_equal(plane[clear], expected[clear])
+    counts = np.bincount(plane[plane >= 0], minlength=len(found.num_inliers))
+    np.testing.assert_array_equal(found.num_inliers, counts)
+    assert (np.diff(counts) <= 0).all()
+
+
+def test_a_plane_without_points_of_its_own_is_given_up():
+    xy0, xy1, _ = two_walls(1, 0.0, noise=0.1, outliers=0)
+    h = np.asarray([[1.02, 0.01, 12], [-0.01, 0.99, 5], [1e-5, 0, 1]])
+    off = h + np.asarray([[0, 0, 1.5], [0, 0, 0], [0, 0, 0]])
+    planes = jnp.asarray(np.stack([off, h, np.zeros((3, 3))]), jnp.float32)
+    homographies, num, plane = settle(
+        planes,
+        jnp.asarray([300, 300, 0], jnp.int32),
+        xy0,
+        xy1,
+        jnp.ones(len(xy0), bool),
+        jnp.float32(4),
+        jnp.int32(20),
+        rounds=10,
+    )
+    assert num.tolist() == [300, 0, 0] and (np.asarray(plane) == 0).all()
+    at = np.asarray([[0, 0], [1000, 800]], np.float64)
+    np.testing.assert_allclose(
+        oracles.transfer(np.asarray(homographies[0], np.float64), at),
+        oracles.transfer(h, at),
+        atol=0.1,
+    )
+
+
+def test_without_planes_nothing_is_a_member():
+    xy0, xy1, _ = two_walls(2, 0.1)
+    none = nearest_plane(
+        jnp.zeros((3, 3, 3)),
+        jnp.zeros(3, bool),
+        xy0,
+        xy1,
+        jnp.ones(len(xy0), bool),
+        jnp.float32(4),
+    )
+    assert (np.asarray(none) == -1).all()
+    found = peel(
+        jax.random.key(0), xy0, xy1[::-1] * 3 % 997, jnp.ones(len(xy0), bool), LIMITS, shape=FAIR
+    )
+    assert found.num_inliers[0] == 0 and not np.asarray(found.homographies).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_plane_keeps_its_points(seed):
+    rng = rng_of(seed)
+    xy0 = rng.uniform(0, 1000, (200, 2))
+    xy1 = oracles.transfer(random_homography(rng, strength=0.5), xy0)
+    valid = jnp.ones(200, bool)
+    args = (jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32), valid, LIMITS)
+    found = peel(jax.random.key(seed), *args, shape=FAIR)
+    assert (np.asarray(found.plane) == 0).all() and found.num_inliers.tolist() == [200, 0, 0, 0, 0]
