@@ -10,12 +10,13 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxsfm.bench import scenes
 from jaxsfm.bench.common import Keep, method_config, versions
+from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
@@ -41,10 +42,18 @@ PUBLISHED = (
 )
 
 
+class Made(NamedTuple):
+    """What a method made of one subset."""
+
+    poses: Poses
+    """Of the best model."""
+    matches: NightMatches | None
+
+
 def _rootsift_models(
     scene: Scene, scratch: Path, _method: str, seed: int, threads: int
-) -> list[Poses]:
-    """Poses per subset: features and matches of all photos once, then what a subset has of them."""
+) -> list[Made]:
+    """Per subset: features and matches of all photos once, then what a subset has of them."""
     database = scratch / "all.db"
     images = [scene.images[name] for name in sorted(scene.images)]
     blanks = any(" " in name for name in scene.images)  # COLMAP's pair lists cannot hold them
@@ -68,12 +77,13 @@ def _rootsift_models(
         kept = {pair: view for pair, view in every.items() if names.issuperset(pair)}
         drop_pairs(part, every.keys() - kept.keys())
         found, _ = build_models(part, kept, options)
-        models.append(model_poses(found[0]) if found else {})
+        poses = model_poses(found[0]) if found else {}
+        models.append(Made(poses, night_matches(part, scene, subset)))
     return models
 
 
-def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: int) -> list[Poses]:
-    """Poses per subset; a photo's features and a pair's matches are computed once."""
+def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: int) -> list[Made]:
+    """Per subset; a photo's features and a pair's matches are computed once."""
     config = method_config(method)
     weights = on_device(load_weights())
     largest = max(len(subset.day) + 1 for subset in scene.subsets)
@@ -103,18 +113,16 @@ def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: 
             intrinsics=scene.camera,
             options=options,
         )
-        models.append(model_poses(made.models[0]) if made.models else {})
+        poses = model_poses(made.models[0]) if made.models else {}
+        models.append(Made(poses, night_matches(scratch / "part.db", scene, subset)))
         results = {pair: result for pair, result in results.items() if last_use[pair] > k}
     return models
 
 
-def judge(poses: Poses, subset: Subset, truth: Poses) -> dict[str, Any]:
-    """One subset's figures: day cameras registered, the night camera's errors or why there are
-    none.
-
-    Args:
-      poses: of the best model.
-    """
+def judge(made: Made, subset: Subset, truth: Poses) -> dict[str, Any]:
+    """One subset's figures: day cameras registered, the night photo's matches, its camera's
+    errors or why there are none."""
+    poses = made.poses
     day = [name for name in subset.day if name in poses]
     row: dict[str, Any] = {
         "night": subset.night,
@@ -123,6 +131,8 @@ def judge(poses: Poses, subset: Subset, truth: Poses) -> dict[str, Any]:
         "day_registered": len(day),
         "day_images": len(subset.day),
     }
+    if made.matches is not None:
+        row |= {"matches": made.matches.number, "correct": made.matches.correct}
     if not row["registered"] or subset.night not in truth:
         return row
     known = {name: truth[name] for name in (*subset.day, subset.night) if name in truth}
@@ -135,17 +145,21 @@ def judge(poses: Poses, subset: Subset, truth: Poses) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Registered nights and days, share of the nights within each limit, the cumulative curve.
+    """Registered nights and days, share of the nights within each limit, the cumulative curve, the
+    nights' verified matches and how many of them are correct.
 
     The share is of all nights with a reference pose, registered or not; None without any.
     """
     judged = [row for row in rows if "position" in row]
+    counted = [row for row in rows if "correct" in row]
     known = sum(row["has_truth"] for row in rows)
     return {
         "nights": len(rows),
         "night_registered": sum(row["registered"] for row in rows),
         "day_images": sum(row["day_images"] for row in rows),
         "day_registered": sum(row["day_registered"] for row in rows),
+        "matches": sum(row["matches"] for row in counted) if counted else None,
+        "correct": sum(row["correct"] for row in counted) if counted else None,
         "within": {
             f"{d:g}; {deg:g} deg": sum(
                 row["position"] <= d and row["rotation_deg"] <= deg for row in judged
@@ -205,8 +219,8 @@ def bench_daynight(
                 make = _rootsift_models if method == "rootsift" else _dense_models
                 models = make(scene, scratch, method, seed, threads)
                 subsets = [
-                    judge(poses, subset, scene.truth)
-                    for poses, subset in zip(models, scene.subsets, strict=True)
+                    judge(each, subset, scene.truth)
+                    for each, subset in zip(models, scene.subsets, strict=True)
                 ]
                 rows.append(
                     {
@@ -243,16 +257,18 @@ def _result(rows: list[dict[str, Any]], setting: dict[str, Any]) -> dict[str, An
 HEADER = (
     f"{'scene':24s} {'method':9s} {'night':>7s} {'day':>9s} "
     + " ".join(f"{f'{d:g}; {deg:g}':>8s}" for d, deg in LIMITS)
-    + f" {'seconds':>8s}"
+    + f" {'correct':>9s} {'matches':>9s} {'seconds':>8s}"
 )
 
 
 def _figures(row: dict[str, Any]) -> str:
     shares = row["within"].values() if row["within"] else [None] * len(LIMITS)
     within = " ".join(f"{'-':>8s}" if share is None else f"{share:8.0%}" for share in shares)
+    counts = ("-" if row[key] is None else str(row[key]) for key in ("correct", "matches"))
     return (
         f"{row['night_registered']:3d}/{row['nights']:<3d} "
-        f"{row['day_registered']:4d}/{row['day_images']:<4d} {within}"
+        f"{row['day_registered']:4d}/{row['day_images']:<4d} {within} "
+        + " ".join(f"{count:>9s}" for count in counts)
     )
 
 
@@ -263,7 +279,8 @@ def row_line(row: dict[str, Any]) -> str:
 
 
 def table_lines(result: dict[str, Any]) -> list[str]:
-    """Nights and days registered, share of the nights within (distance; deg)."""
+    """Nights and days registered, share of the nights within (distance; deg), correct ones of the
+    nights' matches."""
     lines = [HEADER, *(row_line(row) for row in result["rows"])]
     lines += [f"{'all':24s} {m:9s} {_figures(row)}" for m, row in result["totals"].items()]
     for row in result["rows"]:

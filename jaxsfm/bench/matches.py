@@ -18,8 +18,8 @@ from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.pipeline import match_features, on_device
 
 PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust")
-FEATURES = 4
-"""Features held: of two images, at two kinds of keypoints."""
+FEATURES = 8
+"""Features held: of two images, as four methods want them."""
 
 
 class Matches(NamedTuple):
@@ -33,7 +33,8 @@ class Matches(NamedTuple):
 
 
 class Matcher:
-    """Matches pairs; an image's features are computed once for all methods that share them."""
+    """Matches pairs; an image's features are computed once for all pairs and methods that share
+    them."""
 
     def __init__(self) -> None:
         self._weights: Weights | None = None

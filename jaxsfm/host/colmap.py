@@ -176,7 +176,7 @@ class TwoView(NamedTuple):
     """A homography explains all inliers."""
 
 
-def _rays(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
+def rays_of(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
     """Unit directions (n, 3) of pixels, in the camera's frame."""
     flat = camera.cam_from_img(np.ascontiguousarray(xy + float(PIXEL_OFFSET)))
     assert flat is not None
@@ -210,7 +210,7 @@ def read_two_views(path: Path) -> dict[Pair, TwoView]:
             rotation, angle = None, 0.0
             if geometry.cam2_from_cam1 is not None:
                 rotation = geometry.cam2_from_cam1.rotation.matrix()
-                rays = [_rays(camera_of[i], at) for at, i in zip(seen, (a, b), strict=True)]
+                rays = [rays_of(camera_of[i], at) for at, i in zip(seen, (a, b), strict=True)]
                 cross = np.linalg.norm(np.cross(rays[0] @ rotation.T, rays[1]), axis=1)
                 seen_angles = np.arcsin(np.minimum(cross[np.isfinite(cross)], 1.0))
                 angle = float(np.degrees(np.median(seen_angles))) if len(seen_angles) else 0.0
@@ -225,6 +225,22 @@ def read_two_views(path: Path) -> dict[Pair, TwoView]:
                 int(geometry.config) in PLANAR,
             )
         return found
+
+
+def read_verified(path: Path, names: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
+    """A pair's two-view inliers, float64 (n, 2) each, centre of the top-left pixel (0, 0).
+
+    Args:
+      names: of the two images, in the order wanted.
+    """
+    with pycolmap.Database.open(path) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        a, b = ids[names[0]], ids[names[1]]
+        if not db.exists_two_view_geometry(a, b):
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        rows = np.asarray(db.read_two_view_geometry(a, b).inlier_matches).reshape(-1, 2)
+        xy = [np.asarray(db.read_keypoints(i), np.float64)[:, :2] - PIXEL_OFFSET for i in (a, b)]
+    return xy[0][rows[:, 0]], xy[1][rows[:, 1]]
 
 
 def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:

@@ -3,11 +3,13 @@
 import json
 import shutil
 
+import cv2
 import numpy as np
 import pytest
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.daynight import judge, summary
+from jaxsfm.bench.daynight import Made, judge, summary
+from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
 from jaxsfm.bench.scenes import Subset
 from jaxsfm.cli import main
 from jaxsfm.errors import UserError
@@ -87,8 +89,6 @@ def test_a_day_and_a_night_photo_of_one_name_do_not_share_a_pose(simple, tmp_pat
     ],
 )
 def test_damaged_scenes_are_named_before_the_first_run(simple, tmp_path, capsys, damage, word):
-    import cv2
-
     room = tmp_path / "room"
     shutil.copytree(simple / "room", room)
     if damage.endswith("camera"):
@@ -123,8 +123,11 @@ def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monke
         (daynight._rootsift_models, "rootsift"),
         (daynight._dense_models, "paper"),
     ):
-        for poses, subset in zip(make(made, tmp_path, method, 0, 1), made.subsets, strict=True):
+        runs = make(made, tmp_path, method, 0, 1)
+        for (poses, matches), subset in zip(runs, made.subsets, strict=True):
             assert subset.night in poses and set(poses) <= {*subset.day, subset.night}
+            assert (matches is None) == (subset.night not in made.truth)
+            assert matches is None or 0.5 * matches.number < matches.correct <= matches.number
 
 
 def test_aachens_layout(simple, tmp_path):
@@ -174,15 +177,42 @@ def test_the_night_camera_is_judged_after_a_similarity_from_the_day():
     moved = {name: CameraPose(pose.rotation, 3 * pose.centre + 5) for name, pose in truth.items()}
     moved["n"] = CameraPose(moved["n"].rotation, moved["n"].centre + [0.6, 0, 0])
     subset = Subset(names[:4], "n")
-    row = judge(moved, subset, truth)
+    row = judge(Made(moved, None), subset, truth)
     assert row["registered"] and row["day_registered"] == 4
     assert row["position"] == pytest.approx(0.2) and row["rotation_deg"] < 1e-6
     del moved["n"]
-    assert "position" not in judge(moved, subset, truth)
+    assert "position" not in judge(Made(moved, None), subset, truth)
     lonely = {name: truth[name] for name in ("a", "n")}
-    row = judge(lonely, subset, truth)
+    row = judge(Made(lonely, None), subset, truth)
     assert row["registered"] and "not_evaluated" in row and row["day_registered"] == 1
-    assert judge({}, subset, truth)["registered"] is False
+    assert judge(Made({}, NightMatches(9, 4)), subset, truth) == {
+        "night": "n",
+        "registered": False,
+        "has_truth": True,
+        "day_registered": 0,
+        "day_images": 4,
+        "matches": 9,
+        "correct": 4,
+    }
+
+
+def test_the_distance_from_the_epipolar_line_is_that_of_the_image():
+    rng = np.random.default_rng(0)
+    focal, poses = 800.0, []
+    for _ in range(2):
+        turn = cv2.Rodrigues(rng.normal(size=3) * 0.2)[0]
+        poses.append(CameraPose(turn, rng.normal(size=3)))
+    points = rng.normal(size=(50, 3)) + [0, 0, 12]
+    rays = [(points - pose.centre) @ pose.rotation.T for pose in poses]
+    assert np.abs(epipolar_distance(*rays, *poses)).max() < 1e-12
+    # A second point on the same ray of image 0 spans the line; step off it by 3 px.
+    along = [(points + 0.1 * (points - poses[0].centre)) - pose.centre for pose in poses][1]
+    along = along @ poses[1].rotation.T
+    at, other = (x[:, :2] / x[:, 2:] for x in (rays[1], along))
+    normal = (other - at)[:, ::-1] * [1, -1]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    moved = np.c_[at + 3 / focal * normal, np.ones(50)]
+    np.testing.assert_allclose(focal * epipolar_distance(rays[0], moved, *poses), 3.0, rtol=1e-6)
 
 
 def test_unregistered_nights_count_in_the_shares():
@@ -198,7 +228,10 @@ def test_unregistered_nights_count_in_the_shares():
     assert (got["day_registered"], got["day_images"]) == (12, 16)
     assert got["within"]["0.1; 1 deg"] == 0.25 == got["within"]["20; 10 deg"]
     assert got["sorted_positions"] == [0.05, 0.05]
-    assert got["not_evaluated"] == 1
+    assert got["not_evaluated"] == 1 and got["correct"] is None
+    counts = [{"matches": 5, "correct": 2}, {"matches": 3, "correct": 3}, {}, {}]
+    counted = summary([row | count for row, count in zip(rows, counts, strict=True)])
+    assert (counted["matches"], counted["correct"]) == (8, 5)
     unknown = {"registered": True, "has_truth": False, "day_registered": 3, "day_images": 4}
     assert summary([*rows, unknown])["within"] == got["within"]
     assert summary([unknown])["within"] is None and summary([])["within"] is None
@@ -217,6 +250,7 @@ def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
         assert rows[method]["night_registered"] == 1 and rows[method]["day_registered"] == 4
         assert rows[method]["within"]["0.5; 10 deg"] == 1
     assert rows["default"]["within"]["0.1; 1 deg"] == 1
+    assert rows["default"]["correct"] > 0.5 * rows["default"]["matches"] > 50
     assert "published" in capsys.readouterr().out
 
 

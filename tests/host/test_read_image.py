@@ -75,16 +75,26 @@ def test_every_format_becomes_8_bit_rgb_of_the_same_levels(tmp_path, name):
     assert np.abs(got[inner].astype(int) - want[inner]).max() <= tolerance
 
 
-@pytest.mark.parametrize("max_size", [333, 500, 1000, 5000])
-def test_a_point_maps_to_itself_through_the_reduction(tmp_path, max_size):
+@pytest.mark.parametrize(
+    ("max_size", "enlarge", "longer"),
+    [
+        (333, 1.0, 333),
+        (500, 2.0, 500),
+        (1000, 1.0, 1000),
+        (5000, 1.0, 1000),
+        (5000, 2.0, 2000),
+        (1300, 2.0, 1300),
+    ],
+)
+def test_a_point_maps_to_itself_through_the_resizing(tmp_path, max_size, enlarge, longer):
     height, width, point = 700, 1000, np.asarray([611.3, 248.8])
     y, x = np.mgrid[:height, :width]
     blob = np.exp(-((x - point[0]) ** 2 + (y - point[1]) ** 2) / (2 * 20.0**2))
     grey = np.round(255 * blob).astype(np.uint8)
     image = inspect_image(write_png(tmp_path / "a.png", np.dstack([grey] * 3)))
-    working = read_image(image, max_size=max_size)
+    working = read_image(image, max_size=max_size, enlarge=enlarge)
     small = working.rgb[..., 1].astype(float)
-    assert max(small.shape) == min(max_size, width)  # never enlarged
+    assert max(small.shape) == longer
     ys, xs = np.mgrid[: small.shape[0], : small.shape[1]]
     centroid = np.asarray([(xs * small).sum(), (ys * small).sum()]) / small.sum()
     back = (centroid + 0.5) * working.scale - 0.5
