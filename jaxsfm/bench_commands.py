@@ -129,7 +129,8 @@ def wxbs(
       root: Folder of the categories: CATEGORY/NAME/{01,02}.png, corrs.txt.
       sets: CATEGORY or CATEGORY/NAME, by commas or blanks; default: all.
       methods: By commas or blanks: rootsift, paper, grid (the default preset at cell centres),
-        default, robust.
+        default, robust, and either of these without one idea: default-no-IDEA (octaves, centring,
+        consensus, competition; robust-no-enlarging too).
       seeds: Runs of each method, with seeds 0, 1, ...
       max_size: Longer side of our working images, pixels; default: the preset's.
       json: Write all figures here.
@@ -216,7 +217,7 @@ def daynight(
         to a synthetic night one after the other), or Aachen Day-Night.
       sets: Which scenes, by commas or blanks; default: all.
       methods: By commas or blanks: rootsift, paper-grid and paper (the paper's method at cell
-        centres and relocalized), default, robust.
+        centres and relocalized), default, robust; ablations as in `bench wxbs`.
       severity: Of the synthetic night: 0: day, 1: clean, 2: noisy, 3: dark, 5: noise.
       denoise: Whether the synthetic night's camera removes noise.
       jpeg: Whether it stores JPEG.

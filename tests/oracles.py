@@ -128,8 +128,8 @@ def transfer(h: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return p[:, :2] / p[:, 2:]
 
 
-def join_octaves(levels: list[np.ndarray], grid: np.ndarray) -> np.ndarray:
-    """Bilinear values of each octave at the first one's cell centres, side by side, unit."""
+def join_octaves(levels: list[np.ndarray], grid: np.ndarray, weight: float) -> np.ndarray:
+    """Bilinear values of each octave at the first one's cells, weighted, side by side, unit."""
 
     def normal(x):
         return x / np.linalg.norm(x) if x.any() else x
@@ -151,6 +151,6 @@ def join_octaves(levels: list[np.ndarray], grid: np.ndarray) -> np.ndarray:
                         if w and rows and cols:
                             at = min(max(r, 0), rows - 1) * cols + min(max(c, 0), cols - 1)
                             total += w * x[at]
-                parts.append(normal(total))
+                parts.append(weight ** (k / 2) * normal(total))
             result[cell] = normal(np.concatenate(parts)) if len(parts) > 1 else parts[0]
     return result

@@ -18,22 +18,48 @@ Keep = Callable[[dict[str, Any]], None]
 """Takes the figures so far, after every row: nothing measured is lost."""
 
 
+def _with_pair(config: Config, **changes: int) -> Config:
+    return dataclasses.replace(config, pair=dataclasses.replace(config.pair, **changes))
+
+
+ABLATIONS: dict[str, Callable[[Config], Config]] = {
+    "no-octaves": lambda c: dataclasses.replace(c, octaves=1),
+    "no-centring": lambda c: dataclasses.replace(c, centred=False),
+    "no-enlarging": lambda c: dataclasses.replace(c, enlarge=1.0),
+    "no-consensus": lambda c: _with_pair(c, consensus=0),
+    "no-competition": lambda c: _with_pair(c, plane_rounds=0),
+}
+"""One idea left out of a preset: METHOD-no-IDEA."""
+ABLATED = tuple(
+    f"{name}-{idea}"
+    for name in ("default", "robust")
+    for idea, without in ABLATIONS.items()
+    if without(preset(name)) != preset(name)
+)
+
+
 def method_config(method: str, *, max_size: int | None = None) -> Config:
-    """A preset by its name; paper-grid: paper at cell centres; grid and reloc: the default preset
-    without refinement, at cell centres or relocalized.
+    """A preset by its name; PRESET-no-IDEA: without that idea (`ABLATIONS`); paper-grid: paper at
+    cell centres; grid and reloc: the default preset without refinement, at cell centres or
+    relocalized.
 
     Args:
       max_size: longer side of the working images, pixels; None: the preset's.
     """
     if method in PRESETS:
         config = preset(method)
+    elif method in ABLATED:
+        name, _, idea = method.partition("-")
+        config = ABLATIONS[idea](preset(name))
     elif method == "paper-grid":
         config = dataclasses.replace(preset("paper"), keypoints="grid")
     elif method in ("grid", "reloc"):
         keypoints: Keypoints = "grid" if method == "grid" else "relocalized"
         config = dataclasses.replace(preset("default"), refinement=None, keypoints=keypoints)
     else:
-        raise ValueError(f"method must be a preset, paper-grid, grid or reloc; got {method!r}")
+        raise ValueError(
+            f"method must be a preset, PRESET-no-IDEA, paper-grid, grid or reloc; got {method!r}"
+        )
     return config if max_size is None else dataclasses.replace(config, max_size=max_size)
 
 

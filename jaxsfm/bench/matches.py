@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.common import method_config, versions
+from jaxsfm.bench.common import ABLATED, method_config, versions
 from jaxsfm.config import Config
 from jaxsfm.host.features import ImageFeatures, image_features
 from jaxsfm.host.images import ImageFile
@@ -17,7 +17,7 @@ from jaxsfm.host.rootsift import read_matches, write_rootsift_database
 from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.pipeline import match_features, on_device
 
-PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust")
+PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust", *ABLATED)
 FEATURES = 8
 """Features held: of two images, as four methods want them."""
 

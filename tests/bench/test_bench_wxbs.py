@@ -1,5 +1,6 @@
 """`bench wxbs`: the measure's laws, and a run on a rendered pair."""
 
+import dataclasses
 import itertools
 import json
 import shutil
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 from strategies import rng_of
 
+from jaxsfm.bench.common import ABLATED, method_config
 from jaxsfm.bench.wxbs import mean_average_accuracy, means, symmetric_epipolar_error
 from jaxsfm.cli import main
+from jaxsfm.config import preset
 from jaxsfm.host.poses import read_poses
 from jaxsfm.host.two_view import fundamental_matrix, homography
 
@@ -169,3 +172,12 @@ def test_reference_means_of_seeds_hold_their_bounds():
     for scores in itertools.product([0.0, 0.5, 1.0], repeat=2):
         figure = means([{"category": "A", "method": "m", "scores": list(scores)}])["m"]["all"]
         assert figure["min"] <= figure["mean"] <= figure["max"]
+
+
+def test_an_ablation_leaves_out_one_idea():
+    assert method_config("robust-no-octaves") == dataclasses.replace(preset("robust"), octaves=1)
+    changed = method_config("default-no-consensus")
+    assert changed.pair.consensus == 0 and changed != preset("default")
+    assert len(set(map(method_config, ABLATED))) == len(ABLATED) == 9
+    with pytest.raises(ValueError, match="default-no-enlarging"):
+        method_config("default-no-enlarging")  # default does not enlarge

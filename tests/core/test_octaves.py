@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from strategies import rng_of, seeds
 
 from jaxsfm.config import Config, preset
-from jaxsfm.core.octaves import halve, join_octaves
+from jaxsfm.core.octaves import OCTAVE_WEIGHT, halve, join_octaves
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.host.features import compute_features, pad_features
 from jaxsfm.host.images import WorkingImage
@@ -50,22 +50,24 @@ def test_joining_equals_interpolating_cell_by_cell(seed, shape, octaves):
         (joined.coarse, features.coarse, features.coarse_grid),
         (joined.fine, features.fine, features.fine_grid),
     ):
-        expected = oracles.join_octaves([np.asarray(x) for x in levels], np.asarray(grid))
+        expected = oracles.join_octaves(
+            [np.asarray(x) for x in levels], np.asarray(grid), OCTAVE_WEIGHT
+        )
         np.testing.assert_allclose(ours, expected, **tolerances.UNIT)
 
 
 @settings(max_examples=20, deadline=None)
 @given(seeds, st.sampled_from(SHAPES))
-def test_products_are_means_over_the_octaves(seed, shape):
+def test_products_are_weighted_means_over_the_octaves(seed, shape):
     features = random_features(seed, shape, 3)
     joined = np.asarray(join(features).coarse)
     n = joined.shape[0]
     alive = joined.any(1)
     parts = joined.reshape(n, 3, -1)[alive]
     norms = np.linalg.norm(parts, axis=2, keepdims=True)
-    present = norms > 0
-    weight = np.sqrt(1 / present.sum(1, keepdims=True))
-    np.testing.assert_allclose(norms, np.where(present, weight, 0), **tolerances.UNIT)
+    weight = np.where(norms > 0, OCTAVE_WEIGHT ** np.arange(3.0)[None, :, None], 0)
+    share = np.sqrt(weight / weight.sum(1, keepdims=True))
+    np.testing.assert_allclose(norms, share, **tolerances.UNIT)
 
 
 def test_one_octave_is_left_as_it_is():
