@@ -78,9 +78,9 @@ def reconstruct(
     Args:
       images: Folder with the photos; sub-folders are included.
       out: Folder for the results; a run that was interrupted goes on there.
-      preset: paper: the constants of the authors' code. default: iterated refits, the most
-        similar of several matches, view graph, two passes of refinement. robust: default, and
-        neighbouring cells vote for each other (night, seasons, weather).
+      preset: paper: the constants of the authors' code. default: octaves, centred descriptors and
+        neighbourhood consensus (night, seasons, weather), better planes, view graph, two passes of
+        refinement. robust: default, and photos below max-size enlarged up to twice.
       intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
         model, COLMAP's pixels) for all photos; without it one camera per photo.
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.

@@ -175,10 +175,11 @@ PRESETS: dict[str, Config] = {
     "default": _DEFAULT,
     "robust": dataclasses.replace(_DEFAULT, enlarge=2.0),
 }
-"""`paper`: the constants of the authors' code. `default`: local refits iterated (one refit leaves
-up to a fifth of a plane's inliers behind, tests/core/test_ransac.py), the most similar of a cell's
-several matches, the view graph and the refinement. `robust`: default with neighbourhood consensus,
-for night, seasons and weather; a pair takes about 1.5 times as long."""
+"""`paper`: the constants of the authors' code. `default`: octaves, centred descriptors and
+neighbourhood consensus (night, seasons, weather), local refits iterated (one refit leaves up to a
+fifth of a plane's inliers behind, tests/core/test_ransac.py), planes that compete, the most similar
+of a cell's several matches, the view graph and the refinement. `robust`: default, and small images
+enlarged up to twice; they then take as long as large ones."""
 
 
 def preset(name: str) -> Config:

@@ -33,7 +33,7 @@ METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", *ABLATED)
 """paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has
 corners of cells and 80 px.)"""
 FEATURES = 64
-"""Photos whose features are held, or as many as a subset has: 38 MB each at 1536 x 1024."""
+"""Photos whose features are held, or as many as a subset has: 50 MB each at 1536 x 1024."""
 LIMITS = ((0.1, 1.0), (0.5, 10.0), (1.0, 10.0), (5.0, 10.0), (10.0, 10.0), (20.0, 10.0))
 """Distance (the reference's units; metres for Strecha and Aachen) and degrees."""
 PUBLISHED = (
