@@ -125,6 +125,12 @@ def compose(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 3
     return jnp.matmul(a, b, precision=HIGHEST)
 
 
+def _image_of(h: Float[Array, "*b 3 3"], xy0: Float[Array, "k 2"]) -> list[Array]:
+    """h (x, y, 1), its three coordinates (*b, k) apart; elementwise, precise on every backend."""
+    m, x, y = h[..., None], xy0[:, 0], xy0[:, 1]
+    return [m[..., i, 0, :] * x + m[..., i, 1, :] * y + m[..., i, 2, :] for i in range(3)]
+
+
 def transfer_inliers(
     h: Float[Array, "*b 3 3"],
     xy0: Float[Array, "k 2"],
@@ -135,11 +141,8 @@ def transfer_inliers(
 
     One-way: the distance is measured in image 1. Without division: both sides times w.
     """
-    x, y = xy0[:, 0], xy0[:, 1]
-    m = h[..., None]
-    w = m[..., 2, 0, :] * x + m[..., 2, 1, :] * y + m[..., 2, 2, :]
-    du = m[..., 0, 0, :] * x + m[..., 0, 1, :] * y + m[..., 0, 2, :] - w * xy1[:, 0]
-    dv = m[..., 1, 0, :] * x + m[..., 1, 1, :] * y + m[..., 1, 2, :] - w * xy1[:, 1]
+    u, v, w = _image_of(h, xy0)
+    du, dv = u - w * xy1[:, 0], v - w * xy1[:, 1]
     reach = threshold * w
     return (du * du + dv * dv < reach * reach) & (w > 0)
 
@@ -148,9 +151,7 @@ def transfer_error(
     h: Float[Array, "*b 3 3"], xy0: Float[Array, "k 2"], xy1: Float[Array, "k 2"]
 ) -> Float[Array, "*b k"]:
     """|xy1 - h xy0|^2; infinite behind the camera."""
-    m = h[..., None]
-    x, y = xy0[:, 0], xy0[:, 1]
-    u, v, w = (m[..., i, 0, :] * x + m[..., i, 1, :] * y + m[..., i, 2, :] for i in range(3))
+    u, v, w = _image_of(h, xy0)
     safe = jnp.where(w > 0, w, 1.0)
     square = (u / safe - xy1[:, 0]) ** 2 + (v / safe - xy1[:, 1]) ** 2
     return jnp.where(w > 0, square, jnp.inf)
