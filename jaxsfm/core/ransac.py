@@ -156,6 +156,7 @@ def peel_planes(
     """Up to `max_planes` homographies, each on the correspondences the earlier ones left.
 
     Stops at the first with fewer than `min_inliers` inliers (paper, section 3.3; authors' code).
+    With `plane_rounds` they then compete for the correspondences (`jaxsfm.core.planes`).
 
     Args:
       key: the pair's key.

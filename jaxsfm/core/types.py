@@ -82,7 +82,7 @@ class Planes(NamedTuple):
     homographies: Float[Array, "p 3 3"]
     """Image 0 to image 1, pixels, Frobenius norm 1; zero where there is no plane."""
     num_inliers: Int[Array, " p"]
-    """Members when the plane was peeled; 0 where there is no plane."""
+    """Members of each plane; 0 where there is no plane."""
     num_hypotheses: Int[Array, " p"]
     """Minimal samples that were scored."""
     plane: Int[Array, " k"]
