@@ -108,7 +108,7 @@ def match_features(
     room = max(dense.coarse[0].shape[0] for dense in sides)
     widest = max(int(dense.coarse_grid[1]) for dense in sides)
     shape = config.pair
-    if widest > shape.coarse_columns:
+    if shape.consensus and widest > shape.coarse_columns:
         shape = dataclasses.replace(shape, coarse_columns=-(-widest // 64) * 64)
     key = pair_key(jax.random.key(seed), features0.image.identity, features1.image.identity)
     found = match_pair(

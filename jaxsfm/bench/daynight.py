@@ -181,7 +181,7 @@ def bench_daynight(
     root: Path,
     *,
     sets: Sequence[str] | None = None,
-    methods: Sequence[str] = METHODS,
+    methods: Sequence[str] = METHODS[:5],
     severity: float = 2.0,
     denoise: bool = True,
     jpeg: bool = True,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.bench.scenes import Scene, Subset
-from jaxsfm.host.colmap import rays_of, read_verified
+from jaxsfm.host.colmap import rays_of, read_matches
 from jaxsfm.host.poses import CameraPose
 
 CORRECT_PX = 4.0
@@ -54,7 +54,7 @@ def night_matches(database: Path, scene: Scene, subset: Subset) -> NightMatches 
         if name not in scene.truth:
             continue
         day = scene.camera.camera(scene.images[name].size)
-        xy0, xy1 = read_verified(database, (name, subset.night))
+        xy0, xy1 = read_matches(database, (name, subset.night), verified=True)
         if not len(xy0):
             continue
         far = night.mean_focal_length() * epipolar_distance(

@@ -227,18 +227,25 @@ def read_two_views(path: Path) -> dict[Pair, TwoView]:
         return found
 
 
-def read_verified(path: Path, names: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
-    """A pair's two-view inliers, float64 (n, 2) each, centre of the top-left pixel (0, 0).
+def read_matches(
+    path: Path, names: tuple[str, str], *, verified: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """A pair's matches, float64 (n, 2) each, centre of the top-left pixel (0, 0).
 
     Args:
       names: of the two images, in the order wanted.
+      verified: the two-view inliers; else the matches before verification.
     """
     with pycolmap.Database.open(path) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         a, b = ids[names[0]], ids[names[1]]
-        if not db.exists_two_view_geometry(a, b):
-            return np.zeros((0, 2)), np.zeros((0, 2))
-        rows = np.asarray(db.read_two_view_geometry(a, b).inlier_matches).reshape(-1, 2)
+        if not verified:
+            matches = db.read_matches(a, b)
+        elif db.exists_two_view_geometry(a, b):
+            matches = db.read_two_view_geometry(a, b).inlier_matches
+        else:
+            matches = []
+        rows = np.asarray(matches).reshape(-1, 2).astype(np.int64)
         xy = [np.asarray(db.read_keypoints(i), np.float64)[:, :2] - PIXEL_OFFSET for i in (a, b)]
     return xy[0][rows[:, 0]], xy[1][rows[:, 1]]
 

@@ -5,11 +5,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
-import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.colmap import PIXEL_OFFSET
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.native import native
@@ -85,18 +83,3 @@ def write_rootsift_database(
         there = {image.name for image in db.read_all_images()}
     if lost := sorted({image.name for image in images} - there):
         raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, so not for RootSIFT")
-
-
-def read_matches(path: Path, names: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
-    """A pair's matches before verification, float64 (n, 2) each, centre of the top-left pixel
-    (0, 0).
-
-    Args:
-      names: of the two images, in the order wanted.
-    """
-    with pycolmap.Database.open(path) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        a, b = ids[names[0]], ids[names[1]]
-        xy = [np.asarray(db.read_keypoints(i), np.float64)[:, :2] - PIXEL_OFFSET for i in (a, b)]
-        rows = np.asarray(db.read_matches(a, b)).reshape(-1, 2).astype(np.int64)
-    return xy[0][rows[:, 0]], xy[1][rows[:, 1]]
