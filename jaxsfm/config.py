@@ -90,6 +90,11 @@ class Refinement:
     """Nor views that see the surface at an area scale this far from the reference view's."""
     neighbours: int = 16
     """3-D points that give a point its surface normal."""
+    weak_octaves: int = 4
+    """Sizes (working size, half of it, ...) at which views are placed that have too little to
+    align, as a night among days (`jaxsfm.weak_views`); 0: they keep what the mapper gave them."""
+    weak_min_score: float = 0.6
+    """`min_score` in those views."""
 
     def __post_init__(self) -> None:
         for name in ("passes", "radius", "iterations", "neighbours"):
@@ -98,7 +103,11 @@ class Refinement:
         for name in ("max_sigma_px", "max_shift_px", "max_error_px", "max_stretch"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"Refinement.{name} must be positive; got {getattr(self, name)}")
-        for name in ("min_score", "min_cosine"):
+        if not 0 <= self.weak_octaves <= MAX_OCTAVES:
+            raise ValueError(
+                f"Refinement.weak_octaves must lie in 0..{MAX_OCTAVES}; got {self.weak_octaves}"
+            )
+        for name in ("min_score", "min_cosine", "weak_min_score"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"Refinement.{name} must lie in [0, 1); got {getattr(self, name)}")
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from jaxsfm.host.intrinsics import Intrinsics
     from jaxsfm.host.mapping import Attempt, MapOptions
-    from jaxsfm.refine import PassFigures
+    from jaxsfm.refine import RefinementFigures
 
 LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
 """Intensity of an RGB pixel (ITU-R BT.601)."""
@@ -183,8 +183,8 @@ class Reconstructed:
     """COLMAP's two-view inliers, by pair that has any."""
     attempts: "list[Attempt]"
     """Runs of the mapper."""
-    passes: "list[list[PassFigures]]"
-    """Of the refinement, per model."""
+    refinement: "list[RefinementFigures | None]"
+    """Per model; None where it was not refined."""
 
 
 def reconstruct(
@@ -246,9 +246,9 @@ def reconstruct(
         working = read_image(by_name[name], max_size=config.max_size, enlarge=config.enlarge)
         return working.rgb, working.scale
 
-    passes = []
+    figures: list[RefinementFigures | None] = [None] * len(models)
     if config.refinement is not None:
-        models, passes = _refine(models, read, config.refinement, options, on_pass)
+        models, figures = _refine(models, read, config.refinement, options, on_pass)
     for model in models:
         colmap.colour_points(model, read)
     return Reconstructed(
@@ -256,7 +256,7 @@ def reconstruct(
         verdicts=verdicts,
         verified=verified,
         attempts=attempts,
-        passes=passes,
+        refinement=figures,
     )
 
 
@@ -266,7 +266,7 @@ def _refine(
     config: Refinement,
     options: "MapOptions",
     on_pass: Callable[[], None],
-) -> "tuple[list[pycolmap.Reconstruction], list[list[PassFigures]]]":
+) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
     from jaxsfm.refine import refine_model
 
     @functools.lru_cache(maxsize=GRAYS)
@@ -274,10 +274,10 @@ def _refine(
         rgb, scale = read(name)
         return rgb.astype(np.float32) @ LUMA, scale
 
-    refined, passes = [], []
+    refined, figures = [], []
     for model in models:
         try:
-            new, figures = refine_model(
+            new, done = refine_model(
                 model,
                 gray,
                 config=config,
@@ -287,7 +287,7 @@ def _refine(
             )
         except ImageError as error:  # a photo went away since; the mapper's model is there
             logger.warning("no refinement: %s", error)
-            new, figures = model, []
+            new, done = model, None
         refined.append(new)
-        passes.append(figures)
-    return refined, passes
+        figures.append(done)
+    return refined, figures

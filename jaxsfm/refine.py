@@ -3,7 +3,8 @@ reference patch, new observations are added where the point projects into a view
 does not agree is dropped, then bundle adjustment and filtering; repeated.
 
 The reference keypoint stays where it is: it *is* the point. So relocalization's spread over views
-(1-2 px) goes, and tracks reach across every view that shows the surface.
+(1-2 px) goes, and tracks reach across every view that shows the surface. Views that show too little
+to be aligned so are placed at the end, on the structure of the others (`jaxsfm.weak_views`).
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ import numpy as np
 
 from jaxsfm.config import Refinement
 from jaxsfm.host.model import (
+    Sizes,
     Tracks,
     View,
     build_model,
@@ -23,6 +25,7 @@ from jaxsfm.host.model import (
     select,
 )
 from jaxsfm.track_alignment import AlignedBlock, ReadGray, align_blocks
+from jaxsfm.weak_views import Placed, place_weak_views
 
 if TYPE_CHECKING:
     import pycolmap
@@ -48,11 +51,20 @@ class PassFigures:
     dropped: int
     added: int
     weak_views: list[str]
-    """Images that kept their old observations, because too few agreed."""
+    """Images that kept their old observations in this pass, because too few agreed."""
     points: int
     """After the pass."""
     reprojection_error_px: float
     """Mean over the points, original pixels."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RefinementFigures:
+    """What the refinement of a model did."""
+
+    passes: list[PassFigures]
+    placed: list[Placed]
+    """The weak views of the last pass."""
 
 
 def _gather(
@@ -95,12 +107,12 @@ def refine_model(
     refine_intrinsics: bool,
     threads: int = -1,
     on_pass: Callable[[], None] = lambda: None,
-) -> "tuple[pycolmap.Reconstruction, list[PassFigures]]":
-    """A refined model, and what each pass did.
+) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
+    """A refined model, and what was done.
 
     Thresholds are in pixels of the working images. The model keeps all its images: one where too
-    little agrees keeps its old observations, at four times the error limit. A pass that would lose
-    most of the points is taken back.
+    little agrees keeps its old observations, at four times the error limit, until it is placed on
+    the refined structure. A pass that would lose most of the points is taken back.
 
     Args:
       model: from the mapper; not changed.
@@ -145,7 +157,17 @@ def refine_model(
         on_pass()
         if not accepted:
             break
-    return model, figures
+    placed: list[Placed] = []
+    if figures and figures[-1].weak_views:
+        model, placed = place_weak_views(
+            model,
+            figures[-1].weak_views,
+            read,
+            sizes,
+            config=config,
+            refine_intrinsics=refine_intrinsics,
+        )
+    return model, RefinementFigures(passes=figures, placed=placed)
 
 
 def _adjust(
@@ -153,7 +175,7 @@ def _adjust(
     views: list[View],
     tracks: Tracks,
     weak: np.ndarray,
-    sizes: dict[str, tuple[tuple[int, int], tuple[float, float]]],
+    sizes: Sizes,
     config: Refinement,
     refine_intrinsics: bool,
     threads: int,

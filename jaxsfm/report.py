@@ -117,16 +117,22 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
     if len(attempts) > 1:
         tries = ", ".join(str(max(a["registered"], default=0)) for a in attempts)
         lines.append(f"mapping          started {len(attempts)} times, images registered: {tries}")
-    if report["refinement"] and report["refinement"][0]:
-        last = report["refinement"][0][-1]
+    refinement = report["refinement"][0] if report["refinement"] else None
+    if refinement and refinement["passes"]:
+        last = refinement["passes"][-1]
         lines.append(
             f"refinement       {last['kept']} observations agreed, {last['dropped']} dropped, "
-            f"{last['added']} added in the last of {len(report['refinement'][0])} passes"
+            f"{last['added']} added in the last of {len(refinement['passes'])} passes"
             + ("" if last["accepted"] else "; too few, taken back")
         )
-        if last["weak_views"]:
-            names = ", ".join(shown_name(name) for name in last["weak_views"])
-            lines.append(f"not refined      {names}: too few observations agree; the old ones stay")
+        for at in refinement["placed"]:
+            name, px = shown_name(at["name"]), at["octave_px"]
+            lines.append(
+                f"placed           {name}: {at['agreed']} points agree at "
+                f"{'full' if px == 1 else f'1/{px}'} size, {at['error_px']:.1f} px"
+                if px
+                else f"not refined      {name}: too few points agree; the old observations stay"
+            )
     seconds = report["seconds"]
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in seconds.items()))
     if pairs["overflowed"]:

@@ -127,7 +127,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 },
                 "models": figures,
                 "mapping": [dataclasses.asdict(attempt) for attempt in made.attempts],
-                "refinement": [[dataclasses.asdict(p) for p in each] for each in made.passes],
+                "refinement": [each and dataclasses.asdict(each) for each in made.refinement],
                 "lost": lost_images(
                     [image.name for image in good],
                     figures[0]["images"] if figures else [],

@@ -2,6 +2,7 @@
 patch maps from one view to another. Pure functions of numpy arrays.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -115,10 +116,12 @@ def candidates(
     margin: float,
     min_cosine: float,
     max_stretch: float,
+    targets: Sequence[int] | None = None,
 ) -> Candidates:
     """The observations of every track, and the views that could see its point beside them.
 
     Args:
+      targets: only these views.
       points: on the reference rays.
       reference, xy: the reference view of every point, and its keypoint there.
       margin: pixels to the border of the view.
@@ -126,7 +129,8 @@ def candidates(
     every = np.arange(len(points))
     own_scale = seen.log_scale[every, reference]
     parts = []
-    for k, view in enumerate(views):
+    for k in range(len(views)) if targets is None else targets:
+        view = views[k]
         at, _ = view.project(points)
         with np.errstate(invalid="ignore"):
             inside = (at >= margin).all(1) & (at <= np.asarray(view.size) - 1 - margin).all(1)

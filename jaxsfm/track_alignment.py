@@ -2,7 +2,7 @@
 their reference patches, block by block of points.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -63,11 +63,12 @@ def _chunks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
 def _templates(
     reference: np.ndarray,
     xy: np.ndarray,
+    wanted: np.ndarray,
     views: list[View],
     read: ReadGray,
     patch: align_core.Patch,
 ) -> align_core.Templates:
-    """Templates of all points, one view's image in memory at a time."""
+    """Templates of the wanted points, one view's image in memory at a time."""
     n, q = len(reference), len(patch.weights)
     store = [
         np.zeros((n, q, 1), np.float32),
@@ -76,9 +77,9 @@ def _templates(
         np.zeros(n, np.float32),
         np.zeros(n, bool),
     ]
-    for k in np.unique(reference):
+    for k in np.unique(reference[wanted]):
         image, size = _padded(read(views[k].name)[0])
-        for piece, count in _chunks(np.flatnonzero(reference == k)):
+        for piece, count in _chunks(wanted[reference[wanted] == k]):
             made = align_core.make_templates(
                 image,  # pyright: ignore[reportArgumentType]
                 size,  # pyright: ignore[reportArgumentType]
@@ -129,9 +130,20 @@ def _align(
 
 
 def align_blocks(
-    tracks: Tracks, views: list[View], read: ReadGray, config: Refinement, max_shift_px: float
+    tracks: Tracks,
+    views: list[View],
+    read: ReadGray,
+    config: Refinement,
+    max_shift_px: float,
+    *,
+    targets: Sequence[int] | None = None,
 ) -> Iterator[AlignedBlock]:
-    """Align every point's observations, so many points at a time that memory stays bounded."""
+    """Align every point's observations, so many points at a time that memory stays bounded.
+
+    Args:
+      tracks: every point has an observation.
+      targets: only observations in these views.
+    """
     normal = surface.normals(tracks, views, neighbours=config.neighbours)
     patch = align_core.square_patch(config.radius)
     step = max(MIN_BLOCK, min(CELLS // len(views), MAX_BLOCK))
@@ -157,8 +169,9 @@ def align_blocks(
             margin=config.radius + 2,
             min_cosine=config.min_cosine,
             max_stretch=config.max_stretch,
+            targets=targets,
         )
-        templates = _templates(reference, xy, views, read, patch)
+        templates = _templates(reference, xy, np.unique(found.point), views, read, patch)
         moved, agrees = _align(found, templates, views, read, patch, config, max_shift_px)
         tracked = seen.tracked[found.point, found.view]
         yield AlignedBlock(rows, points, reference, xy, found, moved, agrees, tracked)

@@ -43,6 +43,14 @@ def photos() -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="session")
+def rendered():
+    """See `room_scene.Room`."""
+    from room_scene import rendered_room
+
+    return rendered_room()
+
+
+@pytest.fixture(scope="session")
 def scene(tmp_path_factory) -> Path:
     """Three small views of the room, the middle one at night; K.txt and reference beside them."""
     folder = tmp_path_factory.mktemp("scene")

@@ -418,7 +418,7 @@ def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(
 
     monkeypatch.setattr(jaxsfm.refine, "refine_model", gone)
     report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
-    assert report["models"][0]["registered"] == 3 and report["refinement"] == [[]]
+    assert report["models"][0]["registered"] == 3 and report["refinement"] == [None]
     assert "no refinement: view1.png" in capfd.readouterr().err
 
 

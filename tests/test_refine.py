@@ -1,160 +1,29 @@
 """Multi-view refinement against exact cameras, planes and pixels of a rendered room."""
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 import pytest
+from room_scene import (
+    SIZE,
+    errors,
+    exact_tracks,
+    hidden,
+    noisy_model,
+    other_scene,
+    refine,
+    sizes,
+    template,
+    view_of,
+)
 
 from jaxsfm import surface
 from jaxsfm.config import Refinement
 from jaxsfm.evaluation import evaluate
-from jaxsfm.host.model import Tracks, View, build_model, bundle_adjust, read_model_arrays
-from jaxsfm.host.poses import CameraPose, model_poses
-from jaxsfm.refine import refine_model
-from jaxsfm.synthetic import arc, camera_matrix, render, room
-
-SIZE = (480, 360)
-
-
-class Room(NamedTuple):
-    views: list[View]
-    images: dict[str, np.ndarray]
-    """Intensities by name."""
-    poses: dict[str, CameraPose]
-    points: np.ndarray
-    plane: np.ndarray
-    """Which plane each point lies on."""
-    normals: np.ndarray
-    visible: np.ndarray
-    """bool (points, views)."""
-
-
-def camera(size=SIZE) -> pycolmap.Camera:
-    k = camera_matrix(size)
-    params = [k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5]
-    return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
-
-
-def view_of(pose: CameraPose, number: int) -> View:
-    return View(
-        image_id=number + 1,
-        name=f"{number}.png",
-        rotation=pose.rotation,
-        centre=pose.centre,
-        camera=camera(),
-        scale=np.ones(2),
-        size=SIZE,
-    )
-
-
-def hidden(points, own, centre, planes) -> np.ndarray:
-    """Whether another plane lies between a camera and each point."""
-    ray = points - centre
-    covered = np.zeros(len(points), bool)
-    for k, plane in enumerate(planes):
-        normal = np.cross(plane.right, plane.down)
-        depth = ((plane.corner - centre) @ normal) / (ray @ normal)
-        offset = centre + depth[:, None] * ray - plane.corner
-        a = offset @ plane.right / (plane.right @ plane.right)
-        b = offset @ plane.down / (plane.down @ plane.down)
-        inside = (a > -0.02) & (a < 1.02) & (b > -0.02) & (b < 1.02)
-        covered |= inside & (depth > 0) & (depth < 0.99) & (own != k)
-    return covered
-
-
-@pytest.fixture(scope="module")
-def rendered() -> Room:
-    rng = np.random.default_rng(0)
-    planes, poses = room(), arc(5)
-    points, plane, normals = [], [], []
-    for k, p in enumerate(planes):
-        st = rng.uniform(0.03, 0.97, (250, 2))
-        points.append(p.corner + st[:, :1] * p.right + st[:, 1:] * p.down)
-        plane += [k] * len(st)
-        normal = np.cross(p.right, p.down)
-        normals += [normal / np.linalg.norm(normal)] * len(st)
-    points, plane = np.concatenate(points), np.asarray(plane)
-    views = [view_of(pose, k) for k, pose in enumerate(poses)]
-    visible = np.zeros((len(points), len(views)), bool)
-    images = {}
-    for k, view in enumerate(views):
-        xy, depth = view.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (xy > 1).all(1) & (xy < np.asarray(SIZE) - 2).all(1)
-        visible[:, k] = (depth > 0) & inside & ~hidden(points, plane, view.centre, planes)
-        rgb = render(planes, poses[k], SIZE).astype(np.float32)
-        images[view.name] = rgb @ np.float32([0.299, 0.587, 0.114])
-    keep = visible.sum(1) >= 2
-    return Room(
-        views,
-        images,
-        {view.name: pose for view, pose in zip(views, poses, strict=True)},
-        points[keep],
-        plane[keep],
-        np.asarray(normals)[keep],
-        visible[keep],
-    )
-
-
-def exact_tracks(scene: Room, *, use=None) -> Tracks:
-    point, view = np.nonzero(scene.visible if use is None else use)
-    xy = np.asarray(
-        [
-            scene.views[v].project(scene.points[p : p + 1])[0][0]
-            for p, v in zip(point, view, strict=True)
-        ]
-    )
-    return Tracks(scene.points, point, view, xy)
-
-
-def noisy_model(scene: Room, sigma: float, *, use=None) -> pycolmap.Reconstruction:
-    """Every observation (but none of the truth) moved by noise, then bundle adjusted."""
-    tracks = exact_tracks(scene, use=use)
-    rng = np.random.default_rng(1)
-    tracks = tracks._replace(xy=tracks.xy + rng.normal(0, sigma, tracks.xy.shape))
-    model = build_model(template(scene), scene.views, tracks)
-    if sigma:
-        bundle_adjust(model, loss_px=1.0, refine_intrinsics=False, threads=1)
-    return model
-
-
-def template(scene: Room) -> pycolmap.Reconstruction:
-    """Cameras and poses alone."""
-    model = pycolmap.Reconstruction()
-    known = camera()
-    known.camera_id = 1
-    model.add_camera_with_trivial_rig(known)
-    for view in scene.views:
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view.rotation), -view.rotation @ view.centre)
-        image = pycolmap.Image(name=view.name, camera_id=1, image_id=view.image_id)
-        model.add_image_with_trivial_frame(image, pose)
-    return model
-
-
-def read_of(scene: Room, change=lambda image: image):
-    return lambda name: (change(scene.images[name]), (1.0, 1.0))
-
-
-def errors(model, scene: Room) -> tuple[float, float]:
-    e = evaluate(model_poses(model), scene.poses)
-    return e.position["mean"], e.rotation_deg["mean"]
-
-
-def refine(model, scene, change=lambda image: image, **config):
-    return refine_model(
-        model,
-        read_of(scene, change),
-        config=Refinement(**config),
-        refine_intrinsics=False,
-        threads=1,
-    )
-
-
-def sizes(scene: Room):
-    return {view.name: (SIZE, (1.0, 1.0)) for view in scene.views}
-
+from jaxsfm.host.model import build_model, read_model_arrays
+from jaxsfm.host.poses import model_poses
+from jaxsfm.synthetic import arc, camera_matrix, room
 
 # -- the whole refinement --------------------------------------------------------------------------
 
@@ -167,7 +36,7 @@ def test_noisy_keypoints_end_near_the_exact_cameras(rendered):
     assert p1 < p0 / 3 and r1 < r0 / 3
     assert after.compute_mean_reprojection_error() < 0.3
     assert before.compute_mean_reprojection_error() > 0.9  # its own model was not touched
-    assert len(figures) == 2 and figures[0].kept > 0.5 * rendered.visible.sum()
+    assert len(figures.passes) == 2 and figures.passes[0].kept > 0.5 * rendered.visible.sum()
 
 
 def test_gain_and_offset_of_a_view_change_little(rendered):
@@ -186,7 +55,7 @@ def test_lost_observations_come_back_and_hidden_ones_do_not(rendered):
         row[np.flatnonzero(seen)[:2]] = True
     before = noisy_model(rendered, 0.3, use=use)
     after, figures = refine(before, rendered)
-    assert sum(f.added for f in figures) > 500
+    assert sum(f.added for f in figures.passes) > 500
     assert after.compute_mean_track_length() > 1.5 * before.compute_mean_track_length()
     views, tracks = read_model_arrays(after, sizes(rendered))
     # After alignment to the truth every point lies on its plane: find the plane, ask who hides it.
@@ -216,15 +85,9 @@ def test_lost_observations_come_back_and_hidden_ones_do_not(rendered):
 def test_flat_photos_leave_the_model_as_it_was(rendered):
     before = noisy_model(rendered, 1.0)
     after, figures = refine(before, rendered, lambda image: np.full_like(image, 80.0))
-    assert [f.accepted for f in figures] == [False]
+    assert [f.accepted for f in figures.passes] == [False]
     assert errors(after, rendered) == errors(before, rendered)
     assert after.num_points3D() == before.num_points3D()
-
-
-def other_scene(seed: int) -> np.ndarray:
-    """Textured, but nothing of the room."""
-    noise = np.random.default_rng(seed).normal(0, 60, (SIZE[1] // 4, SIZE[0] // 4))
-    return 120 + np.kron(noise, np.ones((4, 4))).astype(np.float32)
 
 
 def test_a_view_that_agrees_with_nothing_keeps_its_observations_and_its_pose(rendered):
@@ -232,7 +95,7 @@ def test_a_view_that_agrees_with_nothing_keeps_its_observations_and_its_pose(ren
     before = noisy_model(rendered, 0.7)
     images = rendered.images | {"2.png": other_scene(0)}
     after, figures = refine(before, rendered._replace(images=images))
-    assert all(f.accepted and f.weak_views == ["2.png"] for f in figures)
+    assert all(f.accepted and f.weak_views == ["2.png"] for f in figures.passes)
     errs = [evaluate(model_poses(m), rendered.poses).images for m in (before, after)]
     assert errs[1]["2.png"].position < 2 * errs[0]["2.png"].position + 0.002
     others = [np.mean([e.position for n, e in es.items() if n != "2.png"]) for es in errs]
@@ -245,7 +108,7 @@ def test_photos_that_agree_in_nothing_leave_the_model_as_it_was(rendered):
     before = noisy_model(rendered, 1.0)
     images = {name: other_scene(k) for k, name in enumerate(rendered.images)}
     after, figures = refine(before, rendered._replace(images=images))
-    assert not figures[-1].accepted and errors(after, rendered) == errors(before, rendered)
+    assert not figures.passes[-1].accepted and errors(after, rendered) == errors(before, rendered)
 
 
 def test_blocks_of_points_change_nothing(rendered, monkeypatch):
@@ -272,7 +135,7 @@ def test_thresholds_refuse_what_makes_no_sense_and_have_effects(rendered):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Refinement(**wrong)
     model = noisy_model(rendered, 1.0)
-    base = refine(model, rendered, passes=1)[1][0]
+    base = refine(model, rendered, passes=1)[1].passes[0]
     for change in (
         {"min_score": 0.97},
         {"max_sigma_px": 0.05},
@@ -284,7 +147,7 @@ def test_thresholds_refuse_what_makes_no_sense_and_have_effects(rendered):
         {"radius": 3},
         {"neighbours": 6},
     ):
-        figures = refine(model, rendered, passes=1, **change)[1][0]
+        figures = refine(model, rendered, passes=1, **change)[1].passes[0]
         assert dataclasses.astuple(figures) != dataclasses.astuple(base), change
 
 

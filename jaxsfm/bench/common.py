@@ -28,14 +28,18 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
     "no-enlarging": lambda c: dataclasses.replace(c, enlarge=1.0),
     "no-consensus": lambda c: _with_pair(c, consensus=0),
     "no-competition": lambda c: _with_pair(c, plane_rounds=0),
+    "no-placing": lambda c: dataclasses.replace(
+        c, refinement=c.refinement and dataclasses.replace(c.refinement, weak_octaves=0)
+    ),
 }
-"""One idea left out of a preset: METHOD-no-IDEA."""
+"""One idea left out of a preset: METHOD-no-IDEA. The last one changes models, not matches."""
 ABLATED = tuple(
     f"{name}-{idea}"
     for name in ("default", "robust")
     for idea, without in ABLATIONS.items()
     if without(preset(name)) != preset(name)
 )
+PAIR_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-placing"))
 
 
 def method_config(method: str, *, max_size: int | None = None) -> Config:

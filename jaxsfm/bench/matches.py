@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.common import ABLATED, method_config, versions
+from jaxsfm.bench.common import PAIR_ABLATED, method_config, versions
 from jaxsfm.config import Config
 from jaxsfm.host.colmap import read_matches
 from jaxsfm.host.features import ImageFeatures, image_features
@@ -18,7 +18,7 @@ from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.pipeline import match_features, on_device
 
-PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust", *ABLATED)
+PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust", *PAIR_ABLATED)
 FEATURES = 8
 """Features held: of two images, as four methods want them."""
 

@@ -16,6 +16,8 @@ from jaxsfm.host.native import native
 
 MIN_TRI_ANGLE_DEG = 1.5
 """COLMAP's."""
+Sizes = Mapping[str, tuple[tuple[int, int], tuple[float, float]]]
+"""Image name -> working (width, height) and original pixels per working pixel."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,11 @@ class View:
             xy[front] = self.camera.img_from_cam(np.ascontiguousarray(local[front]))
         return xy / self.scale - 0.5, depth
 
+    def cam_from_world(self) -> pycolmap.Rigid3d:
+        """The pose as COLMAP has it."""
+        turned = pycolmap.Rotation3d(self.rotation)
+        return pycolmap.Rigid3d(turned, -self.rotation @ self.centre)
+
     def rays(self, xy: np.ndarray) -> np.ndarray:
         """World directions (n, 3) of working pixels, of depth 1."""
         flat = self.camera.cam_from_img(np.ascontiguousarray((xy + 0.5) * self.scale))
@@ -66,13 +73,9 @@ class Tracks(NamedTuple):
 
 def read_model_arrays(
     model: pycolmap.Reconstruction,
-    sizes: Mapping[str, tuple[tuple[int, int], tuple[float, float]]],
+    sizes: Sizes,
 ) -> tuple[list[View], Tracks]:
-    """Views (by image id) and tracks (by point id) of a model.
-
-    Args:
-      sizes: image name -> working (width, height) and original pixels per working pixel.
-    """
+    """Views (by image id) and tracks (by point id) of a model."""
     views, index, pixels = [], {}, []
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
@@ -126,25 +129,27 @@ def select(tracks: Tracks, keep: np.ndarray) -> Tracks:
 def build_model(
     template: pycolmap.Reconstruction, views: list[View], tracks: Tracks
 ) -> pycolmap.Reconstruction:
-    """A model with the cameras and poses of `template` and these tracks.
+    """A model with the cameras of `template` and these views and tracks.
 
-    Points with fewer than two observations, or with rays closer than 1.5 degrees, are left out.
+    A view's own camera counts where it differs from the template's. Points with fewer than two
+    observations, or with rays closer than 1.5 degrees, are left out.
     """
     model = pycolmap.Reconstruction()
-    for camera_id in sorted(template.cameras):
-        model.add_camera_with_trivial_rig(template.camera(camera_id))
+    cameras = {i: template.camera(i) for i in template.cameras}
+    cameras |= {view.camera.camera_id: view.camera for view in views}
+    for camera_id in sorted(cameras):
+        model.add_camera_with_trivial_rig(cameras[camera_id])
     place = np.zeros(len(tracks.xy), np.int64)
     for k, view in enumerate(views):
         rows = np.flatnonzero(tracks.view == k)
         place[rows] = np.arange(len(rows))
-        old = template.image(view.image_id)
         image = pycolmap.Image(
             name=view.name,
-            camera_id=old.camera_id,
+            camera_id=view.camera.camera_id,
             image_id=view.image_id,
             keypoints=(tracks.xy[rows] + 0.5) * view.scale,
         )
-        model.add_image_with_trivial_frame(image, old.cam_from_world())
+        model.add_image_with_trivial_frame(image, view.cam_from_world())
     order = np.argsort(tracks.point, kind="stable")
     ends = np.searchsorted(tracks.point[order], np.arange(len(tracks.points) + 1))
     for k, xyz in enumerate(tracks.points):

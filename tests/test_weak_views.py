@@ -1,0 +1,179 @@
+"""Weak views against exact cameras and pixels of a rendered room, one view of which is noise."""
+
+import dataclasses
+
+import numpy as np
+import pycolmap
+import pytest
+from room_scene import (
+    SIZE,
+    Room,
+    exact_tracks,
+    other_scene,
+    read_of,
+    refine,
+    sizes,
+    template,
+)
+
+from jaxsfm.config import Refinement
+from jaxsfm.evaluation import evaluate
+from jaxsfm.host.model import build_model, read_model_arrays
+from jaxsfm.host.poses import model_poses
+from jaxsfm.track_alignment import align_blocks
+from jaxsfm.weak_views import _at_octave, place_weak_views
+
+NIGHT, NIGHT_NAME = 2, "2.png"
+PHOTONS = 0.02
+"""Per unit of intensity: about two at a bright pixel."""
+
+
+def by_night(scene: Room) -> Room:
+    """The same room; one view counts photons."""
+    counts = np.random.default_rng(0).poisson(PHOTONS * scene.images[NIGHT_NAME])
+    return scene._replace(images=scene.images | {NIGHT_NAME: (counts / PHOTONS).astype(np.float32)})
+
+
+def lost_view(scene: Room, *, turn_deg: float = 1.0, shift: float = 0.0) -> pycolmap.Reconstruction:
+    """The exact model, but the night view looks elsewhere and has 40 observations."""
+    tracks = exact_tracks(scene)
+    night = np.flatnonzero(tracks.view == NIGHT)
+    keep = np.delete(np.arange(len(tracks.view)), night[40:])
+    tracks = tracks._replace(point=tracks.point[keep], view=tracks.view[keep], xy=tracks.xy[keep])
+    views = list(scene.views)
+    angle = np.radians(turn_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    views[NIGHT] = dataclasses.replace(
+        views[NIGHT],
+        rotation=np.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ views[NIGHT].rotation,
+        centre=views[NIGHT].centre + [shift, 0, 0],
+    )
+    return build_model(template(scene), views, tracks)
+
+
+def place(model, scene: Room, *, refine_intrinsics=False, **config):
+    return place_weak_views(
+        model,
+        [NIGHT_NAME],
+        read_of(scene),
+        sizes(scene),
+        config=Refinement(**config),
+        refine_intrinsics=refine_intrinsics,
+    )
+
+
+def night_error(model, scene: Room) -> tuple[float, float]:
+    """Position and degrees, after a similarity from the other cameras."""
+    others = [name for name in scene.poses if name != NIGHT_NAME]
+    error = evaluate(model_poses(model), scene.poses, align_on=others).images[NIGHT_NAME]
+    return error.position, error.rotation_deg
+
+
+@pytest.mark.parametrize(("turn_deg", "shift"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.05)])
+def test_a_view_of_photons_is_placed_where_it_is(rendered, turn_deg, shift):
+    """Two photons at a bright pixel, and the pose up to 10 px off."""
+    night = by_night(rendered)
+    model, (placed,) = place(lost_view(night, turn_deg=turn_deg, shift=shift), night)
+    assert placed.octave_px in (2, 4, 8) and placed.agreed >= 100 and placed.error_px < 4
+    position, rotation = night_error(model, night)
+    assert position < 0.01 and rotation < 0.15
+
+
+def test_refinement_places_a_view_that_it_cannot_align(rendered):
+    night = by_night(rendered)
+    tracks = exact_tracks(night)
+    sigma = np.where(tracks.view == NIGHT, 3.0, 0.7)[:, None]
+    noise = sigma * np.random.default_rng(1).normal(size=tracks.xy.shape)
+    before = build_model(template(night), night.views, tracks._replace(xy=tracks.xy + noise))
+    after, figures = refine(before, night)
+    assert [p.name for p in figures.placed] == [NIGHT_NAME] == figures.passes[-1].weak_views
+    without, old = refine(before, night, weak_octaves=0)
+    assert old.placed[0].octave_px is None and old.passes == figures.passes
+    placed, kept = night_error(after, night), night_error(without, night)
+    assert placed[0] < 0.01 and placed[0] < 0.7 * kept[0]
+
+
+def test_the_other_views_and_their_observations_stay(rendered):
+    night = by_night(rendered)
+    before = lost_view(night)
+    after, _ = place(before, night)
+    for image_id in before.reg_image_ids():
+        if before.image(image_id).name != NIGHT_NAME:
+            one, two = (m.image(image_id).cam_from_world().matrix() for m in (before, after))
+            np.testing.assert_allclose(one, two, atol=1e-14)
+    (_, old), (_, new) = (read_model_arrays(m, sizes(night)) for m in (before, after))
+    assert (new.view != NIGHT).sum() == (old.view != NIGHT).sum()
+    assert (new.view == NIGHT).sum() > 100
+
+
+def test_a_view_of_something_else_stays_as_it_was(rendered):
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    before = lost_view(elsewhere)
+    after, (placed,) = place(before, elsewhere)
+    assert placed.octave_px is None and placed.error_px is None and placed.candidates > 100
+    assert after is before
+
+
+def test_a_model_of_weak_views_alone_stays_as_it_was(rendered):
+    before = lost_view(rendered)
+    after, placed = place_weak_views(
+        before,
+        list(rendered.images),
+        read_of(rendered),
+        sizes(rendered),
+        config=Refinement(),
+        refine_intrinsics=False,
+    )
+    assert after is before and all(p.octave_px is None and not p.candidates for p in placed)
+
+
+@pytest.mark.parametrize(("own", "refined"), [(True, True), (False, False)])
+def test_only_a_camera_of_its_own_gets_another_focal_length(rendered, own, refined):
+    night = by_night(rendered)
+    before = lost_view(night, turn_deg=0.0)
+    right = before.camera(1).focal_length_x
+    if own:
+        alone = pycolmap.Camera(before.camera(1).todict())
+        alone.camera_id = 2
+        alone.focal_length_x = alone.focal_length_y = 1.03 * right
+        views, tracks = read_model_arrays(before, sizes(night))
+        views[NIGHT] = dataclasses.replace(views[NIGHT], camera=alone)
+        before = build_model(before, views, tracks)
+    after, (placed,) = place(before, night, refine_intrinsics=True)
+    assert placed.octave_px is not None
+    camera = after.image(NIGHT + 1).camera
+    if refined:
+        assert abs(camera.focal_length_x / right - 1) < 0.01
+    else:
+        assert camera.focal_length_x == right
+
+
+def test_targets_are_a_part_of_all_views(rendered):
+    """Aligning to some views gives what aligning to all gives there, to the last bit."""
+    tracks, config = exact_tracks(rendered), Refinement()
+    arguments = (tracks, rendered.views, read_of(rendered), config, config.max_shift_px)
+    (every,) = align_blocks(*arguments)
+    (some,) = align_blocks(*arguments, targets=[1, 3])
+    mine = np.isin(every.found.view, [1, 3])
+    for field in ("point", "view", "start", "affine"):
+        np.testing.assert_array_equal(
+            getattr(some.found, field), getattr(every.found, field)[mine], field
+        )
+    np.testing.assert_array_equal(some.moved, every.moved[mine])
+    np.testing.assert_array_equal(some.agrees, every.agrees[mine])
+
+
+@pytest.mark.parametrize("px", [1, 2, 8])
+def test_an_octaves_pixels_are_means_and_lie_where_they_lay(rendered, px):
+    tracks = exact_tracks(rendered)
+    views, smaller, read = _at_octave(px, rendered.views, tracks, read_of(rendered))
+    at, _ = views[0].project(rendered.points[:50])
+    whole, _ = rendered.views[0].project(rendered.points[:50])
+    np.testing.assert_allclose((at + 0.5) * px - 0.5, whole)
+    np.testing.assert_allclose((smaller.xy + 0.5) * px - 0.5, tracks.xy)
+    image, scale = read("0.png")
+    assert image.shape[::-1] == views[0].size == (SIZE[0] // px, SIZE[1] // px)
+    assert scale == (px, px)
+    np.testing.assert_allclose(
+        image[3, 5], rendered.images["0.png"][3 * px : 4 * px, 5 * px : 6 * px].mean(), rtol=1e-5
+    )
