@@ -248,7 +248,10 @@ def reconstruct(
 
     figures: list[RefinementFigures | None] = [None] * len(models)
     if config.refinement is not None:
-        models, figures = _refine(models, read, config.refinement, options, on_pass)
+        cameras = colmap.read_images(database)
+        models, figures = _refine(
+            models, read, config.refinement, options, matches, cameras, on_pass
+        )
     for model in models:
         colmap.colour_points(model, read)
     return Reconstructed(
@@ -265,9 +268,12 @@ def _refine(
     read: Callable[[str], tuple[np.ndarray, tuple[float, float]]],
     config: Refinement,
     options: "MapOptions",
+    matches: Mapping[Pair, PairResult],
+    cameras: "Mapping[str, tuple[int, pycolmap.Camera]]",
     on_pass: Callable[[], None],
 ) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
     from jaxsfm.refine import refine_model
+    from jaxsfm.weak_views import Evidence, LeftOut
 
     @functools.lru_cache(maxsize=GRAYS)
     def gray(name: str) -> tuple[np.ndarray, tuple[float, float]]:
@@ -275,6 +281,8 @@ def _refine(
         return rgb.astype(np.float32) @ LUMA, scale
 
     refined, figures = [], []
+    mapped = {image.name for model in models for image in model.images.values()}
+    left_out = [LeftOut(name, *cameras[name]) for name in sorted(cameras.keys() - mapped)]
     for model in models:
         try:
             new, done = refine_model(
@@ -282,12 +290,15 @@ def _refine(
                 gray,
                 config=config,
                 refine_intrinsics=options.refine_intrinsics,
+                evidence=Evidence(matches, left_out, options.seed),
                 threads=options.threads,
                 on_pass=on_pass,
             )
         except ImageError as error:  # a photo went away since; the mapper's model is there
             logger.warning("no refinement: %s", error)
             new, done = model, None
+        now = {image.name for image in new.images.values()}
+        left_out = [image for image in left_out if image.name not in now]
         refined.append(new)
         figures.append(done)
     return refined, figures

@@ -25,7 +25,7 @@ from jaxsfm.host.model import (
     select,
 )
 from jaxsfm.track_alignment import AlignedBlock, ReadGray, align_blocks
-from jaxsfm.weak_views import Placed, place_weak_views
+from jaxsfm.weak_views import NO_EVIDENCE, Evidence, Placed, place_weak_views
 
 if TYPE_CHECKING:
     import pycolmap
@@ -64,7 +64,7 @@ class RefinementFigures:
 
     passes: list[PassFigures]
     placed: list[Placed]
-    """The weak views of the last pass."""
+    """The weak views of the last pass, and images that the mapper left out."""
 
 
 def _gather(
@@ -105,6 +105,7 @@ def refine_model(
     *,
     config: Refinement,
     refine_intrinsics: bool,
+    evidence: Evidence = NO_EVIDENCE,
     threads: int = -1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
@@ -118,15 +119,17 @@ def refine_model(
       model: from the mapper; not changed.
       read: intensities by image name; called several times per image and pass.
       refine_intrinsics: whether bundle adjustment moves focal lengths and distortion.
+      evidence: images that the mapper left out, and matches to place them and weak views by.
       threads: of bundle adjustment; one makes the model repeatable to the last byte.
 
     Raises:
       ImageError: an image cannot be read any more.
     """
     sizes = {}
-    for image_id in sorted(model.reg_image_ids()):
-        gray, scale = read(model.image(image_id).name)
-        sizes[model.image(image_id).name] = ((gray.shape[1], gray.shape[0]), scale)
+    names = [model.image(image_id).name for image_id in sorted(model.reg_image_ids())]
+    for name in [*names, *(image.name for image in evidence.left_out)]:
+        gray, scale = read(name)
+        sizes[name] = ((gray.shape[1], gray.shape[0]), scale)
     figures: list[PassFigures] = []
     for number in range(config.passes):
         views, tracks = read_model_arrays(model, sizes)
@@ -158,14 +161,16 @@ def refine_model(
         if not accepted:
             break
     placed: list[Placed] = []
-    if figures and figures[-1].weak_views:
+    weak_names = figures[-1].weak_views if figures else []
+    if figures and figures[-1].accepted and (weak_names or evidence.left_out):
         model, placed = place_weak_views(
             model,
-            figures[-1].weak_views,
+            weak_names,
             read,
             sizes,
             config=config,
             refine_intrinsics=refine_intrinsics,
+            evidence=evidence,
         )
     return model, RefinementFigures(passes=figures, placed=placed)
 

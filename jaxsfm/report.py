@@ -126,10 +126,13 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
             + ("" if last["accepted"] else "; too few, taken back")
         )
         for at in refinement["placed"]:
+            if not at["registered"] and not at["octave_px"]:
+                continue  # it is among the lost
             name, px = shown_name(at["name"]), at["octave_px"]
             lines.append(
                 f"placed           {name}: {at['agreed']} points agree at "
                 f"{'full' if px == 1 else f'1/{px}'} size, {at['error_px']:.1f} px"
+                + ("" if at["registered"] else "; the mapper had left it out")
                 if px
                 else f"not refined      {name}: too few points agree; the old observations stay"
             )

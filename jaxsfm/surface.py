@@ -94,15 +94,41 @@ def on_reference_rays(
     moved = np.empty_like(tracks.points)
     for k, view in enumerate(views):
         rows = np.flatnonzero(reference == k)
-        ray = view.rays(xy[rows])
-        offset = tracks.points[rows] - view.centre
-        depth = offset @ view.rotation[2]
-        along = np.einsum("ni,ni->n", ray, normal[rows])
-        steep = np.abs(along) < 0.1
-        hit = np.einsum("ni,ni->n", offset, normal[rows]) / np.where(steep, 1.0, along)
-        hit = np.where(steep | (np.abs(hit - depth) > 0.05 * depth), depth, hit)
-        moved[rows] = view.centre + hit[:, None] * ray
+        moved[rows] = _on_planes(view, xy[rows], tracks.points[rows], normal[rows])
     return moved
+
+
+def _on_planes(view: View, xy: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Where the rays of pixels (n, 2) meet the planes through points (n, 3); at the points' depth
+    where the plane is nearly parallel to the ray."""
+    ray = view.rays(xy)
+    offset = points - view.centre
+    depth = offset @ view.rotation[2]
+    along = np.einsum("ni,ni->n", ray, normal)
+    steep = np.abs(along) < 0.1
+    hit = np.einsum("ni,ni->n", offset, normal) / np.where(steep, 1.0, along)
+    hit = np.where(steep | (np.abs(hit - depth) > 0.05 * depth), depth, hit)
+    return view.centre + hit[:, None] * ray
+
+
+def under_pixels(
+    tracks: Tracks,
+    views: list[View],
+    normal: np.ndarray,
+    view: int,
+    xy: np.ndarray,
+    *,
+    reach_px: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The surface (m, 3) under those of the pixels (n, 2) of a view that have an observation near,
+    and which they are: (m,) indices."""
+    own = np.flatnonzero(tracks.view == view)
+    if not len(own) or not len(xy):
+        return np.zeros((0, 3)), np.zeros(0, np.int64)
+    distance, nearest = map(np.asarray, KDTree(tracks.xy[own]).query(xy))
+    near = np.flatnonzero(distance <= reach_px)
+    point = tracks.point[own[nearest[near]]]
+    return _on_planes(views[view], xy[near], tracks.points[point], normal[point]), near
 
 
 def candidates(

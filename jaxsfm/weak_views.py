@@ -1,132 +1,77 @@
-"""Views in which refinement finds nothing to align, because photon noise hides it: a night among
-days. They are placed on the structure that the other views make, at octaves where noise averages
-out: half, a quarter, an eighth of the working size.
+"""Views in which refinement finds nothing to align, because photon noise hides it, and images that
+the mapper left out: a night among days. They are placed on the structure that the other views make,
+at octaves where noise averages out (`jaxsfm.placing`).
 
-A patch of 15 x 15 pixels of the third octave holds sixteen times the photons, and finds its place
-from sixteen times as far. So the coarsest octave comes first, every octave starts from the pose of
-the one before, and the pose that the evidence determines best stays.
+What agrees there is evidence of its own: a dozen right matches among many wrong ones are enough to
+start from.
 """
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
+from jaxsfm import surface
 from jaxsfm.config import Refinement
 from jaxsfm.host.model import Sizes, Tracks, View, build_model, read_model_arrays
-from jaxsfm.track_alignment import ReadGray, align_blocks
+from jaxsfm.host.pairs import Pair, PairResult, make_pair
+from jaxsfm.host.resection import find_view
+from jaxsfm.placing import Followed, Pose, follow
+from jaxsfm.track_alignment import ReadGray
 
-MIN_COUNT, MIN_SHARE = 30, 0.05
-"""Fewest points that agree at an octave (in number, and of those that could be seen) for its pose
-to count. At wrong poses 0.2 to 3 % agree by chance, at right ones 6 to 40 % (docs/design.md)."""
-
-MAX_SIGMA_PX = 1.0
-"""Largest standard deviation of an observation, pixels of its octave; hundreds make the pose."""
+MIN_SHARE = 0.1
+"""Least share of the points it could see that an image must agree with, at one octave at least. At
+wrong poses 0.2 to 3 % agree by chance, at right ones 20 to 50 % at an eighth of the size
+(docs/design.md)."""
+REACH_PX = 16.0
+"""A match lies on the surface of an observation this near, working pixels: two fine cells."""
+MATCH_ERROR_PX = 12.0
+"""Of right matches, working pixels: COLMAP's limit for resection. A dark image's keypoints lie 4 px
+off, and cells are 8 px wide."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Placed:
-    """What became of a weak view."""
+    """What became of a weak view, or of an image that was not in the model."""
 
     name: str
+    registered: bool
+    """It was in the model before."""
     octave_px: int | None
-    """Working pixels per pixel of the octave that gives the pose; None: no octave agrees, the view
-    stays as it was."""
+    """Working pixels per pixel of the octave that gives the pose; None: too little agrees, nothing
+    changes."""
     candidates: int
-    """Points of the other views that it could see, at that octave; at the last one if None."""
+    """Points of the other views that it could see."""
     agreed: int
-    """Those that agree."""
+    """Those that agree, at that octave (None: at the last)."""
     error_px: float | None
     """Median distance of where they agree from where the pose puts them, working pixels."""
 
 
-class _Found(NamedTuple):
-    """Points aligned to one view at one octave."""
+class LeftOut(NamedTuple):
+    """An image that is in no model."""
 
-    rows: np.ndarray
-    """(n,): which points agree."""
-    points: np.ndarray
-    """float64 (n, 3)."""
-    xy: np.ndarray
-    """float64 (n, 2), pixels of the octave."""
-    candidates: int
+    name: str
+    image_id: int
+    camera: pycolmap.Camera
 
 
-def _at_octave(
-    octave_px: int, views: list[View], tracks: Tracks, read: ReadGray
-) -> tuple[list[View], Tracks, ReadGray]:
-    """The same views, observations and images in pixels that are `octave_px` times as large."""
+class Evidence(NamedTuple):
+    """What there is beside a model."""
 
-    def reduced(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        gray, (sx, sy) = read(name)
-        h, w = (side // octave_px for side in gray.shape)
-        blocks = gray[: h * octave_px, : w * octave_px].reshape(h, octave_px, w, octave_px)
-        return blocks.mean((1, 3)), (sx * octave_px, sy * octave_px)
-
-    smaller = [
-        dataclasses.replace(
-            view,
-            scale=view.scale * octave_px,
-            size=(view.size[0] // octave_px, view.size[1] // octave_px),
-        )
-        for view in views
-    ]
-    return smaller, tracks._replace(xy=(tracks.xy + 0.5) / octave_px - 0.5), reduced
+    matches: Mapping[Pair, PairResult]
+    """Verified matches by pair, original pixels."""
+    left_out: Sequence[LeftOut]
+    seed: int
+    """Of the resection from matches."""
 
 
-def _find(
-    views: list[View], tracks: Tracks, read: ReadGray, weak: list[int], config: Refinement
-) -> dict[int, _Found]:
-    """Where each weak view shows the points of `tracks`, which has no observations of it."""
-    parts: dict[int, list[_Found]] = {k: [] for k in weak}
-    gate = dataclasses.replace(config, min_score=config.weak_min_score, max_sigma_px=MAX_SIGMA_PX)
-    for b in align_blocks(tracks, views, read, gate, config.max_shift_px, targets=weak):
-        for k in weak:
-            own = b.found.view == k
-            good = np.flatnonzero(own & b.agrees)
-            at = b.found.point[good]
-            parts[k].append(_Found(b.rows[at], b.points[at], b.moved[good], int(own.sum())))
-    return {
-        k: _Found(
-            np.concatenate([f.rows for f in found]),
-            np.concatenate([f.points for f in found]),
-            np.concatenate([f.xy for f in found]),
-            sum(f.candidates for f in found),
-        )
-        for k, found in parts.items()
-    }
+NO_EVIDENCE = Evidence({}, (), 0)
 
 
-def _resect(view: View, found: _Found, *, refine_focal: bool) -> View | None:
-    """The view where its points want it: robust least squares from where it is."""
-    options = pycolmap.AbsolutePoseRefinementOptions()
-    options.loss_function_scale = float(view.scale.mean())
-    options.refine_focal_length = refine_focal
-    camera = pycolmap.Camera(view.camera.todict())
-    placed = pycolmap.refine_absolute_pose(
-        view.cam_from_world(),
-        (found.xy + 0.5) * view.scale,
-        found.points,
-        np.ones(len(found.rows), bool),
-        camera,
-        options,
-    )
-    if placed is None:
-        return None
-    pose = placed["cam_from_world"]
-    rotation = pose.rotation.matrix()
-    centre = -rotation.T @ pose.translation
-    return dataclasses.replace(view, rotation=rotation, centre=centre, camera=camera)
-
-
-def _distinct(xy: np.ndarray, side: int) -> int:
-    """How many patches of `side` pixels the points lie in: patches that overlap see the same
-    photons, and agree in their errors."""
-    return len(np.unique(np.floor(xy / side), axis=0))
-
-
-def _structure(tracks: Tracks, weak: list[int]) -> tuple[Tracks, np.ndarray]:
+def _structure(tracks: Tracks, weak: Sequence[int]) -> tuple[Tracks, np.ndarray]:
     """The points that at least two of the other views see, those observations, and which points
     they are."""
     strong = ~np.isin(tracks.view, weak)
@@ -141,71 +86,146 @@ def _structure(tracks: Tracks, weak: list[int]) -> tuple[Tracks, np.ndarray]:
     )
 
 
+def _matched_points(
+    image: View,
+    views: list[View],
+    structure: Tracks,
+    normal: np.ndarray,
+    matches: Mapping[Pair, PairResult],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints (n, 2) of an image, working pixels, and the surface (n, 3) under their partners."""
+    xy, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
+    for k, view in enumerate(views):
+        pair = make_pair(image.name, view.name)
+        if pair not in matches:
+            continue
+        result = matches[pair]
+        sides = (result.keypoints0, result.keypoints1)
+        mine, theirs = sides if pair[0] == image.name else sides[::-1]
+        at, near = surface.under_pixels(
+            structure, views, normal, k, (theirs + 0.5) / view.scale - 0.5, reach_px=REACH_PX
+        )
+        xy.append((mine[near] + 0.5) / image.scale - 0.5)
+        points.append(at)
+    return np.concatenate(xy), np.concatenate(points)
+
+
+def _outside(left_out: Sequence[LeftOut], sizes: Sizes) -> list[View]:
+    """Views of images without a pose."""
+    return [
+        View(
+            image_id=image_id,
+            name=name,
+            rotation=np.eye(3),
+            centre=np.zeros(3),
+            camera=camera,
+            scale=np.asarray(sizes[name][1], np.float64),
+            size=sizes[name][0],
+        )
+        for name, image_id, camera in left_out
+    ]
+
+
 def place_weak_views(
     model: pycolmap.Reconstruction,
-    weak: list[str],
+    weak: Sequence[str],
     read: ReadGray,
     sizes: Sizes,
     *,
     config: Refinement,
     refine_intrinsics: bool,
+    evidence: Evidence,
 ) -> tuple[pycolmap.Reconstruction, list[Placed]]:
-    """The model with its weak views placed on the structure of the others, which stays as it is.
+    """The model with its weak views, and images left out, placed on the structure of the other
+    views, which stays as it is.
 
-    A placed view gets the observations that agree with its new pose instead of those it had.
+    A placed view gets the observations that agree with its new pose instead of those it had. A
+    weak view starts from its pose and from its matches, an image left out from its matches.
 
     Args:
       model: not changed.
       weak: names of registered images.
-      read, sizes: as in `refine_model`.
-      refine_intrinsics: whether a weak view's focal length moves too, if the camera is its own.
+      read, sizes: as in `refine_model`; sizes of the images left out too.
+      refine_intrinsics: whether a placed view's focal length moves too, if the camera is its own.
     """
     views, tracks = read_model_arrays(model, sizes)
-    index = [k for k, view in enumerate(views) if view.name in weak]
-    structure, rows = _structure(tracks, index)
-    users = np.unique([view.camera.camera_id for view in views], return_counts=True)
-    shared = set(users[0][users[1] > 1])
-    best: dict[int, tuple[float, View, _Found, Placed]] = {}
-    last = {
-        k: Placed(name=views[k].name, octave_px=None, candidates=0, agreed=0, error_px=None)
-        for k in index
-    }
-    current = list(views)
-    for octave in reversed(range(config.weak_octaves if len(rows) else 0)):
-        px = 2**octave
-        smaller, observed, reduced = _at_octave(px, current, structure, read)
-        for k, found in _find(smaller, observed, reduced, index, config).items():
-            last[k] = dataclasses.replace(
-                last[k], candidates=found.candidates, agreed=len(found.rows)
-            )
-            if len(found.rows) < max(MIN_COUNT, MIN_SHARE * found.candidates):
-                continue
-            own = refine_intrinsics and views[k].camera.camera_id not in shared
-            view = _resect(smaller[k], found, refine_focal=own)
-            if view is None:
-                continue
-            errors = np.linalg.norm(view.project(found.points)[0] - found.xy, axis=1)
-            error = float(np.median(np.nan_to_num(errors, nan=np.inf))) * px
-            current[k] = dataclasses.replace(view, scale=views[k].scale, size=views[k].size)
-            doubt = error / np.sqrt(_distinct(found.xy, 2 * config.radius + 1))
-            if k in best and best[k][0] <= doubt:
-                continue
-            figures = dataclasses.replace(last[k], octave_px=px, error_px=error)
-            near = errors <= config.max_error_px
-            xy = (found.xy[near] + 0.5) * px - 0.5
-            best[k] = doubt, current[k], found._replace(rows=rows[found.rows[near]], xy=xy), figures
-    placed = [best[k][3] if k in best else last[k] for k in index]
+    images = [*views, *_outside(evidence.left_out, sizes)]
+    weak_ones = [k for k, view in enumerate(views) if view.name in weak]
+    wanted = [*weak_ones, *range(len(views), len(images))]
+    structure, rows = _structure(tracks, weak_ones)
+    poses: dict[int, list[Followed]] = {k: [] for k in wanted}
+    if len(rows) and config.weak_octaves:
+        poses = _starts(images, views, structure, wanted, evidence, config, refine_intrinsics)
+        follow([pose for mine in poses.values() for pose in mine], views, structure, read, config)
+    figures, best = [], {}
+    for k, mine in poses.items():
+        right = [p.best for p in mine if p.best is not None and p.share >= MIN_SHARE]
+        if right:
+            best[k] = min(right, key=lambda pose: pose.doubt)
+        figures.append(_figures(images[k].name, k < len(views), mine, best.get(k)))
     if not best:
-        return model, placed
+        return model, figures
+    return build_model(model, *_joined(views, tracks, best, rows)), figures
+
+
+def _starts(
+    images: list[View],
+    views: list[View],
+    structure: Tracks,
+    wanted: Sequence[int],
+    evidence: Evidence,
+    config: Refinement,
+    refine_intrinsics: bool,
+) -> dict[int, list[Followed]]:
+    """The poses to follow, per wanted image."""
+    normal = surface.normals(structure, views, neighbours=config.neighbours)
+    cameras = [view.camera.camera_id for view in images]
+    starts = {}
+    for k in wanted:
+        own = refine_intrinsics and cameras.count(cameras[k]) == 1
+        found = find_view(
+            images[k],
+            *_matched_points(images[k], views, structure, normal, evidence.matches),
+            max_error_px=MATCH_ERROR_PX,
+            estimate_focal_length=own and not images[k].camera.has_prior_focal_length,
+            seed=evidence.seed,
+        )
+        starts[k] = [
+            Followed(view=view, own_camera=own)
+            for view in ([views[k]] if k < len(views) else []) + ([found] if found else [])
+        ]
+    return starts
+
+
+def _figures(name: str, registered: bool, mine: list[Followed], best: Pose | None) -> Placed:
+    most = max(mine, key=lambda pose: pose.agreed, default=None)
+    return Placed(
+        name=name,
+        registered=registered,
+        octave_px=best.octave_px if best else None,
+        candidates=best.observed.candidates if best else most.candidates if most else 0,
+        agreed=best.agreed if best else most.agreed if most else 0,
+        error_px=best.error_px if best else None,
+    )
+
+
+def _joined(
+    views: list[View], tracks: Tracks, best: Mapping[int, Pose], rows: np.ndarray
+) -> tuple[list[View], Tracks]:
+    """Views and tracks with the placed ones, whose old observations go.
+
+    Args:
+      best: by index; past the last view: an image left out.
+      rows: which points the structure's are.
+    """
     stay = ~np.isin(tracks.view, list(best))
-    point, view, xy = [tracks.point[stay]], [tracks.view[stay]], [tracks.xy[stay]]
-    for k, (_, new, found, _) in best.items():
-        views[k] = new
-        point.append(found.rows)
-        view.append(np.full(len(found.rows), k))
-        xy.append(found.xy)
-    joined = Tracks(tracks.points, *(np.concatenate(part) for part in (point, view, xy)))
-    order = np.lexsort((joined.view, joined.point))
-    return build_model(
-        model, views, Tracks(joined.points, *(part[order] for part in joined[1:]))
-    ), placed
+    parts = [(tracks.point[stay], tracks.view[stay], tracks.xy[stay])]
+    every = list(views)
+    for k, pose in sorted(best.items()):
+        at = min(k, len(every))
+        every[at : at + 1] = [pose.view]
+        seen = pose.observed
+        parts.append((rows[seen.rows], np.full(len(seen.rows), at), seen.xy))
+    point, view, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.lexsort((view, point))
+    return every, Tracks(tracks.points, point[order], view[order], xy[order])

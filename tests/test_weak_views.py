@@ -8,6 +8,7 @@ import pytest
 from room_scene import (
     SIZE,
     Room,
+    camera,
     exact_tracks,
     other_scene,
     read_of,
@@ -17,11 +18,14 @@ from room_scene import (
 )
 
 from jaxsfm.config import Refinement
+from jaxsfm.core.types import Status
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.model import build_model, read_model_arrays
+from jaxsfm.host.pairs import PairResult, make_pair
 from jaxsfm.host.poses import model_poses
+from jaxsfm.placing import at_octave
 from jaxsfm.track_alignment import align_blocks
-from jaxsfm.weak_views import _at_octave, place_weak_views
+from jaxsfm.weak_views import NO_EVIDENCE, Evidence, LeftOut, place_weak_views
 
 NIGHT, NIGHT_NAME = 2, "2.png"
 PHOTONS = 0.02
@@ -51,14 +55,23 @@ def lost_view(scene: Room, *, turn_deg: float = 1.0, shift: float = 0.0) -> pyco
     return build_model(template(scene), views, tracks)
 
 
-def place(model, scene: Room, *, refine_intrinsics=False, **config):
+def place(
+    model,
+    scene: Room,
+    *,
+    weak=(NIGHT_NAME,),
+    refine_intrinsics=False,
+    evidence=NO_EVIDENCE,
+    **config,
+):
     return place_weak_views(
         model,
-        [NIGHT_NAME],
+        weak,
         read_of(scene),
         sizes(scene),
         config=Refinement(**config),
         refine_intrinsics=refine_intrinsics,
+        evidence=evidence,
     )
 
 
@@ -123,8 +136,83 @@ def test_a_model_of_weak_views_alone_stays_as_it_was(rendered):
         sizes(rendered),
         config=Refinement(),
         refine_intrinsics=False,
+        evidence=NO_EVIDENCE,
     )
     assert after is before and all(p.octave_px is None and not p.candidates for p in placed)
+
+
+def without_night(scene: Room) -> pycolmap.Reconstruction:
+    """The exact model of the other views."""
+    use = scene.visible.copy()
+    use[:, NIGHT] = False
+    views = [view for k, view in enumerate(scene.views) if k != NIGHT]
+    tracks = exact_tracks(scene, use=use)
+    return build_model(
+        template(scene), views, tracks._replace(view=tracks.view - (tracks.view > NIGHT))
+    )
+
+
+def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
+    """With every other view so many matches, keypoints 3 px off at night."""
+    rng = np.random.default_rng(0)
+    results = {}
+    for k, view in enumerate(scene.views):
+        if k == NIGHT:
+            continue
+        both = np.flatnonzero(scene.visible[:, k] & scene.visible[:, NIGHT])
+        points = scene.points[rng.permutation(both)[: right + wrong]]
+        day = view.project(points)[0]
+        night = scene.views[NIGHT].project(points)[0] + rng.normal(0, 3, day.shape)
+        night[right:] = rng.uniform((0, 0), SIZE, night[right:].shape)
+        pair = make_pair(view.name, NIGHT_NAME)
+        sides = (day, night) if pair[0] == view.name else (night, day)
+        n = len(points)
+        results[pair] = PairResult(
+            pair=pair,
+            cells=np.zeros((n, 2), np.int32),
+            keypoints0=sides[0].astype(np.float32),
+            keypoints1=sides[1].astype(np.float32),
+            plane=np.zeros(n, np.int32),
+            homographies=np.eye(3)[None],
+            num_tentative=n,
+            num_dropped=0,
+            status=Status.VERIFIED,
+        )
+    return Evidence(results, [LeftOut(NIGHT_NAME, NIGHT + 1, camera())], 0)
+
+
+def test_an_image_that_was_left_out_is_registered_from_a_few_right_matches(rendered):
+    night = by_night(rendered)
+    before = without_night(night)
+    evidence = night_matches(night, right=6, wrong=18)
+    after, (placed,) = place(before, night, weak=(), evidence=evidence)
+    assert not placed.registered and placed.octave_px is not None
+    assert after.num_reg_images() == 5 and before.num_reg_images() == 4
+    position, rotation = night_error(after, night)
+    assert position < 0.01 and rotation < 0.15
+    assert after.image(NIGHT + 1).num_points3D > 50
+    without = evidence._replace(matches={})
+    assert place(before, night, weak=(), evidence=without)[1][0].octave_px is None
+
+
+def test_an_image_of_something_else_is_not_registered(rendered):
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    before = without_night(elsewhere)
+    for right in (0, 40):  # even where matches give a pose: nothing agrees there
+        evidence = night_matches(elsewhere, right=right, wrong=20)
+        after, (placed,) = place(before, elsewhere, weak=(), evidence=evidence)
+        assert placed.octave_px is None and after is before
+
+
+def test_matches_bring_a_lost_view_back(rendered):
+    """From where alignment alone does not find home."""
+    night = by_night(rendered)
+    before = lost_view(night, turn_deg=15.0, shift=0.3)
+    assert place(before, night)[1][0].octave_px is None
+    after, (placed,) = place(
+        before, night, evidence=night_matches(night, right=20, wrong=20)._replace(left_out=())
+    )
+    assert placed.registered and night_error(after, night)[0] < 0.01
 
 
 @pytest.mark.parametrize(("own", "refined"), [(True, True), (False, False)])
@@ -141,11 +229,11 @@ def test_only_a_camera_of_its_own_gets_another_focal_length(rendered, own, refin
         before = build_model(before, views, tracks)
     after, (placed,) = place(before, night, refine_intrinsics=True)
     assert placed.octave_px is not None
-    camera = after.image(NIGHT + 1).camera
+    found = after.image(NIGHT + 1).camera
     if refined:
-        assert abs(camera.focal_length_x / right - 1) < 0.01
+        assert abs(found.focal_length_x / right - 1) < 0.01
     else:
-        assert camera.focal_length_x == right
+        assert found.focal_length_x == right
 
 
 def test_targets_are_a_part_of_all_views(rendered):
@@ -166,7 +254,7 @@ def test_targets_are_a_part_of_all_views(rendered):
 @pytest.mark.parametrize("px", [1, 2, 8])
 def test_an_octaves_pixels_are_means_and_lie_where_they_lay(rendered, px):
     tracks = exact_tracks(rendered)
-    views, smaller, read = _at_octave(px, rendered.views, tracks, read_of(rendered))
+    views, smaller, read = at_octave(px, rendered.views, tracks, read_of(rendered))
     at, _ = views[0].project(rendered.points[:50])
     whole, _ = rendered.views[0].project(rendered.points[:50])
     np.testing.assert_allclose((at + 0.5) * px - 0.5, whole)

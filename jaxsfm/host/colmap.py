@@ -250,6 +250,13 @@ def read_matches(
     return xy[0][rows[:, 0]], xy[1][rows[:, 1]]
 
 
+def read_images(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:
+    """Id and camera of every image in a database, by name."""
+    with pycolmap.Database.open(path) as db:
+        cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
+        return {i.name: (i.image_id, cameras[i.camera_id]) for i in db.read_all_images()}
+
+
 def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
     """Take pairs' verified geometries out of a database; their matches stay."""
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
