@@ -272,6 +272,7 @@ def _refine(
     cameras: "Mapping[str, tuple[int, pycolmap.Camera]]",
     on_pass: Callable[[], None],
 ) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
+    from jaxsfm.host.mapping import registered
     from jaxsfm.refine import refine_model
     from jaxsfm.weak_views import Evidence, LeftOut
 
@@ -281,7 +282,7 @@ def _refine(
         return rgb.astype(np.float32) @ LUMA, scale
 
     refined, figures = [], []
-    mapped = {image.name for model in models for image in model.images.values()}
+    mapped = {name for model in models for name in registered(model)}
     left_out = [LeftOut(name, *cameras[name]) for name in sorted(cameras.keys() - mapped)]
     for model in models:
         try:
@@ -297,8 +298,7 @@ def _refine(
         except ImageError as error:  # a photo went away since; the mapper's model is there
             logger.warning("no refinement: %s", error)
             new, done = model, None
-        now = {image.name for image in new.images.values()}
-        left_out = [image for image in left_out if image.name not in now]
+        left_out = [image for image in left_out if image.name not in registered(new)]
         refined.append(new)
         figures.append(done)
     return refined, figures

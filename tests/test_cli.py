@@ -422,6 +422,27 @@ def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(
     assert "no refinement: view1.png" in capfd.readouterr().err
 
 
+def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
+    scene, tmp_path, monkeypatch, capsys
+):
+    from jaxsfm.host import mapping
+
+    build = mapping.build_models
+
+    def without_one(*arguments, **options):
+        models, attempts = build(*arguments, **options)
+        (image,) = [i for i in models[0].images.values() if i.name == "view2.png"]
+        models[0].deregister_frame(image.frame_id)
+        return models, attempts
+
+    monkeypatch.setattr(mapping, "build_models", without_one)
+    report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
+    assert report["models"][0]["registered"] == 3
+    (placed,) = [p for p in report["refinement"][0]["placed"] if p["name"] == "view2.png"]
+    assert not placed["registered"] and placed["octave_px"]
+    assert "view2.png" in capsys.readouterr().out.split("the mapper had left it out")[0]
+
+
 def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "photos"
     shutil.copytree(scene / "images", folder)

@@ -104,6 +104,22 @@ def test_a_view_that_agrees_with_nothing_keeps_its_observations_and_its_pose(ren
     assert (tracks.view == 2).sum() > 100
 
 
+def test_a_view_that_is_weak_in_one_pass_is_placed(rendered, monkeypatch):
+    """The few observations that agree in the first are most of what it has in the second."""
+    import jaxsfm.refine as module
+
+    gather, calls = module._gather, []
+
+    def weak_once(*arguments):
+        calls.append(1)
+        return gather(*arguments)[0], np.asarray([2] if len(calls) == 1 else [], int)
+
+    monkeypatch.setattr(module, "_gather", weak_once)
+    _, figures = refine(noisy_model(rendered, 0.7), rendered)
+    assert [f.weak_views for f in figures.passes] == [["2.png"], []]
+    assert [p.name for p in figures.placed] == ["2.png"] and figures.placed[0].octave_px
+
+
 def test_photos_that_agree_in_nothing_leave_the_model_as_it_was(rendered):
     before = noisy_model(rendered, 1.0)
     images = {name: other_scene(k) for k, name in enumerate(rendered.images)}

@@ -100,7 +100,8 @@ def _order(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstructio
     )
 
 
-def _names(model: pycolmap.Reconstruction) -> set[str]:
+def registered(model: pycolmap.Reconstruction) -> set[str]:
+    """Names of the images that have a pose."""
     return {model.image(i).name for i in model.reg_image_ids()}
 
 
@@ -108,7 +109,7 @@ def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:
     """Whether the best model holds (nearly) all images that a chain of pairs connects to it."""
     if not models:
         return not pairs
-    names = _names(models[0])
+    names = registered(models[0])
     connected = component_of(names, pairs)
     return len(connected - names) <= MISSING * len(connected)
 
@@ -146,7 +147,7 @@ def build_models(
             other = _run(database, options, pair, on_image)
             attempts.append(_attempt("incremental", pair, other))
             if other and (not models or other[0].num_reg_images() > models[0].num_reg_images()):
-                apart = [m for m in models if not _names(m) <= _names(other[0])]
+                apart = [m for m in models if not registered(m) <= registered(other[0])]
                 models = _order([other[0], *apart])
         if not models and pairs:
             other = _run(database, dataclasses.replace(options, mapper="global"), None, on_image)
