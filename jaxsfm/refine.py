@@ -7,6 +7,7 @@ The reference keypoint stays where it is: it *is* the point. So relocalization's
 to be aligned so are placed at the end, on the structure of the others (`jaxsfm.weak_views`).
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxsfm.config import Refinement
+from jaxsfm.host.images import ImageError
 from jaxsfm.host.model import (
     Sizes,
     Tracks,
@@ -99,6 +101,11 @@ def _gather(
     return Tracks(points, point[order], view[order], xy[order]), weak
 
 
+def _size(read: ReadGray, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
+    gray, scale = read(name)
+    return (gray.shape[1], gray.shape[0]), scale
+
+
 def refine_model(
     model: "pycolmap.Reconstruction",
     read: ReadGray,
@@ -126,10 +133,15 @@ def refine_model(
       ImageError: an image cannot be read any more.
     """
     sizes = {}
-    names = [model.image(image_id).name for image_id in sorted(model.reg_image_ids())]
-    for name in [*names, *(image.name for image in evidence.left_out)]:
-        gray, scale = read(name)
-        sizes[name] = ((gray.shape[1], gray.shape[0]), scale)
+    for image_id in sorted(model.reg_image_ids()):
+        name = model.image(image_id).name
+        sizes[name] = _size(read, name)
+    readable = []
+    for image in evidence.left_out:
+        with contextlib.suppress(ImageError):  # it went away since, and is not in the model anyway
+            sizes[image.name] = _size(read, image.name)
+            readable.append(image)
+    evidence = evidence._replace(left_out=readable)
     figures: list[PassFigures] = []
     for number in range(config.passes):
         views, tracks = read_model_arrays(model, sizes)

@@ -105,17 +105,17 @@ def test_best_pairs_hands_on_fewer(scene, tmp_path, plain):
 def test_refine_and_view_graph_switch_their_stages(scene, tmp_path, plain):
     args = ("--intrinsics", scene / "K.txt", "--threads", "1")
     bare = run(scene, tmp_path / "bare", *args, "--refine", "0", "--view-graph", "no")
-    assert "refinement" not in bare["seconds"] and bare["refinement"] == []
+    assert "refinement" not in bare["seconds"] and bare["refinement"] == [None]
     assert all(row["view_graph"] is None for row in bare["pairs"]["each"])
     full = plain[1]
-    assert len(full["refinement"][0]) == 2
+    assert len(full["refinement"][0]["passes"]) == 2
     assert all(row["view_graph"]["trusted"] for row in full["pairs"]["each"])
     errors = [r["models"][0]["reprojection_error_px"] for r in (bare, full)]
     assert errors[1] < 0.5 * errors[0]
     once = run(scene, tmp_path / "bare", *args, "--refine", "1")  # the matches stay valid
-    assert len(once["refinement"][0]) == 1 and once["seconds"]["matching"] < 0.5
+    assert len(once["refinement"][0]["passes"]) == 1 and once["seconds"]["matching"] < 0.5
     paper = run(scene, tmp_path / "paper", "--preset", "paper")
-    assert paper["refinement"] == [] and paper["pairs"]["each"][0]["view_graph"] is None
+    assert paper["refinement"] == [None] and paper["pairs"]["each"][0]["view_graph"] is None
 
 
 def test_max_size_reduces_the_working_images(scene, tmp_path, plain):

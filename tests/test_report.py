@@ -111,15 +111,22 @@ def test_a_summary_has_the_counts_of_every_stage():
 def test_second_tries_and_refinement_are_said():
     figures = {"accepted": True, "kept": 5, "dropped": 3, "added": 4, "weak_views": ["night"]}
     attempts = [{"registered": []}, {"registered": [2, 1]}]
-    night = {"name": "night", "agreed": 7, "octave_px": None, "error_px": None}
-    dusk = {"name": "dusk", "agreed": 321, "octave_px": 4, "error_px": 1.26}
-    done = {"passes": [figures, figures], "placed": [night, dusk, dusk | {"octave_px": 1}]}
+    night = {"name": "night", "registered": True, "agreed": 7, "octave_px": None, "error_px": None}
+    dusk = night | {"name": "dusk", "agreed": 321, "octave_px": 4, "error_px": 1.26}
+    late = dusk | {"name": "late", "registered": False}
+    never = night | {"name": "never", "registered": False}
+    done = {
+        "passes": [figures, figures],
+        "placed": [night, dusk, dusk | {"octave_px": 1}, late, never],
+    }
     text = "\n".join(summary_lines(report(mapping=attempts, refinement=[done])))
     assert "started 2 times, images registered: 0, 2" in text
     assert "5 observations agreed, 3 dropped, 4 added in the last of 2 passes" in text
     assert "not refined      night" in text and "taken back" not in text
     assert "placed           dusk: 321 points agree at 1/4 size, 1.3 px" in text
     assert "placed           dusk: 321 points agree at full size" in text
+    assert "late: 321 points agree at 1/4 size, 1.3 px; the mapper had left it out" in text
+    assert "never" not in text and text.count("left it out") == 1
     back = {"passes": [figures | {"accepted": False}], "placed": []}
     text = "\n".join(summary_lines(report(refinement=[back])))
     assert "too few, taken back" in text

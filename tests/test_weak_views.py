@@ -10,6 +10,7 @@ from room_scene import (
     Room,
     camera,
     exact_tracks,
+    noisy_model,
     other_scene,
     read_of,
     refine,
@@ -20,10 +21,12 @@ from room_scene import (
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.evaluation import evaluate
+from jaxsfm.host.images import ImageError
 from jaxsfm.host.model import build_model, read_model_arrays
 from jaxsfm.host.pairs import PairResult, make_pair
 from jaxsfm.host.poses import model_poses
 from jaxsfm.placing import at_octave
+from jaxsfm.refine import refine_model
 from jaxsfm.track_alignment import align_blocks
 from jaxsfm.weak_views import NO_EVIDENCE, Evidence, LeftOut, place_weak_views
 
@@ -141,10 +144,14 @@ def test_a_model_of_weak_views_alone_stays_as_it_was(rendered):
     assert after is before and all(p.octave_px is None and not p.candidates for p in placed)
 
 
+def without(visible: np.ndarray, view: int) -> np.ndarray:
+    """The same, but that view sees nothing."""
+    return visible & (np.arange(visible.shape[1]) != view)
+
+
 def without_night(scene: Room) -> pycolmap.Reconstruction:
     """The exact model of the other views."""
-    use = scene.visible.copy()
-    use[:, NIGHT] = False
+    use = without(scene.visible, NIGHT)
     views = [view for k, view in enumerate(scene.views) if k != NIGHT]
     tracks = exact_tracks(scene, use=use)
     return build_model(
@@ -193,6 +200,24 @@ def test_an_image_that_was_left_out_is_registered_from_a_few_right_matches(rende
     assert after.image(NIGHT + 1).num_points3D > 50
     without = evidence._replace(matches={})
     assert place(before, night, weak=(), evidence=without)[1][0].octave_px is None
+
+
+def test_a_photo_that_went_away_is_not_missed(rendered):
+    """Left out and unreadable: the refinement goes on without it."""
+
+    def read(name):
+        if name == NIGHT_NAME:
+            raise ImageError(f"{name}: cannot be read")
+        return read_of(rendered)(name)
+
+    model = noisy_model(rendered, 0.5, use=without(rendered.visible, NIGHT))
+    model.deregister_frame(model.image(NIGHT + 1).frame_id)
+    evidence = night_matches(rendered, right=20, wrong=0)
+    after, figures = refine_model(
+        model, read, config=Refinement(), refine_intrinsics=False, evidence=evidence
+    )
+    assert after.num_reg_images() == 4 and figures.placed == []
+    assert [p.accepted for p in figures.passes] == [True, True]
 
 
 def test_an_image_of_something_else_is_not_registered(rendered):
