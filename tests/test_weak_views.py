@@ -117,9 +117,12 @@ def test_the_other_views_and_their_observations_stay(rendered):
         if before.image(image_id).name != NIGHT_NAME:
             one, two = (m.image(image_id).cam_from_world().matrix() for m in (before, after))
             np.testing.assert_allclose(one, two, atol=1e-14)
-    (_, old), (_, new) = (read_model_arrays(m, sizes(night)) for m in (before, after))
+    (_, old), (views, new) = (read_model_arrays(m, sizes(night)) for m in (before, after))
     assert (new.view != NIGHT).sum() == (old.view != NIGHT).sum()
-    assert (new.view == NIGHT).sum() > 100
+    own = np.flatnonzero(new.view == NIGHT)
+    assert len(own) > 100 and len(np.unique(new.point[own])) == len(own)
+    off = views[NIGHT].project(new.points[new.point[own]])[0] - new.xy[own]
+    assert np.abs(np.median(off, axis=0)).max() < 0.25
 
 
 def test_a_view_of_something_else_stays_as_it_was(rendered):
