@@ -217,7 +217,7 @@ def daynight(
         to a synthetic night one after the other), or Aachen Day-Night.
       sets: Which scenes, by commas or blanks; default: all.
       methods: By commas or blanks: rootsift, paper-grid and paper (the paper's method at cell
-        centres and relocalized), default, robust; ablations as in `bench wxbs`.
+        centres and relocalized), default, robust; ablations as in `bench wxbs`, and placing.
       severity: Of the synthetic night: 0: day, 1: clean, 2: noisy, 3: dark, 5: noise.
       denoise: Whether the synthetic night's camera removes noise.
       jpeg: Whether it stores JPEG.
