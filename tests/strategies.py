@@ -1,7 +1,10 @@
 """Hypothesis strategies: values are drawn, shapes come from a short menu (each shape compiles)."""
 
+import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
+
+from jaxsfm.core.types import DenseFeatures
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -31,3 +34,24 @@ homographies = st.builds(
     st.sampled_from([0.0, 1e-4, 0.1, 1.0]),
 )
 """Identity, nearly identity, mild and strong."""
+
+
+def random_features(seed: int, shape: tuple[int, int], octaves: int) -> DenseFeatures:
+    """Unit descriptors, some of them blank, in more room than there are cells."""
+    rng = rng_of(seed)
+
+    def levels(grid, room):
+        for k in range(octaves):
+            cells = (grid[0] >> k) * (grid[1] >> k)
+            x = rng.normal(size=(cells, 6)) * (rng.random((cells, 1)) > 0.1)
+            x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+            yield jnp.asarray(np.pad(x, ((0, -(-room // 4**k) - cells), (0, 0))), jnp.float32)
+
+    fine = (2 * shape[0] + 1, 2 * shape[1])
+    return DenseFeatures(
+        tuple(levels(shape, 112)),
+        tuple(levels(fine, 448)),
+        jnp.zeros((448, 2)),
+        jnp.asarray(shape, jnp.int32),
+        jnp.asarray(fine, jnp.int32),
+    )

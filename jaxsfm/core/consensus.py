@@ -8,6 +8,7 @@ consensus networks (Rocco et al. 2018, "Neighbourhood Consensus Networks"), with
 """
 
 import math
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 from jax import lax
@@ -16,6 +17,8 @@ from jaxtyping import Array, Float, Int
 from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.matching import scan_mutual
 from jaxsfm.core.numerics import HIGHEST
+from jaxsfm.core.octaves import blend
+from jaxsfm.core.types import OctavePart
 
 
 def weights(radius: int) -> list[float]:
@@ -23,11 +26,48 @@ def weights(radius: int) -> list[float]:
     return [math.exp(-(d * d) / (2 * radius * radius)) for d in range(-radius, radius + 1)]
 
 
+def _products(
+    a: Float[Array, "n c"],
+    others: Float[Array, "m c"],
+    parts: Sequence[OctavePart],
+    padding: tuple[tuple[int, int], tuple[int, int]],
+) -> Callable[[Array, int], Float[Array, "rows m"]]:
+    """(first row, how many) -> those rows' products, counted in `a` with its padding."""
+    own = a.shape[1] - sum(part.flat.shape[1] for part in parts)
+    rows = jnp.pad(a[:, :own], padding)
+
+    def first_octave(start, count):
+        block = lax.dynamic_slice_in_dim(rows, start, count)
+        return jnp.einsum("nc,mc->nm", block, others[:, :own], precision=HIGHEST)
+
+    if not parts:
+        return first_octave
+    tables, cells, weights, channel, cell = [], [], [], own, 0
+    for part in parts:
+        k, c = part.flat.shape
+        mine = others[:, channel : channel + c]
+        tables.append(jnp.einsum("kc,mc->km", part.flat, mine, precision=HIGHEST))
+        cells.append(jnp.pad(part.cells + cell, padding))
+        weights.append(jnp.pad(part.weights, padding))
+        channel, cell = channel + c, cell + k
+    table, blends = jnp.concatenate(tables), (jnp.stack(cells), jnp.stack(weights))
+
+    def all_octaves(start, count):
+        each = [lax.dynamic_slice_in_dim(x, start, count, axis=1) for x in blends]
+        # A loop, because XLA would fuse the sums into the votes and repeat them for all nine.
+        return lax.scan(
+            lambda total, at: (total + blend(table, *at), None), first_octave(start, count), each
+        )[0]
+
+    return all_octaves
+
+
 def consensus_nn(
     a: Float[Array, "n c"],
     b: Float[Array, "m c"],
     grid0: Int[Array, " 2"],
     grid1: Int[Array, " 2"],
+    parts: Sequence[OctavePart] = (),
     *,
     radius: int,
     columns: int,
@@ -39,9 +79,14 @@ def consensus_nn(
     of S' exist at a time, from the products of `tile` rows and of a margin on either side that
     holds their neighbours: with cells in row order, a shift of the cell is a shift of the product.
 
+    Where channels of `a` are blends of a smaller octave's cells, so are their products, and there
+    is one product per cell of that octave: for four octaves a third of the arithmetic, and half of
+    the time on a CPU. These products, a third of n x m in all, exist at once.
+
     Args:
       a, b: unit descriptors, cell (row, column) at row * columns + column, zero past the grid.
       grid0, grid1: (rows, columns).
+      parts: what the last channels of `a` are made of.
       radius: 1: 3 x 3 cells, 2: 5 x 5.
       columns: at least those of either grid; fixes the margin. A wider grid has no matches.
 
@@ -52,8 +97,8 @@ def consensus_nn(
         raise ValueError(f"radius and columns must be at least 1; got {radius}, {columns}")
     n, m = a.shape[0], b.shape[0]
     tile, margin = min(tile, n), radius * (columns + 1)
-    rows = jnp.pad(a, ((margin, -n % tile + margin), (0, 0)))
     others = jnp.pad(b, ((margin, margin), (0, 0)))
+    product = _products(a, others, parts, ((margin, -n % tile + margin), (0, 0)))
     alive0 = jnp.pad(jnp.any(a != 0, axis=1), (0, -n % tile))
     alive1 = jnp.any(b != 0, axis=1)
     column0 = cell_rows_cols(n + -n % tile, grid0[1])[1]
@@ -62,15 +107,14 @@ def consensus_nn(
     kernel = list(zip(range(-radius, radius + 1), weights(radius), strict=True))
 
     def scores(start):
-        block = lax.dynamic_slice_in_dim(rows, start, tile + 2 * margin)
-        product = jnp.einsum("nc,mc->nm", block, others, precision=HIGHEST)
+        block = product(start, tile + 2 * margin)
         at = lax.dynamic_slice_in_dim(column0, start, tile)
         total = jnp.zeros((tile, m), a.dtype)
         for right, w in kernel:
             line = jnp.zeros((tile, m), a.dtype)
             for down, v in kernel:
                 corner = (margin + down * grid0[1] + right, margin + down * grid1[1] + right)
-                line += v * lax.dynamic_slice(product, corner, (tile, m))
+                line += v * lax.dynamic_slice(block, corner, (tile, m))
             # The cell before a row's first one is the last of another row: not a neighbour.
             inside0 = (at + right >= 0) & (at + right < grid0[1])
             inside1 = (column1 + right >= 0) & (column1 + right < grid1[1])

@@ -14,14 +14,19 @@ def squared_norm(x: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
     return jnp.sum(x * x, axis=-1)
 
 
-def unit(x: Float[Array, "*batch c"]) -> Float[Array, "*batch c"]:
-    """L2-normalise the last axis; an all-zero vector stays zero and has a finite gradient.
+def inverse_norm(x: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
+    """1 / L2 norm over the last axis; 0 for an all-zero vector, with a finite gradient.
 
     The dead branch is made safe before `where`: otherwise its gradient is NaN.
     """
-    square = squared_norm(x)[..., None]
+    square = squared_norm(x)
     safe = jnp.where(square > 0, square, 1.0)
-    return jnp.where(square > 0, x * lax.rsqrt(safe), 0.0)
+    return jnp.where(square > 0, lax.rsqrt(safe), 0.0)
+
+
+def unit(x: Float[Array, "*batch c"]) -> Float[Array, "*batch c"]:
+    """L2-normalise the last axis; an all-zero vector stays zero and has a finite gradient."""
+    return x * inverse_norm(x)[..., None]
 
 
 def argmax_first(x: Float[Array, "*shape"], *, axis: int) -> tuple[Array, Array]:

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsfm.core.grid import cell_rows_cols
-from jaxsfm.core.numerics import unit
-from jaxsfm.core.types import DenseFeatures, JoinedFeatures
+from jaxsfm.core.numerics import inverse_norm
+from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart
 
 OCTAVE_WEIGHT = 0.5
 """Of an octave's products, relative to the octave before: 1, 1/2, 1/4, ... Equal weights find a
@@ -47,43 +47,58 @@ def _between(
     return first, jnp.minimum(first + 1, last), place - jnp.floor(place)
 
 
-def _join(octaves: Sequence[Array], grid: Int[Array, " 2"]) -> Float[Array, "n kc"]:
+def blend(
+    rows: Float[Array, "k c"], cells: Int[Array, "n 4"], weights: Float[Array, "n 4"]
+) -> Float[Array, "n c"]:
+    """Weighted sums of four rows each."""
+
+    def nth(i):
+        return weights[:, i : i + 1] * jnp.take(rows, cells[:, i], axis=0, mode="clip")
+
+    return (nth(0) + nth(1)) + (nth(2) + nth(3))
+
+
+def _join(
+    octaves: Sequence[Array], grid: Int[Array, " 2"]
+) -> tuple[Float[Array, "n kc"], tuple[OctavePart, ...]]:
     """The octaves' unit descriptors at the first one's cells, each times the root of its weight,
-    side by side, unit together.
+    side by side, unit together; and what the channels after the first octave's are made of.
 
     Between the centres of coarser cells: bilinear; beyond the outermost: theirs.
     """
+    first = octaves[0]
     if len(octaves) == 1:
-        return octaves[0]
-    n = octaves[0].shape[0]
-    row, col = cell_rows_cols(n, grid[1])
-    parts = [octaves[0]]
+        return first, ()
+    row, col = cell_rows_cols(first.shape[0], grid[1])
+    # A cell that shows nothing at full size has no keypoint worth matching either.
+    shown = (row < grid[0]) & jnp.any(first != 0, axis=1)
+    columns, parts = [first], []
     for k, flat in enumerate(octaves[1:], start=1):
         rows, cols = grid[0] >> k, grid[1] >> k
         y0, y1, down = _between(row, rows, k)
         x0, x1, right = _between(col, cols, k)
-
-        def at(y, x, weight, flat=flat, cols=cols):
-            return weight[:, None] * jnp.take(flat, y * cols + x, axis=0, mode="clip")
-
-        above = at(y0, x0, (1 - down) * (1 - right)) + at(y0, x1, (1 - down) * right)
-        total = above + at(y1, x0, down * (1 - right)) + at(y1, x1, down * right)
-        there = (row < grid[0]) & (rows > 0) & (cols > 0)
-        share = math.sqrt(OCTAVE_WEIGHT**k)
-        parts.append(jnp.where(there[:, None], share * unit(total), 0.0))
-    # A cell that shows nothing at full size has no keypoint worth matching either.
-    return jnp.where(
-        jnp.any(octaves[0] != 0, axis=1)[:, None], unit(jnp.concatenate(parts, axis=1)), 0.0
-    )
+        cells = jnp.stack([y0 * cols + x0, y0 * cols + x1, y1 * cols + x0, y1 * cols + x1], axis=1)
+        weights = jnp.stack(
+            [(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=1
+        )
+        total = blend(flat, cells, weights)
+        share = jnp.where(shown, math.sqrt(OCTAVE_WEIGHT**k), 0.0) * inverse_norm(total)
+        columns.append(share[:, None] * total)
+        parts.append(OctavePart(flat, cells, share[:, None] * weights))
+    joined = jnp.concatenate(columns, axis=1)
+    scale = jnp.where(shown, inverse_norm(joined), 0.0)[:, None]
+    return joined * scale, tuple(p._replace(weights=p.weights * scale) for p in parts)
 
 
 def join_octaves(features: DenseFeatures) -> JoinedFeatures:
     """What an image brings to a pair: products of these descriptors are weighted means over the
     octaves."""
+    coarse, parts = _join(features.coarse, features.coarse_grid)
     return JoinedFeatures(
-        coarse=_join(features.coarse, features.coarse_grid),
-        fine=_join(features.fine, features.fine_grid),
+        coarse=coarse,
+        fine=_join(features.fine, features.fine_grid)[0],
         keypoints=features.keypoints,
         coarse_grid=features.coarse_grid,
         fine_grid=features.fine_grid,
+        coarse_parts=parts,
     )

@@ -42,6 +42,17 @@ class DenseFeatures(NamedTuple):
     """(rows, columns) of the first octave's pool3 grid."""
 
 
+class OctavePart(NamedTuple):
+    """A smaller octave's channels of joined descriptors: weighted sums over its own cells."""
+
+    flat: Float[Array, "k c"]
+    """The octave's descriptors."""
+    cells: Int[Array, "n 4"]
+    """The four of them around every joined cell."""
+    weights: Float[Array, "n 4"]
+    """Zero for cells without this octave."""
+
+
 class JoinedFeatures(NamedTuple):
     """What one image brings to a pair, its octaves joined (`jaxsfm.core.octaves`).
 
@@ -58,6 +69,8 @@ class JoinedFeatures(NamedTuple):
     """(rows, columns) of the pool4 grid."""
     fine_grid: Int[Array, " 2"]
     """(rows, columns) of the pool3 grid."""
+    coarse_parts: tuple[OctavePart, ...] = ()
+    """What the last channels of `coarse` are made of, octave after octave."""
 
 
 class Thresholds(NamedTuple):

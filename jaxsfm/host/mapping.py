@@ -18,8 +18,9 @@ from jaxsfm.host.native import native
 from jaxsfm.host.pairs import Pair, component_of
 
 Mapper = Literal["incremental", "global"]
-MISSING = 0.05
-"""Share of the connected images whose absence is a reason to start again."""
+MISSING = 0.1
+"""Share of the connected images up to which an absence is no reason to start again: one of ten
+lacks matches, not another start, and further starts are two more runs of the mapper."""
 MAX_RETRIES = 2
 """Further initial pairs tried when the mapper's own choice leaves connected images out."""
 

@@ -6,12 +6,14 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import rng_of, seeds, unit_rows
+from strategies import random_features, rng_of, seeds, unit_rows
 from tolerances import NEAR_TIE
 
 from jaxsfm.core.consensus import consensus_nn, weights
 from jaxsfm.core.matching import mutual_nn
+from jaxsfm.core.octaves import join_octaves
 
+join = jax.jit(join_octaves)
 _match = jax.jit(consensus_nn, static_argnames=("radius", "columns", "tile"))
 
 
@@ -45,6 +47,19 @@ def test_tiled_consensus_equals_the_sum_over_shifts(seed, shapes, radius, tile):
     decided = margin > NEAR_TIE
     got = np.asarray(match(a, b, grid0, grid1, radius=radius, tile=tile))
     np.testing.assert_array_equal(got[decided], expected[decided])
+    assert decided.mean() >= 0.7
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds, st.sampled_from(SHAPES), st.sampled_from([7, 60]), st.sampled_from([2, 4]))
+def test_products_of_octaves_are_blends_of_their_cells_products(seed, shapes, tile, octaves):
+    joined = [join(random_features(seed + k, shape, octaves)) for k, shape in enumerate(shapes)]
+    a, b = (np.asarray(x.coarse) for x in joined)
+    grid0, grid1 = (x.coarse_grid for x in joined)
+    expected, margin = oracles.consensus_nn(a, b, grid0, grid1, weights(1))
+    decided = margin > NEAR_TIE
+    got = match(a, b, grid0, grid1, joined[0].coarse_parts, radius=1, tile=tile)
+    np.testing.assert_array_equal(np.asarray(got)[decided], expected[decided])
     assert decided.mean() >= 0.7
 
 

@@ -8,7 +8,7 @@ import pytest
 import tolerances
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import rng_of, seeds
+from strategies import random_features, rng_of, seeds
 
 from jaxsfm.config import Config, preset
 from jaxsfm.core.octaves import OCTAVE_WEIGHT, halve, join_octaves
@@ -18,27 +18,6 @@ from jaxsfm.host.images import WorkingImage
 
 join = jax.jit(join_octaves)
 SHAPES = [(8, 12), (5, 7), (9, 4), (1, 6), (3, 3)]
-
-
-def random_features(seed: int, shape: tuple[int, int], octaves: int) -> DenseFeatures:
-    """Unit descriptors, some of them blank, in more room than there are cells."""
-    rng = rng_of(seed)
-
-    def levels(grid, room):
-        for k in range(octaves):
-            cells = (grid[0] >> k) * (grid[1] >> k)
-            x = rng.normal(size=(cells, 6)) * (rng.random((cells, 1)) > 0.1)
-            x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
-            yield jnp.asarray(np.pad(x, ((0, -(-room // 4**k) - cells), (0, 0))), jnp.float32)
-
-    fine = (2 * shape[0] + 1, 2 * shape[1])
-    return DenseFeatures(
-        tuple(levels(shape, 112)),
-        tuple(levels(fine, 448)),
-        jnp.zeros((448, 2)),
-        jnp.asarray(shape, jnp.int32),
-        jnp.asarray(fine, jnp.int32),
-    )
 
 
 @settings(max_examples=30, deadline=None)
