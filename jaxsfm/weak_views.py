@@ -18,13 +18,9 @@ from jaxsfm.config import Refinement
 from jaxsfm.host.model import Sizes, Tracks, View, build_model, read_model_arrays
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.resection import find_view
-from jaxsfm.placing import Followed, Pose, follow
+from jaxsfm.placing import Followed, Pose, follow, trusted
 from jaxsfm.track_alignment import ReadGray
 
-MIN_SHARE = 0.1
-"""Least share of the points it could see that an image must agree with, at one octave at least. At
-wrong poses 0.2 to 3 % agree by chance, at right ones 20 to 50 % at an eighth of the size
-(docs/design.md)."""
 REACH_PX = 16.0
 """A match lies on the surface of an observation this near, working pixels: two fine cells."""
 MATCH_ERROR_PX = 12.0
@@ -159,9 +155,9 @@ def place_weak_views(
         follow([pose for mine in poses.values() for pose in mine], views, structure, read, config)
     figures, best = [], {}
     for k, mine in poses.items():
-        right = [p.best for p in mine if p.best is not None and p.share >= MIN_SHARE]
+        right = [pose for pose in map(trusted, mine) if pose is not None]
         if right:
-            best[k] = min(right, key=lambda pose: pose.doubt)
+            best[k] = min(right, key=lambda pose: pose.doubt_px)
         figures.append(_figures(images[k].name, k < len(views), mine, best.get(k)))
     if not best:
         return model, figures
@@ -203,7 +199,7 @@ def _figures(name: str, registered: bool, mine: list[Followed], best: Pose | Non
         name=name,
         registered=registered,
         octave_px=best.octave_px if best else None,
-        candidates=best.observed.candidates if best else most.candidates if most else 0,
+        candidates=len(best.observed.could) if best else most.candidates if most else 0,
         agreed=best.agreed if best else most.agreed if most else 0,
         error_px=best.error_px if best else None,
     )

@@ -18,6 +18,7 @@ from room_scene import (
     template,
 )
 
+from jaxsfm import surface, weak_views
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.evaluation import evaluate
@@ -25,7 +26,6 @@ from jaxsfm.host.images import ImageError
 from jaxsfm.host.model import build_model, read_model_arrays
 from jaxsfm.host.pairs import PairResult, make_pair
 from jaxsfm.host.poses import model_poses
-from jaxsfm.placing import at_octave
 from jaxsfm.refine import refine_model
 from jaxsfm.track_alignment import align_blocks
 from jaxsfm.weak_views import NO_EVIDENCE, Evidence, LeftOut, place_weak_views
@@ -279,17 +279,31 @@ def test_targets_are_a_part_of_all_views(rendered):
     np.testing.assert_array_equal(some.agrees, every.agrees[mine])
 
 
-@pytest.mark.parametrize("px", [1, 2, 8])
-def test_an_octaves_pixels_are_means_and_lie_where_they_lay(rendered, px):
-    tracks = exact_tracks(rendered)
-    views, smaller, read = at_octave(px, rendered.views, tracks, read_of(rendered))
-    at, _ = views[0].project(rendered.points[:50])
-    whole, _ = rendered.views[0].project(rendered.points[:50])
-    np.testing.assert_allclose((at + 0.5) * px - 0.5, whole)
-    np.testing.assert_allclose((smaller.xy + 0.5) * px - 0.5, tracks.xy)
-    image, scale = read("0.png")
-    assert image.shape[::-1] == views[0].size == (SIZE[0] // px, SIZE[1] // px)
-    assert scale == (px, px)
-    np.testing.assert_allclose(
-        image[3, 5], rendered.images["0.png"][3 * px : 4 * px, 5 * px : 6 * px].mean(), rtol=1e-5
+def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendered):
+    before = without_night(rendered)
+    evidence = night_matches(rendered, right=30, wrong=0)
+    assert {pair[0] == NIGHT_NAME for pair in evidence.matches} == {True, False}
+    views, tracks = read_model_arrays(before, sizes(rendered))
+    normal = surface.normals(tracks, views, neighbours=16)
+    xy, points = weak_views._matched_points(
+        rendered.views[NIGHT], views, tracks, normal, evidence.matches
     )
+    off = np.linalg.norm(rendered.views[NIGHT].project(points)[0] - xy, axis=1)
+    assert len(off) > 60 and np.median(off) < 6 and np.quantile(off, 0.9) < 12
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_shared_camera_is_no_views_own(monkeypatch, rendered, own):
+    before = lost_view(rendered)
+    if own:
+        alone = pycolmap.Camera(before.camera(1).todict())
+        alone.camera_id = 2
+        views, tracks = read_model_arrays(before, sizes(rendered))
+        views[NIGHT] = dataclasses.replace(views[NIGHT], camera=alone)
+        before = build_model(before, views, tracks)
+    followed = []
+    monkeypatch.setattr(weak_views, "follow", lambda poses, *_: followed.extend(poses))
+    place(before, rendered, refine_intrinsics=True)
+    assert [pose.own_camera for pose in followed] == [own]
+    place(before, rendered, refine_intrinsics=False)
+    assert not followed[-1].own_camera
