@@ -95,6 +95,14 @@ def test_a_view_of_photons_is_placed_where_it_is(rendered, turn_deg, shift):
     assert position < 0.01 and rotation < 0.15
 
 
+def test_an_octave_is_repeated_until_the_view_stands_still(rendered):
+    """One step each leaves 0.004 and 0.055 deg: the first finds half of the points."""
+    night = by_night(rendered)
+    model, (placed,) = place(lost_view(night, turn_deg=0.5), night, weak_octaves=2)
+    position, rotation = night_error(model, night)
+    assert placed.octave_px == 2 and position < 0.002 and rotation < 0.035
+
+
 def test_refinement_places_a_view_that_it_cannot_align(rendered):
     night = by_night(rendered)
     tracks = exact_tracks(night)
