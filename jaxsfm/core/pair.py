@@ -58,7 +58,7 @@ def match_pair(
             joined1.coarse,
             joined0.coarse_grid,
             joined1.coarse_grid,
-            joined0.coarse_parts,
+            parts=joined0.coarse_parts,
             radius=shape.consensus,
             columns=shape.coarse_columns,
             tile=shape.coarse_tile,

@@ -58,7 +58,8 @@ def test_products_of_octaves_are_blends_of_their_cells_products(seed, shapes, ti
     grid0, grid1 = (x.coarse_grid for x in joined)
     expected, margin = oracles.consensus_nn(a, b, grid0, grid1, weights(1))
     decided = margin > NEAR_TIE
-    got = match(a, b, grid0, grid1, joined[0].coarse_parts, radius=1, tile=tile)
+    parts = joined[0].coarse_parts
+    got = match(a, b, grid0, grid1, parts=parts, radius=1, tile=tile)
     np.testing.assert_array_equal(np.asarray(got)[decided], expected[decided])
     assert decided.mean() >= 0.7
 
