@@ -27,8 +27,8 @@ MAX_DOUBT_PX = 1.0
 """Of a trusted pose, working pixels. Followed from wrong poses nothing is below 2; at right ones
 0.2 to 0.7."""
 MAX_STEPS, STILL_PX = 4, 0.5
-"""An octave's steps end when the median point moves by less, pixels of the octave. A start 0.5 m
-off agreed with 8 % of what it could see at its first step, and with 15 % at home."""
+"""An octave's steps end when the median point moves by less, pixels of the octave. From 6.5 m
+off, 8 % of what a view could see agreed at the first step, 15 % at the second."""
 STEP = 1e-6
 """Of numerical derivatives; projections are float64."""
 MEDIAN_RADIUS = 1.1774

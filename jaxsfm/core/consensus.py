@@ -42,15 +42,15 @@ def _products(
 
     if not parts:
         return first_octave
-    tables, cells, weights, channel, cell = [], [], [], own, 0
+    tables, cells, shares, channel, cell = [], [], [], own, 0
     for part in parts:
         k, c = part.flat.shape
         mine = others[:, channel : channel + c]
         tables.append(jnp.einsum("kc,mc->km", part.flat, mine, precision=HIGHEST))
         cells.append(jnp.pad(part.cells + cell, padding))
-        weights.append(jnp.pad(part.weights, padding))
+        shares.append(jnp.pad(part.weights, padding))
         channel, cell = channel + c, cell + k
-    table, blends = jnp.concatenate(tables), (jnp.stack(cells), jnp.stack(weights))
+    table, blends = jnp.concatenate(tables), (jnp.stack(cells), jnp.stack(shares))
 
     def all_octaves(start, count):
         each = [lax.dynamic_slice_in_dim(x, start, count, axis=1) for x in blends]
