@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from room_scene import SIZE, Room, exact_tracks, read_of
 
+from jaxsfm import placing
+from jaxsfm.config import Refinement
 from jaxsfm.host.resection import adjust_view
-from jaxsfm.placing import Followed, Observed, Pose, _doubt, at_octave, trusted
+from jaxsfm.placing import Followed, Observed, Pose, _doubt, at_octave, follow, trusted
 
 NIGHT = 2
 
@@ -78,6 +80,36 @@ def test_a_pose_is_trusted_with_little_doubt_and_enough_that_agrees(
     pose = Followed(view=view, own_camera=False, best=best, share=share)
     assert trusted(pose) is (best if right else None)
     assert trusted(dataclasses.replace(pose, best=None)) is None
+
+
+def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_best(
+    rendered, monkeypatch
+):
+    start, end, last = rendered.views[NIGHT], rendered.views[0], rendered.views[1]
+    seen = observed(rendered, np.arange(40), 1.0)
+    found = {"doubtful": 0.8, "sure": 0.3, "lost": None}
+    poses = {name: Followed(view=start, own_camera=False) for name in found}
+    began = []
+
+    def descend(moving, *_):
+        names = [next(n for n, p in poses.items() if p is pose) for pose in moving]
+        began.append([(name, poses[name].view) for name in names])
+        for name in names:
+            doubt_px = found[name]
+            best = Pose(end, 2, seen, 40, 1.0, doubt_px) if doubt_px else None
+            poses[name].view, poses[name].best = last, best
+
+    monkeypatch.setattr(placing, "_descend", descend)
+    follow(
+        list(poses.values()),
+        rendered.views,
+        exact_tracks(rendered),
+        read_of(rendered),
+        Refinement(),
+    )
+    first, second = began
+    assert [(name, view is start) for name, view in first] == [(name, True) for name in found]
+    assert [(name, view is end) for name, view in second] == [("doubtful", True)]
 
 
 @pytest.mark.parametrize("px", [1, 2, 8])
