@@ -24,8 +24,8 @@ MIN_SHARE = 0.05
 """Least share of the points it could see that an image must agree with, at one octave at least. At
 wrong poses up to 7 % agree, at right ones 8 to 70 % at an eighth of the size (docs/design.md)."""
 MAX_DOUBT_PX = 1.0
-"""Of a trusted pose, working pixels; of right ones 0.2 to 0.7. Of 24 followed from wrong starts (castle-P19 0016)
-one ends at 0.95 (1.5 % agree there), the others above 1.6 or without any."""
+"""Of a trusted pose, working pixels; of right ones 0.2 to 0.7. Of 24 followed from wrong starts
+(castle-P19 0016) one ends at 0.95, where 1.5 % agree, the others above 1.6 or without any."""
 MAX_DESCENTS, SURE_PX = 2, 0.5
 """A pose that ends in more doubt, working pixels, is followed over all octaves once more, from
 where it was best: one that came home only at the last octave finds more at the first (castle-P19
