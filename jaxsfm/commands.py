@@ -139,7 +139,8 @@ def match(
       image0: The first image.
       image1: The second image.
       out: File.npz with keypoints0, keypoints1 (n x 2, original pixels, centre of the top-left
-        pixel (0, 0)), plane (n) and homographies (p x 3 x 3, image 0 to image 1).
+        pixel (0, 0)), aligned (n: keypoints1 is sub-pixel), plane (n) and homographies
+        (p x 3 x 3, image 0 to image 1).
       plot: Picture of the matches, a colour for each plane.
       preset: See reconstruct.
       max_size: Longer side of the working images, pixels.
@@ -155,7 +156,7 @@ def match(
     from jaxsfm.host.images import inspect_image, read_image
     from jaxsfm.host.weights import load_weights
     from jaxsfm.host.workfolder import atomic_file
-    from jaxsfm.pipeline import match_features, on_device
+    from jaxsfm.pipeline import align, match_features, on_device
     from jaxsfm.run import check_seed
 
     check_seed(seed)
@@ -163,11 +164,14 @@ def match(
     weights = on_device(load_weights())
     features = [image_features(weights, file, config=config) for file in files]
     result = match_features(features[0], features[1], config=config, seed=seed)
+    keypoints1, aligned = align(result, files[0], files[1], config=config)
+    result = dataclasses.replace(result, keypoints1=keypoints1.astype(np.float32))
     with atomic_file(out) as file:
         np.savez(
             file,
             keypoints0=result.keypoints0,
             keypoints1=result.keypoints1,
+            aligned=aligned,
             plane=result.plane,
             homographies=result.homographies,
         )
@@ -187,7 +191,7 @@ def match(
         save_figure(figure, plot)
     print(
         f"{result.num_inliers} matches on {len(result.homographies)} planes "
-        f"({result.num_tentative} tentative): {out}"
+        f"({result.num_tentative} tentative, {aligned.sum()} aligned): {out}"
     )
     return 0
 

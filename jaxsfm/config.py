@@ -133,6 +133,10 @@ class Config:
     confidence: float = 0.999
     """RANSAC stops when a better plane has been missed with less than 1 - confidence."""
     pair: PairShape = dataclasses.field(default_factory=PairShape)
+    aligned_octaves: int = 0
+    """Sizes (working size, half of it, ...) at which the matches of a single pair are aligned to a
+    fraction of a pixel (`jaxsfm.pair_alignment`); 0: they stay as they were verified. Models have
+    aligned tracks instead."""
     view_graph: bool = False
     """Hand on only pairs that the view graph trusts (`jaxsfm.host.viewgraph`)."""
     refinement: Refinement | None = None
@@ -146,7 +150,7 @@ class Config:
     def matching(self) -> dict[str, object]:
         """The part that the matches depend on, as plain data."""
         parts = dataclasses.asdict(self)
-        del parts["view_graph"], parts["refinement"]
+        del parts["aligned_octaves"], parts["view_graph"], parts["refinement"]
         return parts
 
     def __post_init__(self) -> None:
@@ -156,6 +160,10 @@ class Config:
             raise ValueError(f"enlarge must be at least 1; got {self.enlarge}")
         if not 1 <= self.octaves <= MAX_OCTAVES:
             raise ValueError(f"octaves must lie in 1..{MAX_OCTAVES}; got {self.octaves}")
+        if not 0 <= self.aligned_octaves <= MAX_OCTAVES:
+            raise ValueError(
+                f"aligned_octaves must lie in 0..{MAX_OCTAVES}; got {self.aligned_octaves}"
+            )
         if self.keypoints not in ("relocalized", "grid"):
             raise ValueError(f"keypoints must be 'relocalized' or 'grid'; got {self.keypoints!r}")
         if not self.threshold_px > 0:
@@ -176,6 +184,7 @@ _DEFAULT = Config(
     octaves=4,
     centred=True,
     pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
+    aligned_octaves=4,
     view_graph=True,
     refinement=Refinement(),
 )
@@ -187,8 +196,8 @@ PRESETS: dict[str, Config] = {
 """`paper`: the constants of the authors' code. `default`: octaves, centred descriptors and
 neighbourhood consensus (night, seasons, weather), local refits iterated (one refit leaves up to a
 fifth of a plane's inliers behind, tests/core/test_ransac.py), planes that compete, the most similar
-of a cell's several matches, the view graph and the refinement. `robust`: default, and small images
-enlarged up to twice; they then take as long as large ones."""
+of a cell's several matches, aligned matches of single pairs, the view graph and the refinement.
+`robust`: default, and small images enlarged up to twice; they then take as long as large ones."""
 
 
 def preset(name: str) -> Config:

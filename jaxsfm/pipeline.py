@@ -32,6 +32,8 @@ from jaxsfm.host.images import (
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.viewgraph import Verdict, trusted_pairs
 from jaxsfm.host.weights import Weights
+from jaxsfm.pair_alignment import AlignedMatches, align_matches
+from jaxsfm.patches import gray
 
 if TYPE_CHECKING:
     import pycolmap
@@ -40,8 +42,6 @@ if TYPE_CHECKING:
     from jaxsfm.host.mapping import Attempt, MapOptions
     from jaxsfm.refine import RefinementFigures
 
-LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
-"""Intensity of an RGB pixel (ITU-R BT.601)."""
 GRAYS = 64
 """Decoded images kept during refinement: 8 MB each at 1600 x 1200."""
 logger = logging.getLogger("jaxsfm")
@@ -155,6 +155,38 @@ def to_original_pixels(
         num_tentative=int(found.num_tentative),
         num_dropped=int(found.num_dropped),
         status=Status(int(found.status)),
+    )
+
+
+def align(
+    result: PairResult, image0: ImageFile, image1: ImageFile, *, config: Config
+) -> AlignedMatches:
+    """The matches with second keypoints to a fraction of a pixel, where the two images agree.
+
+    For one pair: in a reconstruction a keypoint is shared by all pairs of its image, and
+    `jaxsfm.refine` aligns whole tracks.
+
+    Args:
+      result: of `match_features` with the same images and config.
+
+    Raises:
+      ImageError: an image cannot be decoded.
+    """
+    if not config.aligned_octaves or not result.num_inliers:
+        still = np.zeros(result.num_inliers, bool)
+        return AlignedMatches(result.keypoints1.astype(np.float64), still)
+    first, second = (
+        read_image(image, max_size=config.max_size, enlarge=config.enlarge)
+        for image in (image0, image1)
+    )
+    return align_matches(
+        result,
+        gray(first.rgb),
+        gray(second.rgb),
+        first.scale,
+        second.scale,
+        octaves=config.aligned_octaves,
+        max_error_px=config.threshold_px,
     )
 
 
@@ -277,9 +309,9 @@ def _refine(
     from jaxsfm.weak_views import Evidence, LeftOut
 
     @functools.lru_cache(maxsize=GRAYS)
-    def gray(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+    def read_gray(name: str) -> tuple[np.ndarray, tuple[float, float]]:
         rgb, scale = read(name)
-        return rgb.astype(np.float32) @ LUMA, scale
+        return gray(rgb), scale
 
     refined, figures = [], []
     mapped = {name for model in models for name in registered(model)}
@@ -288,7 +320,7 @@ def _refine(
         try:
             new, done = refine_model(
                 model,
-                gray,
+                read_gray,
                 config=config,
                 refine_intrinsics=options.refine_intrinsics,
                 evidence=Evidence(matches, left_out, options.seed),

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from jaxsfm.config import Refinement
 from jaxsfm.host.model import Tracks, View
 from jaxsfm.host.resection import adjust_view
-from jaxsfm.track_alignment import ReadGray, align_blocks
+from jaxsfm.patches import ReadGray, block_means
+from jaxsfm.track_alignment import align_blocks
 
 MIN_COUNT = 30
 """Fewest points that must agree at an octave for its pose to count."""
@@ -105,9 +106,7 @@ def at_octave(
 
     def reduced(name: str) -> tuple[np.ndarray, tuple[float, float]]:
         gray, (sx, sy) = read(name)
-        h, w = (side // octave_px for side in gray.shape)
-        blocks = gray[: h * octave_px, : w * octave_px].reshape(h, octave_px, w, octave_px)
-        return blocks.mean((1, 3)), (sx * octave_px, sy * octave_px)
+        return block_means(gray, octave_px), (sx * octave_px, sy * octave_px)
 
     smaller = [
         dataclasses.replace(

@@ -26,7 +26,8 @@ from jaxsfm.host.model import (
     read_model_arrays,
     select,
 )
-from jaxsfm.track_alignment import AlignedBlock, ReadGray, align_blocks
+from jaxsfm.patches import ReadGray
+from jaxsfm.track_alignment import AlignedBlock, align_blocks
 from jaxsfm.weak_views import NO_EVIDENCE, Evidence, Placed, place_weak_views
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 their reference patches, block by block of points.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -11,19 +11,13 @@ import numpy as np
 from jaxsfm import surface
 from jaxsfm.config import Refinement
 from jaxsfm.core import align as align_core
-from jaxsfm.host import interrupt
 from jaxsfm.host.model import Tracks, View
+from jaxsfm.patches import ReadGray, chunks, padded
 
-ReadGray = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
-"""Image name -> float32 (h, w) intensities of the working image, original pixels per pixel."""
-CHUNK = 4096
-"""Keypoints aligned by one call of the compiled program."""
 CELLS = 10_000_000
 """Points times views looked at together; about 100 bytes each, and 2.7 kB for each point."""
 MIN_BLOCK, MAX_BLOCK = 1000, 100_000
 """Points of a block, whatever the number of views."""
-PAD = 128
-"""Maps are padded to multiples of this, so that few image sizes mean few compilations."""
 
 
 class AlignedBlock(NamedTuple):
@@ -44,22 +38,6 @@ class AlignedBlock(NamedTuple):
     """Candidates that are observations of the old tracks."""
 
 
-def _padded(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    h, w = image.shape
-    wide = np.pad(image, ((0, -h % PAD), (0, -w % PAD)))
-    return wide[..., None], np.asarray([h, w], np.int32)
-
-
-def _chunks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-    """Rows in pieces of CHUNK, the last one filled up with its first row, and how many count."""
-    for start in range(0, len(rows), CHUNK):
-        piece = rows[start : start + CHUNK]
-        filled = np.full(CHUNK, piece[0])
-        filled[: len(piece)] = piece
-        interrupt.check()
-        yield filled, len(piece)
-
-
 def _templates(
     reference: np.ndarray,
     xy: np.ndarray,
@@ -78,8 +56,8 @@ def _templates(
         np.zeros(n, bool),
     ]
     for k in np.unique(reference[wanted]):
-        image, size = _padded(read(views[k].name)[0])
-        for piece, count in _chunks(wanted[reference[wanted] == k]):
+        image, size = padded(read(views[k].name)[0])
+        for piece, count in chunks(wanted[reference[wanted] == k]):
             made = align_core.make_templates(
                 image,  # pyright: ignore[reportArgumentType]
                 size,  # pyright: ignore[reportArgumentType]
@@ -104,8 +82,8 @@ def _align(
     moved = found.start.copy()
     agrees = np.zeros(len(moved), bool)
     for k in np.unique(found.view):
-        image, size = _padded(read(views[k].name)[0])
-        for piece, count in _chunks(np.flatnonzero(found.view == k)):
+        image, size = padded(read(views[k].name)[0])
+        for piece, count in chunks(np.flatnonzero(found.view == k)):
             result = jax.device_get(
                 align_core.align(
                     image,  # pyright: ignore[reportArgumentType]

@@ -18,8 +18,8 @@ from jaxsfm.config import Refinement
 from jaxsfm.host.model import Sizes, Tracks, View, build_model, read_model_arrays
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.resection import find_view
+from jaxsfm.patches import ReadGray
 from jaxsfm.placing import Followed, Pose, follow, trusted
-from jaxsfm.track_alignment import ReadGray
 
 REACH_PX = 16.0
 """A match lies on the surface of an observation this near, working pixels: two fine cells."""

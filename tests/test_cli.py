@@ -168,6 +168,7 @@ def test_match_writes_arrays_and_a_picture_in_original_pixels(scene, tmp_path, c
         xy = xy @ arrays["homographies"][plane].T
         error = np.linalg.norm(xy[:, :2] / xy[:, 2:] - arrays["keypoints1"][member], axis=1)
         assert error.max() < 10.1
+    assert arrays["aligned"].shape == (n,) and arrays["aligned"].mean() > 0.3
     assert cv2.imread(str(plot)).std() > 10
     assert f"{n} matches" in capsys.readouterr().out
 

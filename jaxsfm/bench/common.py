@@ -28,11 +28,13 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
     "no-enlarging": lambda c: dataclasses.replace(c, enlarge=1.0),
     "no-consensus": lambda c: _with_pair(c, consensus=0),
     "no-competition": lambda c: _with_pair(c, plane_rounds=0),
+    "no-alignment": lambda c: dataclasses.replace(c, aligned_octaves=0),
     "no-placing": lambda c: dataclasses.replace(
         c, refinement=c.refinement and dataclasses.replace(c.refinement, weak_octaves=0)
     ),
 }
-"""One idea left out of a preset: METHOD-no-IDEA. The last one changes models, not matches."""
+"""One idea left out of a preset: METHOD-no-IDEA. Without placing models change, not matches;
+without alignment matches of single pairs, not models."""
 ABLATED = tuple(
     f"{name}-{idea}"
     for name in ("default", "robust")
@@ -40,12 +42,13 @@ ABLATED = tuple(
     if without(preset(name)) != preset(name)
 )
 PAIR_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-placing"))
+RUN_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-alignment"))
 
 
 def method_config(method: str, *, max_size: int | None = None) -> Config:
     """A preset by its name; PRESET-no-IDEA: without that idea (`ABLATIONS`); paper-grid: paper at
-    cell centres; grid and reloc: the default preset without refinement, at cell centres or
-    relocalized.
+    cell centres; grid and reloc: the default preset without refinement and alignment, at cell
+    centres or relocalized.
 
     Args:
       max_size: longer side of the working images, pixels; None: the preset's.
@@ -59,7 +62,9 @@ def method_config(method: str, *, max_size: int | None = None) -> Config:
         config = dataclasses.replace(preset("paper"), keypoints="grid")
     elif method in ("grid", "reloc"):
         keypoints: Keypoints = "grid" if method == "grid" else "relocalized"
-        config = dataclasses.replace(preset("default"), refinement=None, keypoints=keypoints)
+        config = dataclasses.replace(
+            preset("default"), aligned_octaves=0, refinement=None, keypoints=keypoints
+        )
     else:
         raise ValueError(
             f"method must be a preset, PRESET-no-IDEA, paper-grid, grid or reloc; got {method!r}"

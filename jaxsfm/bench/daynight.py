@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.common import ABLATED, Keep, method_config, versions
+from jaxsfm.bench.common import RUN_ABLATED, Keep, method_config, versions
 from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.errors import UserError
@@ -29,7 +29,7 @@ from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import load_weights
 from jaxsfm.pipeline import match_features, on_device, reconstruct
 
-METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", *ABLATED)
+METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", *RUN_ABLATED)
 """paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has
 corners of cells and 80 px.)"""
 FEATURES = 64

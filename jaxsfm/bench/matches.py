@@ -16,7 +16,7 @@ from jaxsfm.host.features import ImageFeatures, image_features
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import Weights, load_weights
-from jaxsfm.pipeline import match_features, on_device
+from jaxsfm.pipeline import align, match_features, on_device
 
 PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust", *PAIR_ABLATED)
 FEATURES = 8
@@ -55,7 +55,8 @@ class Matcher:
         Args:
           image0, image1: two images of one folder, called by their files' names.
           method: of PAIR_METHODS. rootsift: COLMAP's own features and its matcher with ratio test,
-            before any geometry; the others verified by homographies, as they leave our pipeline.
+            before any geometry; the others verified by homographies, and aligned where the method
+            does, as `jaxsfm match` gives them.
           max_size: longer side of the working images, pixels; None: the preset's.
         """
         if method == "rootsift":
@@ -71,9 +72,9 @@ class Matcher:
         for seed in seeds:
             start = time.monotonic()
             found = match_features(features0, features1, config=config, seed=seed)
+            xy1, _ = align(found, image0, image1, config=config)
             taken = seconds0 + seconds1 + time.monotonic() - start
-            xy0, xy1 = found.keypoints0, found.keypoints1
-            results.append(Matches(xy0.astype(np.float64), xy1.astype(np.float64), taken))
+            results.append(Matches(found.keypoints0.astype(np.float64), xy1, taken))
         return results
 
     def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:

@@ -178,6 +178,6 @@ def test_an_ablation_leaves_out_one_idea():
     assert method_config("robust-no-octaves") == dataclasses.replace(preset("robust"), octaves=1)
     changed = method_config("default-no-consensus")
     assert changed.pair.consensus == 0 and changed != preset("default")
-    assert len(set(map(method_config, ABLATED))) == len(ABLATED) == 11
+    assert len(set(map(method_config, ABLATED))) == len(ABLATED) == 13
     with pytest.raises(ValueError, match="default-no-enlarging"):
         method_config("default-no-enlarging")  # default does not enlarge
