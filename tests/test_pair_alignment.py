@@ -1,6 +1,7 @@
 """Laws of aligned matches: what the plane says, to a fraction of a pixel, or nothing."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from tolerances import ALIGNED_PX
 
 from jaxsfm.config import preset
 from jaxsfm.core.types import Status
+from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import PairResult
 from jaxsfm.pair_alignment import align_matches, local_map
+from jaxsfm.pipeline import align
 
 SIDE = 320
 H = np.asarray([[1.1, -0.25, 40.0], [0.2, 0.95, -20.0], [1e-4, -5e-5, 1.0]])
@@ -149,6 +152,15 @@ def test_the_affinity_is_the_homographys_derivative():
     at, got = local_map(np.broadcast_to(7.0 * H, (20, 3, 3)), xy)
     np.testing.assert_allclose(at, mapped(H, xy))
     np.testing.assert_allclose(got, np.stack(columns, axis=2), rtol=1e-6)
+
+
+def test_without_octaves_keypoints_stay_where_they_were():
+    """And the images are not even read."""
+    result, _ = pair(3.0, 1.0, 1.0)
+    gone = ImageFile(path=Path("gone.png"), name="gone.png", size=(SIDE, SIDE), sha256="")
+    found = align(result, gone, gone, config=preset("paper"))
+    assert not found.aligned.any()
+    np.testing.assert_array_equal(found.keypoints1, result.keypoints1)
 
 
 def test_alignment_is_no_part_of_what_a_stored_match_depends_on():
