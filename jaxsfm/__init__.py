@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jaxsfm.host.poses import read_poses as read_poses
     from jaxsfm.host.weights import Weights as Weights
     from jaxsfm.host.weights import load_weights as load_weights
-    from jaxsfm.pipeline import align as align
+    from jaxsfm.pair_alignment import align as align
     from jaxsfm.pipeline import extract as extract
     from jaxsfm.pipeline import match as match
     from jaxsfm.pipeline import open_images as open_images
@@ -47,7 +47,7 @@ _HOME = {
     "read_poses": "host.poses",
     "Weights": "host.weights",
     "load_weights": "host.weights",
-    "align": "pipeline",
+    "align": "pair_alignment",
     "extract": "pipeline",
     "match": "pipeline",
     "open_images": "pipeline",

@@ -156,7 +156,8 @@ def match(
     from jaxsfm.host.images import inspect_image, read_image
     from jaxsfm.host.weights import load_weights
     from jaxsfm.host.workfolder import atomic_file
-    from jaxsfm.pipeline import align, match_features, on_device
+    from jaxsfm.pair_alignment import align
+    from jaxsfm.pipeline import match_features, on_device
     from jaxsfm.run import check_seed
 
     check_seed(seed)

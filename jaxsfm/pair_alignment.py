@@ -11,9 +11,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxsfm.config import Config
 from jaxsfm.core import align as align_core
+from jaxsfm.host.images import ImageFile, read_image
 from jaxsfm.host.pairs import PairResult
-from jaxsfm.patches import block_means, chunks, padded
+from jaxsfm.patches import block_means, chunks, gray, padded
 
 RADIUS, ITERATIONS = 7, 10
 """Of the patch, pixels of the octave, and Gauss-Newton steps: as in the refinement."""
@@ -116,4 +118,36 @@ def _align(
             patch,
             iterations=ITERATIONS,
         )
+    )
+
+
+def align(
+    result: PairResult, image0: ImageFile, image1: ImageFile, *, config: Config
+) -> AlignedMatches:
+    """The matches with second keypoints to a fraction of a pixel, where the two images agree.
+
+    For one pair: in a reconstruction a keypoint is shared by all pairs of its image, and
+    `jaxsfm.refine` aligns whole tracks.
+
+    Args:
+      result: of `jaxsfm.pipeline.match_features` with the same images and config.
+
+    Raises:
+      ImageError: an image cannot be decoded.
+    """
+    if not config.aligned_octaves or not result.num_inliers:
+        still = np.zeros(result.num_inliers, bool)
+        return AlignedMatches(result.keypoints1.astype(np.float64), still)
+    first, second = (
+        read_image(image, max_size=config.max_size, enlarge=config.enlarge)
+        for image in (image0, image1)
+    )
+    return align_matches(
+        result,
+        gray(first.rgb),
+        gray(second.rgb),
+        first.scale,
+        second.scale,
+        octaves=config.aligned_octaves,
+        max_error_px=config.threshold_px,
     )

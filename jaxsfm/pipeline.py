@@ -32,7 +32,6 @@ from jaxsfm.host.images import (
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.viewgraph import Verdict, trusted_pairs
 from jaxsfm.host.weights import Weights
-from jaxsfm.pair_alignment import AlignedMatches, align_matches
 from jaxsfm.patches import gray
 
 if TYPE_CHECKING:
@@ -155,38 +154,6 @@ def to_original_pixels(
         num_tentative=int(found.num_tentative),
         num_dropped=int(found.num_dropped),
         status=Status(int(found.status)),
-    )
-
-
-def align(
-    result: PairResult, image0: ImageFile, image1: ImageFile, *, config: Config
-) -> AlignedMatches:
-    """The matches with second keypoints to a fraction of a pixel, where the two images agree.
-
-    For one pair: in a reconstruction a keypoint is shared by all pairs of its image, and
-    `jaxsfm.refine` aligns whole tracks.
-
-    Args:
-      result: of `match_features` with the same images and config.
-
-    Raises:
-      ImageError: an image cannot be decoded.
-    """
-    if not config.aligned_octaves or not result.num_inliers:
-        still = np.zeros(result.num_inliers, bool)
-        return AlignedMatches(result.keypoints1.astype(np.float64), still)
-    first, second = (
-        read_image(image, max_size=config.max_size, enlarge=config.enlarge)
-        for image in (image0, image1)
-    )
-    return align_matches(
-        result,
-        gray(first.rgb),
-        gray(second.rgb),
-        first.scale,
-        second.scale,
-        octaves=config.aligned_octaves,
-        max_error_px=config.threshold_px,
     )
 
 

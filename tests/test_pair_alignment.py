@@ -12,8 +12,7 @@ from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import PairResult
-from jaxsfm.pair_alignment import align_matches, local_map
-from jaxsfm.pipeline import align
+from jaxsfm.pair_alignment import align, align_matches, local_map
 
 SIDE = 320
 H = np.asarray([[1.1, -0.25, 40.0], [0.2, 0.95, -20.0], [1e-4, -5e-5, 1.0]])

@@ -16,7 +16,8 @@ from jaxsfm.host.features import ImageFeatures, image_features
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import Weights, load_weights
-from jaxsfm.pipeline import align, match_features, on_device
+from jaxsfm.pair_alignment import align
+from jaxsfm.pipeline import match_features, on_device
 
 PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust", *PAIR_ABLATED)
 FEATURES = 8
