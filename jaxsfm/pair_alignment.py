@@ -19,9 +19,10 @@ from jaxsfm.patches import block_means, chunks, gray, padded
 
 RADIUS, ITERATIONS = 7, 10
 """Of the patch, pixels of the octave, and Gauss-Newton steps: as in the refinement."""
-MIN_SCORE = 0.6
-"""Least normalised cross-correlation; of unlike light and different views, as for weak views."""
-MAX_SIGMA_PX = 1.0
+MIN_SCORE = 0.8
+"""Least normalised cross-correlation, as in the refinement. In unlike light and seasons 0.6 lets
+in patches that only look alike (docs/design.md)."""
+MAX_SIGMA_PX = 0.25
 """Largest standard deviation of a position along its worst direction, pixels of the octave: an
 edge moves along itself."""
 MAX_SHIFT_PX = 4.0
