@@ -11,21 +11,22 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxsfm.config import Config
+from jaxsfm.config import Config, Refinement
 from jaxsfm.core import align as align_core
 from jaxsfm.host.images import ImageFile, read_image
 from jaxsfm.host.pairs import PairResult
 from jaxsfm.patches import block_means, chunks, gray, padded
 
-RADIUS, ITERATIONS = 7, 10
-"""Of the patch, pixels of the octave, and Gauss-Newton steps: as in the refinement."""
-MIN_SCORE = 0.8
-"""Least normalised cross-correlation, as in the refinement. In unlike light and seasons 0.6 lets
-in patches that only look alike (docs/design.md)."""
-MAX_SIGMA_PX = 0.25
+RADIUS, ITERATIONS = Refinement.radius, Refinement.iterations
+"""Of the patch, pixels of the octave, and Gauss-Newton steps; these and the limits are those of the
+refinement."""
+MIN_SCORE = Refinement.min_score
+"""Least normalised cross-correlation. In unlike light and seasons 0.6 lets in patches that only
+look alike (docs/design.md)."""
+MAX_SIGMA_PX = Refinement.max_sigma_px
 """Largest standard deviation of a position along its worst direction, pixels of the octave: an
 edge moves along itself."""
-MAX_SHIFT_PX = 4.0
+MAX_SHIFT_PX = Refinement.max_shift_px
 """Furthest of one octave, pixels of the octave."""
 
 
