@@ -21,7 +21,7 @@ from jaxsfm.bench.common import (
 from jaxsfm.bench.matches import Matcher, pair_figures
 from jaxsfm.errors import UserError
 from jaxsfm.host.images import SUFFIXES, ImageFile
-from jaxsfm.host.two_view import fundamental_matrix
+from jaxsfm.host.two_view import epipolar_residuals, fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)
 
@@ -35,12 +35,10 @@ def symmetric_epipolar_error(f: np.ndarray, xy0: np.ndarray, xy1: np.ndarray) ->
 
     Source: Hartley and Zisserman, 2nd edition, equation 11.10.
     """
-    x0, x1 = (np.c_[xy, np.ones(len(xy))] for xy in (xy0, xy1))
-    line1, line0 = x0 @ f.T, x1 @ f
-    residual = np.square((x1 * line1).sum(1))
-    norms = [np.square(line[:, :2]).sum(1) for line in (line0, line1)]
+    residual, norm0, norm1 = epipolar_residuals(f, xy0, xy1)
+    square = np.square(residual)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.sqrt(residual / norms[0] + residual / norms[1])
+        error = np.sqrt(square / norm0 + square / norm1)
     return np.where(np.isfinite(error), error, np.inf)
 
 

@@ -5,9 +5,9 @@ import itertools
 import json
 import shutil
 
-import cv2
 import numpy as np
 import pytest
+from epipolar import two_views
 from strategies import rng_of
 
 from jaxsfm.bench.common import ABLATED, method_config
@@ -15,19 +15,6 @@ from jaxsfm.bench.wxbs import mean_average_accuracy, means, symmetric_epipolar_e
 from jaxsfm.cli import main
 from jaxsfm.config import preset
 from jaxsfm.host.poses import read_poses
-from jaxsfm.host.two_view import fundamental_matrix, homography
-
-
-def two_views(rng, n=60):
-    """A fundamental matrix and exact correspondences, pixels."""
-    k = np.asarray([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
-    rotation = cv2.Rodrigues(rng.normal(size=3) * 0.2)[0]
-    t = rng.normal(size=3)
-    cross = np.cross(np.eye(3), t / np.linalg.norm(t)).T
-    f = np.linalg.inv(k).T @ cross @ rotation @ np.linalg.inv(k)
-    points = rng.uniform([-2, -2, 4], [2, 2, 9], size=(n, 3))
-    x0, x1 = points @ k.T, (points @ rotation.T + t) @ k.T
-    return f, x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -57,19 +44,6 @@ def test_mean_average_accuracy_counts_whole_pixels():
     assert mean_average_accuracy(np.full(4, np.inf)) == 0
     assert mean_average_accuracy(np.asarray([10.5])) == 0.5  # within 11 .. 20 px
     assert mean_average_accuracy(np.asarray([1.0, 20.1])) == 0.5
-
-
-def test_estimators_find_the_geometry_among_outliers_and_repeat():
-    rng = rng_of(1)
-    f, xy0, xy1 = two_views(rng, n=200)
-    noisy = xy1 + rng.normal(size=xy1.shape) * 0.3
-    noisy[:80] = rng.uniform(0, 600, size=(80, 2))
-    found = fundamental_matrix(xy0, noisy, seed=3)
-    assert found is not None
-    assert np.median(symmetric_epipolar_error(found, xy0, xy1)) < 0.5
-    assert np.array_equal(found, fundamental_matrix(xy0, noisy, seed=3))
-    assert fundamental_matrix(xy0[:7], xy1[:7], seed=0) is None
-    assert homography(xy0[:3], xy1[:3], seed=0) is None
 
 
 def test_means_average_pairs_before_seeds():
