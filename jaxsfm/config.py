@@ -191,13 +191,18 @@ _DEFAULT = Config(
 PRESETS: dict[str, Config] = {
     "paper": Config(),
     "default": _DEFAULT,
-    "robust": dataclasses.replace(_DEFAULT, enlarge=2.0),
+    "robust": dataclasses.replace(
+        _DEFAULT,
+        enlarge=2.0,
+        pair=dataclasses.replace(_DEFAULT.pair, local_refits=10),
+    ),
 }
 """`paper`: the constants of the authors' code. `default`: octaves, centred descriptors and
 neighbourhood consensus (night, seasons, weather), local refits iterated (one refit leaves up to a
 fifth of a plane's inliers behind, tests/core/test_ransac.py), planes that compete, the most similar
 of a cell's several matches, aligned matches of single pairs, the view graph and the refinement.
-`robust`: default, and small images enlarged up to twice; they then take as long as large ones."""
+`robust`: default, and small images enlarged up to twice (they then take as long as large ones);
+planes are refitted until they gain nothing: matches that depend less on the seed."""
 
 
 def preset(name: str) -> Config:
