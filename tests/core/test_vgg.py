@@ -7,8 +7,10 @@ import oracles
 import pytest
 import tolerances
 
+from jaxsfm.core import vgg
 from jaxsfm.core.types import Pyramid
 from jaxsfm.core.vgg import LAYERS, VGG16, Preprocessing, init_shapes, preprocess
+from jaxsfm.core.winograd import conv3x3
 from jaxsfm.host.weights import TORCHVISION
 
 
@@ -79,3 +81,18 @@ def test_preprocessing_is_scale_then_mean_then_std():
     p = Preprocessing(scale=2.0, mean=(1.0, 2.0, 3.0), std=(1.0, 2.0, 4.0))
     out = preprocess(jnp.full((1, 1, 3), 10, jnp.uint8), p)
     np.testing.assert_allclose(np.asarray(out)[0, 0], [4.0, 1.5, 0.5])
+
+
+def test_both_convolutions_give_the_same_maps(weights, photo, monkeypatch):
+    """On CPUs; elsewhere it compares the library's with itself."""
+    sizes = [photo.shape[:2]]
+    library = apply(weights.params, photo[None], sizes)
+    monkeypatch.setattr(vgg, "WINOGRAD_PIXELS", 1)
+    monkeypatch.setattr(vgg, "WINOGRAD_CHANNELS", 1)
+    used = []
+    monkeypatch.setattr(vgg, "conv3x3", lambda x, k: (used.append(x.shape), conv3x3(x, k))[1])
+    jax.clear_caches()  # what was compiled before has the library's convolution
+    for ours, expected in zip(apply(weights.params, photo[None], sizes), library, strict=True):
+        assert_maps_equal(ours, np.asarray(expected))
+    assert len(used) == len(LAYERS)
+    jax.clear_caches()
