@@ -74,15 +74,20 @@ def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
 def count_inliers(
     h: Float[Array, "s 3 3"], problem: _Problem, *, shape: PairShape
 ) -> Int[Array, " s"]:
-    """Inliers of every hypothesis, a chunk of correspondences at a time."""
+    """Inliers of every hypothesis, a chunk of correspondences at a time.
+
+    Coordinates are cut into columns first: slices of (k, 2) are read with a stride of two, four
+    times as slowly.
+    """
     k = problem.xy0.shape[0]
     chunk = min(shape.score_chunk, k)
+    columns = [xy[:, axis] for xy in (problem.xy0, problem.xy1) for axis in (0, 1)]
 
     def body(state):
         i, counts = state
         start = jnp.minimum(i * chunk, k - chunk)
-        xy0 = lax.dynamic_slice(problem.xy0, (start, 0), (chunk, 2))
-        xy1 = lax.dynamic_slice(problem.xy1, (start, 0), (chunk, 2))
+        x0, y0, x1, y1 = (lax.dynamic_slice_in_dim(c, start, chunk) for c in columns)
+        xy0, xy1 = jnp.stack([x0, y0], axis=1), jnp.stack([x1, y1], axis=1)
         index = start + jnp.arange(chunk)
         # The last chunk is moved back to fit: count only what no earlier chunk has counted.
         live = (index >= i * chunk) & (index < problem.num_live)
