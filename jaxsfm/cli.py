@@ -14,6 +14,7 @@ from jaxsfm.bench_commands import daynight, homography, planes, strecha, wxbs
 from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
+from jaxsfm.host.compiled import keep_compiled
 
 BENCHMARKS = {
     "strecha": strecha,
@@ -53,6 +54,7 @@ def main(argv: list[str] | None = None) -> int:
     logger = logging.getLogger("jaxsfm")
     logger.handlers, logger.propagate = [handler], False
     logger.setLevel(logging.INFO)
+    keep_compiled()
     try:
         with interrupt.noted():
             return tyro.extras.subcommand_cli_from_dict(
