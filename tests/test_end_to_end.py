@@ -1,5 +1,6 @@
 """Real or rendered photos in, cameras out, against exact or measured truth."""
 
+import itertools
 import json
 
 import numpy as np
@@ -9,6 +10,7 @@ import jaxsfm
 from jaxsfm.cli import main
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.evaluation import evaluate
+from jaxsfm.host.viewgraph import rotation_angle_deg
 
 
 def test_the_demo_recovers_its_exact_cameras(tmp_path, capsys):
@@ -50,7 +52,12 @@ def test_a_dozen_lines_of_python_do_the_same_as_the_command(tmp_path):
 
 
 def test_strecha_cameras_are_recovered_at_half_size(data_folder, tmp_path):
-    """A quick look at real photos; docs/results.md has the full-size figures of all sets."""
+    """A quick look at real photos; docs/results.md has the full-size figures of all sets.
+
+    Rotations are compared between cameras: these four stand within 0.3 of 4 m of one line, so that
+    an alignment of their centres turns errors of 5 mm into a degree about it (with seeds 0 .. 7
+    0.1-0.7 deg after the alignment, 0.1-0.2 deg between cameras).
+    """
     names = ("0003", "0004", "0005", "0006")
     folder = data_folder / "strecha" / "fountain-P11"
     images = [i for i in jaxsfm.open_images(folder / "images")[0] if i.name[:4] in names]
@@ -64,9 +71,12 @@ def test_strecha_cameras_are_recovered_at_half_size(data_folder, tmp_path):
         config=config,
         intrinsics=jaxsfm.parse_intrinsics(str(folder / "images" / "K.txt")),
     )
-    errors = evaluate(jaxsfm.model_poses(made.models[0]), jaxsfm.read_poses(folder))
-    assert len(errors.images) == len(names)
-    assert errors.position["max"] < 0.05 and errors.rotation_deg["max"] < 0.5
+    poses, truth = jaxsfm.model_poses(made.models[0]), jaxsfm.read_poses(folder)
+    assert {name[:4] for name in poses} == set(names)
+    assert evaluate(poses, truth).position["max"] < 0.05
+    for a, b in itertools.combinations(sorted(poses), 2):
+        ours, measured = (p[b].rotation @ p[a].rotation.T for p in (poses, truth))
+        assert rotation_angle_deg(ours, measured) < 0.5
 
 
 def test_configs_refuse_what_makes_no_sense():
