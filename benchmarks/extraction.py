@@ -31,7 +31,8 @@ def flop(height: int, width: int) -> float:
 
 @jax.jit
 def _pool4(params, x):
-    return VGG16().apply(params, x, jnp.asarray([[HEIGHT, WIDTH]], jnp.int32)).pool4
+    size = jnp.asarray([[HEIGHT, WIDTH]], jnp.int32)
+    return VGG16().apply(params, x, size, method="levels").pool4
 
 
 def _torch_pool4(params: dict, image: np.ndarray) -> Callable[[], Any] | None:

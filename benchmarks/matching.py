@@ -12,11 +12,12 @@ from benchmarks.timing import Metric, median, ratio, seconds
 from jaxsfm.config import preset
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.numerics import HIGHEST, unit
+from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pair
-from jaxsfm.host.features import image_features
+from jaxsfm.extraction import image_features
 from jaxsfm.host.images import inspect_image
 from jaxsfm.host.weights import load_weights
-from jaxsfm.pipeline import thresholds
+from jaxsfm.matching import thresholds
 
 CELLS, CHANNELS = 6144, 512
 """Of pool4 at 1536 x 1024."""
@@ -73,11 +74,12 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
         return
     weights = load_weights()
     a, b = _descriptors(0), _descriptors(1)
+    join = jax.jit(join_octaves)
     for name in ("paper", "default"):
         config = dataclasses.replace(preset(name), max_size=1536)
         shape = dataclasses.replace(config.pair, max_hypotheses=2048)
         dense = [
-            jax.device_put(image_features(weights, inspect_image(path), config=config).dense)
+            join(image_features(weights, inspect_image(path), config=config).dense)
             for path in found
         ]
         limits = thresholds(config)

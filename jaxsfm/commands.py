@@ -72,6 +72,10 @@ def reconstruct(
     seed: int = 0,
     threads: int = -1,
     reference: Path | None = None,
+    devices: int | None = None,
+    images_at_once: int | None = None,
+    pairs_at_once: int | None = None,
+    memory_gb: float | None = None,
 ) -> int:
     """A folder of photos to a COLMAP model.
 
@@ -95,11 +99,26 @@ def reconstruct(
       seed: Of everything random.
       threads: Of COLMAP's part; 1 makes the model repeatable to the last byte; -1: all.
       reference: Reference poses (Strecha .camera files or a COLMAP model) to evaluate against.
+      devices: How many of JAX's devices to use; default: all.
+      images_at_once: Extracted side by side on each device; default: what fits, one on a CPU.
+      pairs_at_once: Matched side by side on each device; default: what fits, one on a CPU.
+      memory_gb: For the features at hand, on each device; default: half of an accelerator, an
+        eighth of a host, at most 1.6. Less makes photos come back more often.
     """
     config = _config(preset, max_size, keypoints, view_graph, refine)
+    from jaxsfm.execution import Execution
     from jaxsfm.report import summary_lines
     from jaxsfm.run import RunOptions, run_folder
 
+    try:
+        execution = Execution(
+            devices=devices,
+            images_at_once=images_at_once,
+            pairs_at_once=pairs_at_once,
+            memory_gb=memory_gb,
+        )
+    except ValueError as error:
+        raise UserError(f"--{str(error).replace('_', '-')}") from error
     options = RunOptions(
         pairs=pairs,
         best_pairs=best_pairs,
@@ -109,6 +128,7 @@ def reconstruct(
         seed=seed,
         threads=threads,
         reference=reference,
+        execution=execution,
         progress=True,
     )
     report = run_folder(images, out, config=config, options=options)
@@ -152,12 +172,12 @@ def match(
     check_writable(plot, "--plot", (".png", ".jpg"))
     import numpy as np
 
-    from jaxsfm.host.features import image_features
+    from jaxsfm.extraction import image_features, on_device
     from jaxsfm.host.images import inspect_image, read_image
     from jaxsfm.host.weights import load_weights
     from jaxsfm.host.workfolder import atomic_file
+    from jaxsfm.matching import match_features
     from jaxsfm.pair_alignment import align
-    from jaxsfm.pipeline import match_features, on_device
     from jaxsfm.run import check_seed
 
     check_seed(seed)

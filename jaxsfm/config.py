@@ -36,7 +36,7 @@ class PairShape:
     """Widest coarse grid the votes reach across: 2048 px; the pipeline widens it where needed."""
     coarse_tile: int = 1024
     """Rows of the coarse similarity matrix held at once."""
-    fine_chunk: int = 128
+    fine_chunk: int = 16
     """Coarse matches whose windows are compared at once."""
     score_chunk: int = 2048
     """Correspondences scored at once: small enough to stay in cache."""

@@ -132,7 +132,7 @@ def align(
     `jaxsfm.refine` aligns whole tracks.
 
     Args:
-      result: of `jaxsfm.pipeline.match_features` with the same images and config.
+      result: of `jaxsfm.matching.match_features` with the same images and config.
 
     Raises:
       ImageError: an image cannot be decoded.

@@ -11,16 +11,14 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 from tqdm import tqdm
 
 from jaxsfm.config import Config, Refinement
-from jaxsfm.core.grid import rescale
-from jaxsfm.core.pair import match_pair, pair_key
-from jaxsfm.core.types import PairMatches, Status, Thresholds
 from jaxsfm.errors import UserError
-from jaxsfm.host.features import ImageFeatures, image_features, pad_features
+from jaxsfm.execution import Execution
+from jaxsfm.extraction import extracted, on_device
+from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import (
     ImageError,
     ImageFile,
@@ -29,9 +27,10 @@ from jaxsfm.host.images import (
     read_image,
     working_size,
 )
-from jaxsfm.host.pairs import Pair, PairResult, make_pair
+from jaxsfm.host.pairs import Pair, PairResult
 from jaxsfm.host.viewgraph import Verdict, trusted_pairs
 from jaxsfm.host.weights import Weights
+from jaxsfm.matching import matched
 from jaxsfm.patches import gray
 
 if TYPE_CHECKING:
@@ -63,20 +62,23 @@ def open_images(folder: Path, *, progress: bool = False) -> tuple[list[ImageFile
 
 
 def extract(
-    weights: Weights, images: Iterable[ImageFile], *, config: Config
+    weights: Weights,
+    images: Iterable[ImageFile],
+    *,
+    config: Config,
+    execution: Execution | None = None,
 ) -> dict[str, ImageFeatures]:
-    """Dense features of images, by name; all of them in memory (50 MB for 1536 x 1024).
+    """Dense features of images, by name; all of them in memory (25 MB for 1536 x 1024).
 
     Raises:
       ImageError: an image cannot be decoded.
     """
-    weights = on_device(weights)
-    return {image.name: image_features(weights, image, config=config) for image in images}
-
-
-def on_device(weights: Weights) -> Weights:
-    """The same weights with their arrays on the accelerator, copied once instead of per image."""
-    return dataclasses.replace(weights, params=jax.device_put(weights.params))
+    features = {}
+    for image, found in extracted(on_device(weights), images, config=config, execution=execution):
+        if isinstance(found, ImageError):
+            raise found
+        features[image.name] = found
+    return features
 
 
 def match(
@@ -85,82 +87,17 @@ def match(
     *,
     config: Config,
     seed: int = 0,
+    execution: Execution | None = None,
 ) -> dict[Pair, PairResult]:
     """Verified matches of pairs of images, by pair (the lesser name first).
 
     A pair's result depends on the two images, the config and the seed; not on other pairs.
     """
-    results = {}
-    for a, b in pairs:
-        pair = make_pair(a, b)
-        results[pair] = match_features(
-            features[pair[0]], features[pair[1]], config=config, seed=seed
-        )
-    return results
-
-
-def match_features(
-    features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int = 0
-) -> PairResult:
-    """Verified matches of two images, in the order given."""
-    sides = (features0.dense, features1.dense)
-    room = max(dense.coarse[0].shape[0] for dense in sides)
-    widest = max(int(dense.coarse_grid[1]) for dense in sides)
-    shape = config.pair
-    if shape.consensus and widest > shape.coarse_columns:
-        shape = dataclasses.replace(shape, coarse_columns=-(-widest // 64) * 64)
-    key = pair_key(jax.random.key(seed), features0.image.identity, features1.image.identity)
-    found = match_pair(
-        key,
-        *(pad_features(dense, room) for dense in sides),
-        thresholds(config),
-        shape=shape,
+    rooms = {name: each.room for name, each in features.items()}
+    results = matched(
+        features.__getitem__, rooms, pairs, config=config, seed=seed, execution=execution
     )
-    return to_original_pixels(jax.device_get(found), features0, features1)
-
-
-def thresholds(config: Config) -> Thresholds:
-    """The config's traced half."""
-    return Thresholds(
-        np.float32(config.threshold_px),  # pyright: ignore[reportArgumentType]
-        np.int32(config.min_inliers),  # pyright: ignore[reportArgumentType]
-        np.float32(config.confidence),  # pyright: ignore[reportArgumentType]
-    )
-
-
-def to_original_pixels(
-    found: PairMatches, features0: ImageFeatures, features1: ImageFeatures
-) -> PairResult:
-    """From the program's padded output to lists in original pixels."""
-    keep = np.asarray(found.plane) >= 0
-    cells = np.asarray(found.cells)[keep]
-
-    def keypoints(features: ImageFeatures, side: int) -> np.ndarray:
-        xy = np.asarray(features.dense.keypoints, np.float64)[cells[:, side]]
-        return np.asarray(rescale(xy, np.asarray(features.scale))).astype(np.float32)
-
-    # In float64 on the host: 1600 px coordinates squared leave float32 no digits to invert with.
-    present = np.asarray(found.num_inliers) > 0
-    to0, to1 = _scale_matrix(features0.scale), _scale_matrix(features1.scale)
-    h = to1 @ np.asarray(found.homographies, np.float64)[present] @ np.linalg.inv(to0)
-    norms = np.linalg.norm(h, axis=(1, 2), keepdims=True)
-    return PairResult(
-        pair=(features0.image.name, features1.image.name),
-        cells=cells,
-        keypoints0=keypoints(features0, 0),
-        keypoints1=keypoints(features1, 1),
-        plane=np.asarray(found.plane)[keep],
-        homographies=h / norms,
-        num_tentative=int(found.num_tentative),
-        num_dropped=int(found.num_dropped),
-        status=Status(int(found.status)),
-    )
-
-
-def _scale_matrix(scale: tuple[float, float]) -> np.ndarray:
-    """`rescale` on homogeneous (x, y, 1), float64."""
-    sx, sy = scale
-    return np.asarray([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1.0]])
+    return {result.pair: result for result in results}
 
 
 def pixel_scale(images: list[ImageFile], *, config: Config) -> float:

@@ -14,10 +14,12 @@ from tqdm import tqdm
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
+from jaxsfm.execution import Execution
+from jaxsfm.extraction import extracted, image_features, on_device
 from jaxsfm.host import interrupt
 from jaxsfm.host.colmap import write_models
-from jaxsfm.host.features import image_features
-from jaxsfm.host.images import ImageError, ImageFile
+from jaxsfm.host.features import ImageFeatures, room_of
+from jaxsfm.host.images import ImageError, ImageFile, working_size
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, Mapper
 from jaxsfm.host.pairs import Pair, PairResult, best_pairs, exhaustive_pairs, read_pairs
@@ -25,7 +27,8 @@ from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.viewgraph import Verdict
 from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.host.workfolder import WorkFolder, open_folder, write_atomic
-from jaxsfm.pipeline import Reconstructed, match_features, on_device, open_images, reconstruct
+from jaxsfm.matching import matched
+from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures
 
 T = TypeVar("T")
@@ -48,6 +51,8 @@ class RunOptions:
     threads: int = -1
     reference: Path | None = None
     """Reference poses to evaluate the model against."""
+    execution: Execution = dataclasses.field(default_factory=Execution)
+    """Devices, batches, memory."""
     progress: bool = False
     """Progress bars on standard error."""
 
@@ -96,10 +101,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             good = [image for image in usable if image.name not in skipped]
             _check_enough(images, good, skipped)
         with _timed(seconds, "matching"):
-            for pair in _bar(missing, "matching", "pair", options):
-                result = _match(folder, weights, by_name, pair, config, options.seed)
-                folder.save_matches(result)
-                results[pair] = result
+            for result in _match(folder, weights, by_name, missing, config, options):
+                results[result.pair] = result
         with folder.publish() as fresh:
             chosen = _choose(results, options.best_pairs)
             handed_on = {pair: results[pair] for pair in chosen}
@@ -240,10 +243,11 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = time.monotonic() - start
 
 
-def _bar(items: Iterable[T], stage: str, unit: str, options: RunOptions) -> Iterator[T]:
-    for item in tqdm(items, desc=stage, unit=unit, disable=not options.progress):
-        interrupt.check()
+def _bar(items: Iterable[T], total: int, stage: str, unit: str, options: RunOptions) -> Iterator[T]:
+    bar = tqdm(items, total=total, desc=stage, unit=unit, disable=not options.progress)
+    for item in bar:
         yield item
+        interrupt.check()
     interrupt.check()
 
 
@@ -258,14 +262,16 @@ def _extract(
     """Features of every image of `pairs` that has none yet; why some have none."""
     needed = sorted({name for pair in pairs for name in pair})
     todo = [images[name] for name in needed if not folder.has_features(images[name])]
-    skipped = {}
-    weights = on_device(weights) if todo else weights
-    for image in _bar(todo, "extraction", "image", options):
-        try:
-            folder.save_features(image_features(weights, image, config=config))
-        except ImageError as error:
-            folder.mark_unusable(image, str(error))
-            skipped[image.name] = str(error)
+    skipped: dict[str, str] = {}
+    if not todo:
+        return skipped
+    stream = extracted(on_device(weights), todo, config=config, execution=options.execution)
+    for image, found in _bar(stream, len(todo), "extraction", "image", options):
+        if isinstance(found, ImageError):
+            folder.mark_unusable(image, str(found))
+            skipped[image.name] = str(found)
+        else:
+            folder.save_features(found)
     return skipped
 
 
@@ -273,18 +279,29 @@ def _match(
     folder: WorkFolder,
     weights: Weights,
     images: dict[str, ImageFile],
-    pair: Pair,
+    pairs: list[Pair],
     config: Config,
-    seed: int,
-) -> PairResult:
-    features = []
-    for name in pair:
+    options: RunOptions,
+) -> Iterator[PairResult]:
+    """Matches of pairs, saved as they are made."""
+
+    def load(name: str) -> ImageFeatures:
         found = folder.load_features(images[name])
         if found is None:  # damaged or deleted under us: it is only a cache
             found = image_features(weights, images[name], config=config)
             folder.save_features(found)
-        features.append(found)
-    return match_features(features[0], features[1], config=config, seed=seed)
+        return found
+
+    rooms = {
+        name: room_of(working_size(image.size, config.max_size, config.enlarge))
+        for name, image in images.items()
+    }
+    stream = matched(
+        load, rooms, pairs, config=config, seed=options.seed, execution=options.execution
+    )
+    for result in _bar(stream, len(pairs), "matching", "pair", options):
+        folder.save_matches(result)
+        yield result
 
 
 def _choose(results: dict[Pair, PairResult], n: int | None) -> set[Pair]:

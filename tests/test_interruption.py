@@ -10,12 +10,13 @@ import pytest
 
 import jaxsfm.run
 from jaxsfm.cli import main
+from jaxsfm.host.workfolder import WorkFolder
 
 
-def interrupt_after(monkeypatch, name: str, calls: int) -> list[int]:
-    """Let jaxsfm.run.<name> work `calls` times, then raise KeyboardInterrupt; counts the calls."""
+def interrupt_after(monkeypatch, owner, name: str, calls: int) -> list[int]:
+    """Let `owner.name` work `calls` times, then raise KeyboardInterrupt; counts the calls."""
     count = [0]
-    original = getattr(jaxsfm.run, name)
+    original = getattr(owner, name)
 
     def wrapped(*args, **kwargs):
         if count[0] == calls:
@@ -23,16 +24,16 @@ def interrupt_after(monkeypatch, name: str, calls: int) -> list[int]:
         count[0] += 1
         return original(*args, **kwargs)
 
-    monkeypatch.setattr(jaxsfm.run, name, wrapped)
+    monkeypatch.setattr(owner, name, wrapped)
     return count
 
 
 @pytest.mark.parametrize(
-    ("stage", "function", "calls"),
+    ("stage", "owner", "function", "calls"),
     [
-        ("extraction", "image_features", 1),
-        ("matching", "match_features", 2),
-        ("mapping", "reconstruct", 0),
+        ("extraction", WorkFolder, "save_features", 1),
+        ("matching", WorkFolder, "save_matches", 2),
+        ("mapping", jaxsfm.run, "reconstruct", 0),
     ],
 )
 def test_an_interrupted_run_goes_on_where_it_was(
@@ -41,20 +42,21 @@ def test_an_interrupted_run_goes_on_where_it_was(
     monkeypatch,
     capsys,
     stage,
+    owner,
     function,
     calls,
 ):
     args = ["reconstruct", str(scene / "images"), "--threads", "1", "--out"]
     assert main([*args, str(tmp_path / "whole")]) == 0
     with monkeypatch.context() as patch:
-        interrupt_after(patch, function, calls)
+        interrupt_after(patch, owner, function, calls)
         assert main([*args, str(tmp_path / "cut")]) == 130
     assert "interrupted" in capsys.readouterr().err
     done = len(list((tmp_path / "cut").glob("features/*.npz")))
     matched = len(list((tmp_path / "cut").glob("matches/*.npz")))
     assert (done, matched) == {"extraction": (1, 0), "matching": (3, 2), "mapping": (3, 3)}[stage]
-    extracted = interrupt_after(monkeypatch, "image_features", 99)
-    rematched = interrupt_after(monkeypatch, "match_features", 99)
+    extracted = interrupt_after(monkeypatch, WorkFolder, "save_features", 99)
+    rematched = interrupt_after(monkeypatch, WorkFolder, "save_matches", 99)
     assert main([*args, str(tmp_path / "cut")]) == 0
     assert extracted[0] == 3 - done and rematched[0] == 3 - matched
     for file in sorted((tmp_path / "whole" / "matches").iterdir()):
@@ -68,14 +70,14 @@ def test_an_interrupt_that_a_callback_swallowed_still_ends_the_run(
     scene, tmp_path, monkeypatch, capsys
 ):
     """Like JAX's garbage collector hook, which Python lets print and forget the exception."""
-    original = jaxsfm.run.image_features
+    original = WorkFolder.save_features
 
     def swallowing(*args, **kwargs):
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         return original(*args, **kwargs)
 
-    monkeypatch.setattr(jaxsfm.run, "image_features", swallowing)
+    monkeypatch.setattr(WorkFolder, "save_features", swallowing)
     assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert len(list((tmp_path / "out" / "features").iterdir())) == 1

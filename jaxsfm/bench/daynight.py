@@ -20,14 +20,16 @@ from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
+from jaxsfm.extraction import image_features, on_device
 from jaxsfm.host.colmap import drop_pairs, read_two_views
-from jaxsfm.host.features import ImageFeatures, image_features
+from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.host.poses import Poses, model_poses
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import load_weights
-from jaxsfm.pipeline import match_features, on_device, reconstruct
+from jaxsfm.matching import match_features
+from jaxsfm.pipeline import reconstruct
 
 METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", *RUN_ABLATED)
 """paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has

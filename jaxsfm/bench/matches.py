@@ -11,13 +11,14 @@ import numpy as np
 
 from jaxsfm.bench.common import PAIR_ABLATED, method_config, versions
 from jaxsfm.config import Config
+from jaxsfm.extraction import image_features, on_device
 from jaxsfm.host.colmap import read_matches
-from jaxsfm.host.features import ImageFeatures, image_features
+from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import Weights, load_weights
+from jaxsfm.matching import match_features
 from jaxsfm.pair_alignment import align
-from jaxsfm.pipeline import match_features, on_device
 
 PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust", *PAIR_ABLATED)
 FEATURES = 8

@@ -18,7 +18,7 @@ from jaxsfm.bench.common import Keep, check_root, choose_sets, read_rows, spread
 from jaxsfm.config import Config, preset
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.errors import UserError
-from jaxsfm.pipeline import thresholds
+from jaxsfm.matching import thresholds
 
 SUFFIX = "_pts.txt"
 POINT_PX = 2.0

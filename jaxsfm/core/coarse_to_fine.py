@@ -44,15 +44,23 @@ def window_cells(
     return jnp.where(inside, rows * fine_grid[1] + cols, 0), inside
 
 
+def rows_of(table: Float[Array, "m d"], index: Int[Array, "*b"]) -> Float[Array, "*b d"]:
+    """Rows of a table; out of range there is none, so nothing has to be looked for."""
+    return jnp.take(table, index, axis=0, mode="clip")
+
+
 def _match_windows(
-    f0: JoinedFeatures, f1: JoinedFeatures, cell0: Int[Array, " b"], cell1: Int[Array, " b"]
+    f0: JoinedFeatures,
+    f1: JoinedFeatures,
+    shown: tuple[Bool[Array, " m"], Bool[Array, " m"]],
+    cell0: Int[Array, " b"],
+    cell1: Int[Array, " b"],
 ) -> Int[Array, "b w"]:
     """The fine cell of image 1 for every window cell of image 0, or -1."""
     index0, inside0 = window_cells(cell0, f0.coarse_grid, f0.fine_grid)
     index1, inside1 = window_cells(cell1, f1.coarse_grid, f1.fine_grid)
-    a, b = jnp.take(f0.fine, index0, axis=0), jnp.take(f1.fine, index1, axis=0)
-    a_set = inside0 & jnp.any(a != 0, axis=-1)
-    b_set = inside1 & jnp.any(b != 0, axis=-1)
+    a, b = (rows_of(f.fine, index) for f, index in ((f0, index0), (f1, index1)))
+    a_set, b_set = inside0 & shown[0][index0], inside1 & shown[1][index1]
     s = jnp.einsum("bwd,bvd->bwv", a, b, precision=HIGHEST)
     s = jnp.where(a_set[:, :, None] & b_set[:, None, :], s, -jnp.inf)
     row_score, row_best = argmax_first(s, axis=2)
@@ -62,13 +70,15 @@ def _match_windows(
 
 
 def match_windows(
-    f0: JoinedFeatures, f1: JoinedFeatures, coarse: Int[Array, " n"], *, chunk: int = 128
+    f0: JoinedFeatures, f1: JoinedFeatures, coarse: Int[Array, " n"], *, chunk: int = 16
 ) -> Int[Array, "n w"]:
     """`_match_windows` for every coarse match, `chunk` at a time; -1 where there is none.
 
-    The loop ends with the last real match: unmatched cells cost nothing.
+    The loop ends with the last real match: unmatched cells cost nothing. Windows of 1024 channels
+    take 5 MB for 16 matches and stay in the cache: half the time of 128.
     """
     n = coarse.shape[0]
+    shown = jnp.any(f0.fine != 0, axis=-1), jnp.any(f1.fine != 0, axis=-1)
     chunk = min(chunk, n)
     matched, count = compact(coarse >= 0, size=n)
 
@@ -79,7 +89,7 @@ def match_windows(
         cell0 = lax.dynamic_slice(matched, (start,), (chunk,))
         live = start + jnp.arange(chunk) < count
         cell1 = jnp.where(live, coarse[cell0], 0)
-        rows = _match_windows(f0, f1, cell0, cell1)
+        rows = _match_windows(f0, f1, shown, cell0, cell1)
         target = jnp.where(live, cell0, n)
         return i + 1, table.at[target].set(rows, mode="drop")
 
@@ -120,6 +130,31 @@ def correspondences(
     slots = table.shape[1]
     index, count = compact(table.reshape(-1) >= 0, size=capacity)
     return jnp.stack([index // slots, table.reshape(-1)[index]], axis=1), count
+
+
+def similarities(
+    f0: JoinedFeatures,
+    f1: JoinedFeatures,
+    cells: Int[Array, "k 2"],
+    found: Int[Array, ""],
+    *,
+    chunk: int = 512,
+) -> Float[Array, " k"]:
+    """Products of the fine descriptors of the first `found` correspondences; zeros after them."""
+    k = cells.shape[0]
+    chunk = min(chunk, k)
+
+    def body(state):
+        i, scores = state
+        # The last chunk is moved back to fit; what it repeats is written twice, alike.
+        start = jnp.minimum(i * chunk, k - chunk)
+        some = lax.dynamic_slice(cells, (start, 0), (chunk, 2))
+        a, b = rows_of(f0.fine, some[:, 0]), rows_of(f1.fine, some[:, 1])
+        products = jnp.einsum("kd,kd->k", a, b, precision=HIGHEST)
+        return i + 1, lax.dynamic_update_slice(scores, products, (start,))
+
+    start = (jnp.int32(0), jnp.zeros((k,), f0.fine.dtype))
+    return lax.while_loop(lambda s: s[0] * chunk < found, body, start)[1]
 
 
 def one_to_one(

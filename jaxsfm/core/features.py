@@ -11,7 +11,7 @@ from jaxsfm.core.grid import COARSE_STRIDE, FINE_STRIDE, cell_rows_cols, cell_to
 from jaxsfm.core.numerics import squared_norm, unit
 from jaxsfm.core.octaves import halve, octave_capacity
 from jaxsfm.core.relocalize import flat_pyramid, relocalize
-from jaxsfm.core.types import DenseFeatures, Pyramid
+from jaxsfm.core.types import DenseFeatures, Levels
 from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 
 LEAST_DIFFERENCE = 1e-3
@@ -38,7 +38,7 @@ def _flatten(
 
 
 def dense_features(
-    pyramids: Sequence[Pyramid],
+    octaves: Sequence[Levels],
     size: Int[Array, " 2"],
     *,
     num_coarse: int,
@@ -46,12 +46,12 @@ def dense_features(
     relocalized: bool,
     centred: bool = False,
 ) -> DenseFeatures:
-    """Descriptors and keypoints of an image's pyramids, each with batch axis 1.
+    """Descriptors and keypoints of an image from its maps, each with batch axis 1.
 
     Any backbone with maps of halving size can stand in for VGG here.
 
     Args:
-      pyramids: of the image, of the image at half its size, ...
+      octaves: of the image, of the image at half its size, ...
       size: valid (rows, columns) of the image.
       num_coarse, num_fine: capacities of the first octave, at least the number of valid cells.
       relocalized: keypoints by relocalization; False puts them at the cells' centres.
@@ -60,8 +60,7 @@ def dense_features(
     fine_grid, coarse_grid = size // FINE_STRIDE, size // COARSE_STRIDE
     row, col = cell_rows_cols(num_fine, fine_grid[1])
     if relocalized:
-        first = pyramids[0]
-        norms, levels = flat_pyramid([first.pool2[0], first.pool1[0], first.conv1_2[0]])
+        norms, levels = flat_pyramid([norm[0] for norm in reversed(octaves[0].norms)])
         keypoints = relocalize(norms, levels, row, col)
     else:
         cells = jnp.stack([col, row], axis=-1).astype(jnp.float32)
@@ -74,12 +73,22 @@ def dense_features(
         )
 
     return DenseFeatures(
-        coarse=descriptors([p.pool4 for p in pyramids], coarse_grid, num_coarse),
-        fine=descriptors([p.pool3 for p in pyramids], fine_grid, num_fine),
+        coarse=descriptors([o.pool4 for o in octaves], coarse_grid, num_coarse),
+        fine=descriptors([o.pool3 for o in octaves], fine_grid, num_fine),
         keypoints=jnp.where((row < fine_grid[0])[:, None], keypoints, 0.0),
         coarse_grid=coarse_grid.astype(jnp.int32),
         fine_grid=fine_grid.astype(jnp.int32),
     )
+
+
+def stored(features: DenseFeatures) -> DenseFeatures:
+    """The same with descriptors of half the size, as they are kept: float16, which rounds a unit
+    vector by 3e-4, a hundredth of what separates neighbouring cells (docs/design.md)."""
+
+    def half(octaves: tuple[Array, ...]) -> tuple[Array, ...]:
+        return tuple(octave.astype(jnp.float16) for octave in octaves)
+
+    return features._replace(coarse=half(features.coarse), fine=half(features.fine))
 
 
 @functools.partial(
@@ -110,15 +119,15 @@ def extract(
     Both padded sides must be multiples of 2^(octaves - 1).
     """
     x = preprocess(image, preprocessing)
-    pyramids = []
+    levels: list[Levels] = []
     for k in range(octaves):
-        pyramid = VGG16().apply(params, x[None], (size >> k)[None])
-        assert isinstance(pyramid, Pyramid)
-        pyramids.append(pyramid)
+        maps = VGG16().apply(params, x[None], (size >> k)[None], method="levels")
+        assert isinstance(maps, Levels)
+        levels.append(maps)
         if k + 1 < octaves:
             x = halve(x)
     return dense_features(
-        pyramids,
+        levels,
         size,
         num_coarse=num_coarse,
         num_fine=num_fine,

@@ -1,5 +1,9 @@
 """Small numerically careful pieces shared by the stages."""
 
+from collections.abc import Callable
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -46,3 +50,14 @@ def compact(mask: Bool[Array, " k"], *, size: int) -> tuple[Int[Array, " size"],
     return jnp.nonzero(mask, size=size, fill_value=0)[0].astype(jnp.int32), mask.sum(
         dtype=jnp.int32
     )
+
+
+def one_by_one(function: Callable[[Any], Any], items: Any, *, batch_size: int) -> Any:
+    """`function` over the leading axis of `items`, `batch_size` of them vmapped at a time.
+
+    A single item is no loop: XLA then sees what it sees without a batch.
+    """
+    if jax.tree.leaves(items)[0].shape[0] == 1:
+        result = function(jax.tree.map(lambda x: x[0], items))
+        return jax.tree.map(lambda x: x[None], result)
+    return lax.map(function, items, batch_size=batch_size if batch_size > 1 else None)

@@ -66,6 +66,7 @@ def _join(
 
     Between the centres of coarser cells: bilinear; beyond the outermost: theirs.
     """
+    octaves = [flat.astype(jnp.float32) for flat in octaves]
     first = octaves[0]
     if len(octaves) == 1:
         return first, ()

@@ -1,24 +1,22 @@
 """One pair = one program: coarse matches, fine correspondences, planes, one-to-one.
 
-`match_pairs` is the batch; `batch_size` pairs run side by side (vmapped), the rest in turn. One at
-a time is best on a CPU, where a vmapped `while_loop` runs every pair as long as the slowest.
+Images come with their octaves joined (`jaxsfm.core.octaves.join_octaves`), which is done once per
+image and not once per pair. `match_pairs` is the batch.
 """
 
 import functools
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from jaxsfm.config import PairShape
 from jaxsfm.core import coarse_to_fine as c2f
 from jaxsfm.core.consensus import consensus_nn
 from jaxsfm.core.matching import mutual_nn
-from jaxsfm.core.numerics import HIGHEST
-from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.numerics import one_by_one
 from jaxsfm.core.ransac import peel_planes
-from jaxsfm.core.types import DenseFeatures, PairMatches, PRNGKey, Status, Thresholds
+from jaxsfm.core.types import JoinedFeatures, PairMatches, PRNGKey, Status, Thresholds
 
 
 def pair_key(root: PRNGKey, identity0: int | Array, identity1: int | Array) -> PRNGKey:
@@ -33,8 +31,8 @@ def pair_key(root: PRNGKey, identity0: int | Array, identity1: int | Array) -> P
 @functools.partial(jax.jit, static_argnames=("shape",))
 def match_pair(
     key: PRNGKey,
-    features0: DenseFeatures,
-    features1: DenseFeatures,
+    features0: JoinedFeatures,
+    features1: JoinedFeatures,
     thresholds: Thresholds,
     *,
     shape: PairShape,
@@ -49,34 +47,28 @@ def match_pair(
       features0, features1: of the two working images.
       thresholds: pixels of the working images.
     """
-    joined0, joined1 = join_octaves(features0), join_octaves(features1)
-    num_fine = max(joined0.fine.shape[0], joined1.fine.shape[0])
+    num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
     capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
     if shape.consensus:
         coarse = consensus_nn(
-            joined0.coarse,
-            joined1.coarse,
-            joined0.coarse_grid,
-            joined1.coarse_grid,
-            parts=joined0.coarse_parts,
+            features0.coarse,
+            features1.coarse,
+            features0.coarse_grid,
+            features1.coarse_grid,
+            parts=features0.coarse_parts,
             radius=shape.consensus,
             columns=shape.coarse_columns,
             tile=shape.coarse_tile,
         )
     else:
-        coarse = mutual_nn(joined0.coarse, joined1.coarse, tile=shape.coarse_tile)
-    windows = c2f.match_windows(joined0, joined1, coarse, chunk=shape.fine_chunk)
-    cells, found = c2f.correspondences(c2f.candidates(windows, joined0), capacity=capacity)
+        coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
+    windows = c2f.match_windows(features0, features1, coarse, chunk=shape.fine_chunk)
+    cells, found = c2f.correspondences(c2f.candidates(windows, features0), capacity=capacity)
     valid = jnp.arange(cells.shape[0]) < found
-    xy0, xy1 = joined0.keypoints[cells[:, 0]], joined1.keypoints[cells[:, 1]]
+    xy0, xy1 = features0.keypoints[cells[:, 0]], features1.keypoints[cells[:, 1]]
     planes = peel_planes(key, xy0, xy1, valid, thresholds, shape=shape)
     if shape.one_to_one == "similarity":
-        score = jnp.einsum(
-            "kd,kd->k",
-            joined0.fine[cells[:, 0]],
-            joined1.fine[cells[:, 1]],
-            precision=HIGHEST,
-        )
+        score = c2f.similarities(features0, features1, cells, found)
     else:
         score = jnp.zeros((cells.shape[0],), jnp.float32)
     kept = c2f.one_to_one(cells, planes.plane >= 0, score, num_cells=num_fine)
@@ -101,8 +93,8 @@ def match_pair(
 @functools.partial(jax.jit, static_argnames=("shape", "batch_size"))
 def match_pairs(
     keys: PRNGKey,
-    features0: DenseFeatures,
-    features1: DenseFeatures,
+    features0: JoinedFeatures,
+    features1: JoinedFeatures,
     thresholds: Thresholds,
     *,
     shape: PairShape,
@@ -111,14 +103,14 @@ def match_pairs(
     """`match_pair` over a leading axis of keys and features.
 
     Args:
-      batch_size: pairs computed side by side. With 1 the results equal `match_pair` bit for bit;
-        with more, products are vmapped and may round differently in the last place.
+      batch_size: pairs computed side by side (vmapped), the others in turn. With 1 the results
+        equal `match_pair` bit for bit; with more, products are vmapped and may round differently in
+        the last place. One is best on a CPU, where a vmapped `while_loop` runs every pair as long
+        as the slowest.
     """
 
     def one(item):
         key, f0, f1 = item
         return match_pair(key, f0, f1, thresholds, shape=shape)
 
-    return lax.map(
-        one, (keys, features0, features1), batch_size=batch_size if batch_size > 1 else None
-    )
+    return one_by_one(one, (keys, features0, features1), batch_size=batch_size)

@@ -9,24 +9,25 @@ The levels differ in shape, which `lax.scan` does not allow; their norm maps are
 to end in one vector and the scan runs over (offset, width).
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
-
-from jaxsfm.core.numerics import squared_norm
 
 FACTOR = 2
 """Children per axis: the pyramid's own ratio (K in the paper)."""
 
 
 def flat_pyramid(
-    maps: list[Float[Array, "_h _w _c"]],
+    norms: Sequence[Float[Array, "_h _w"]],
 ) -> tuple[Float[Array, " total"], Int[Array, "levels 2"]]:
-    """Squared descriptor norms of feature maps in one vector, and (offset, width) of each map.
+    """Norm maps in one vector, and (offset, width) of each.
 
-    Squared norms order as norms do. Args: maps, coarse to fine, each twice the size of the last.
+    Args:
+      norms: of the descriptors of feature maps, coarse to fine, each twice the size of the last;
+        squared norms order as norms do.
     """
-    norms = [squared_norm(m) for m in maps]
     offsets, start = [], 0
     for norm in norms:
         offsets.append((start, norm.shape[1]))

@@ -24,6 +24,15 @@ class Pyramid(NamedTuple):
     pool5: Float[Array, "b h32 w32 512"]
 
 
+class Levels(NamedTuple):
+    """What features are made of: descriptors, and how strong the finer maps are."""
+
+    norms: tuple[Float[Array, "b h w"], Float[Array, "b h2 w2"], Float[Array, "b h4 w4"]]
+    """Squared norms of the pixels of conv1_2, pool1 and pool2."""
+    pool3: Float[Array, "b h8 w8 256"]
+    pool4: Float[Array, "b h16 w16 512"]
+
+
 class DenseFeatures(NamedTuple):
     """What one image brings to every pair: descriptors at its size, at half its size, ...
 

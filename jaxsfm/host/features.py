@@ -14,18 +14,14 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsfm.config import Config
-from jaxsfm.core.features import extract
 from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.host.images import (
     ImageFile,
-    WorkingImage,
-    read_image,
     shown_name,
     working_size,
 )
-from jaxsfm.host.weights import Weights
 
 SIDE_BUCKET = 128
 """Padding costs at most 8 % of a 1600 px side."""
@@ -39,6 +35,15 @@ _MENU = tuple(1024 * n // 2 for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
 """Coarse capacities: 512 .. 32768, half an octave apart."""
 
 
+class Room(NamedTuple):
+    """What fixes the shapes of a pair's program."""
+
+    num_coarse: int
+    """Capacity for coarse cells; there are four times as many fine ones."""
+    columns: int
+    """Of the coarse grid."""
+
+
 class ImageFeatures(NamedTuple):
     """Features of one image and the way back to its original pixels."""
 
@@ -47,6 +52,11 @@ class ImageFeatures(NamedTuple):
     """Original pixels per working pixel, (x, y)."""
     dense: DenseFeatures
     """numpy arrays."""
+
+    @property
+    def room(self) -> Room:
+        """As `room_of` the working image."""
+        return Room(self.dense.coarse[0].shape[0], int(self.dense.coarse_grid[1]))
 
 
 def capacity(num_coarse: int) -> int:
@@ -58,27 +68,19 @@ def capacity(num_coarse: int) -> int:
     return -(-num_coarse // _MENU[-1]) * _MENU[-1]
 
 
-def compute_features(weights: Weights, working: WorkingImage, *, config: Config) -> DenseFeatures:
-    """DenseFeatures (numpy) of an image at working size."""
-    height, width = working.rgb.shape[:2]
-    padded = tuple(-(-side // SIDE_BUCKET) * SIDE_BUCKET for side in (height, width))
-    image = np.zeros((*padded, 3), np.uint8)
-    image[:height, :width] = working.rgb
+def padded_size(size: tuple[int, int]) -> tuple[int, int]:
+    """(rows, columns), pixels, that a working image of (width, height) is padded to."""
+    width, height = size
+    return -(-height // SIDE_BUCKET) * SIDE_BUCKET, -(-width // SIDE_BUCKET) * SIDE_BUCKET
+
+
+def room_of(size: tuple[int, int]) -> Room:
+    """For the cells of a working image of (width, height)."""
+    width, height = size
     # 4 cells of pool3 to one of pool4, and the odd last row and column.
     odd = height // 8 * (width // 8) - 4 * (height // 16) * (width // 16)
-    num_coarse = capacity(height // 16 * (width // 16) + -(-odd // 4))
-    dense = extract(
-        weights.params,
-        image,
-        np.asarray([height, width], np.int32),
-        preprocessing=weights.preprocessing,
-        num_coarse=num_coarse,
-        num_fine=4 * num_coarse,
-        relocalized=config.keypoints == "relocalized",
-        octaves=config.octaves,
-        centred=config.centred,
-    )
-    return jax.device_get(dense)
+    cells = height // 16 * (width // 16) + -(-odd // 4)
+    return Room(capacity(cells), width // 16)
 
 
 def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
@@ -115,6 +117,11 @@ def total_memory() -> int | None:
     return total
 
 
+def extraction_bytes(pixels: int, *, config: Config) -> int:
+    """Peak memory of extracting one image of so many working pixels."""
+    return pixels * (BYTES_PER_PIXEL if config.octaves == 1 else OCTAVES_BYTES_PER_PIXEL)
+
+
 def check_memory(image: ImageFile, *, config: Config) -> None:
     """Refuse an image whose features cannot fit, before the system kills the process.
 
@@ -122,8 +129,7 @@ def check_memory(image: ImageFile, *, config: Config) -> None:
       UserError: what it needs and what there is.
     """
     width, height = working_size(image.size, config.max_size, config.enlarge)
-    per_pixel = BYTES_PER_PIXEL if config.octaves == 1 else OCTAVES_BYTES_PER_PIXEL
-    needed = per_pixel * width * height
+    needed = extraction_bytes(width * height, config=config)
     total = total_memory() if jax.default_backend() == "cpu" else None
     if total is not None and needed > total:
         raise UserError(
@@ -131,15 +137,3 @@ def check_memory(image: ImageFile, *, config: Config) -> None:
             f"{needed / 1e9:.1f} GB of memory, there are {total / 1e9:.1f} GB; "
             "use a smaller --max-size"
         )
-
-
-def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
-    """Read one image and compute its features.
-
-    Raises:
-      ImageError: the image cannot be used.
-      UserError: it needs more memory than there is.
-    """
-    check_memory(image, config=config)
-    working = read_image(image, max_size=config.max_size, enlarge=config.enlarge)
-    return ImageFeatures(image, working.scale, compute_features(weights, working, config=config))

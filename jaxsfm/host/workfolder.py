@@ -13,12 +13,10 @@ import logging
 import os
 import shutil
 import zipfile
-from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
-import jax
 import numpy as np
 
 from jaxsfm.core.types import DenseFeatures, Status
@@ -29,8 +27,6 @@ from jaxsfm.host.pairs import Pair, PairResult
 
 logger = logging.getLogger(__name__)
 
-MEMORY_BYTES = 2 << 30
-"""Features kept in memory; the others are read again from the folder."""
 _OCTAVES = ("coarse", "fine")
 """Fields of DenseFeatures that hold an array per octave."""
 RESULTS = ("report.json", "sparse", "database.db")
@@ -72,7 +68,6 @@ class WorkFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._cache: OrderedDict[str, ImageFeatures] = OrderedDict()
 
     # -- features: a cache that may be deleted at any time -------------------------------------
 
@@ -87,16 +82,12 @@ class WorkFolder:
             else:
                 arrays[name] = value
         _save_npz(self._feature_path(features.image), arrays)
-        self._remember(features)
 
     def has_features(self, image: ImageFile) -> bool:
-        return image.name in self._cache or self._feature_path(image).exists()
+        return self._feature_path(image).exists()
 
     def load_features(self, image: ImageFile) -> ImageFeatures | None:
         """The saved features, or None if there are none (or they are damaged)."""
-        if image.name in self._cache:
-            self._cache.move_to_end(image.name)
-            return self._cache[image.name]
         try:
             with (
                 self._feature_path(image).open("rb") as raw,
@@ -111,23 +102,10 @@ class WorkFolder:
                 scale = file["scale"]
         except _DAMAGED:
             return None
-        features = ImageFeatures(image, (float(scale[0]), float(scale[1])), dense)
-        self._remember(features)
-        return features
-
-    def _remember(self, features: ImageFeatures) -> None:
-        self._cache[features.image.name] = features
-        sizes = {
-            name: sum(a.nbytes for a in jax.tree.leaves(f.dense)) for name, f in self._cache.items()
-        }
-        total = sum(sizes.values())
-        while total > MEMORY_BYTES and len(self._cache) > 2:
-            name, _ = self._cache.popitem(last=False)
-            total -= sizes[name]
+        return ImageFeatures(image, (float(scale[0]), float(scale[1])), dense)
 
     def drop_features(self) -> None:
         """Delete the cache: every pair has its matches."""
-        self._cache.clear()
         shutil.rmtree(self.path / "features", ignore_errors=True)
 
     # -- photos that could not be decoded ------------------------------------------------------

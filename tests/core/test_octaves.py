@@ -6,6 +6,7 @@ import numpy as np
 import oracles
 import pytest
 import tolerances
+from described import compute_features
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import random_features, rng_of, seeds
@@ -13,7 +14,7 @@ from strategies import random_features, rng_of, seeds
 from jaxsfm.config import Config, preset
 from jaxsfm.core.octaves import OCTAVE_WEIGHT, halve, join_octaves
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.host.features import compute_features, pad_features
+from jaxsfm.host.features import pad_features
 from jaxsfm.host.images import WorkingImage
 
 join = jax.jit(join_octaves)

@@ -10,15 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from described import compute_features
 from strategies import random_homography, rng_of
 
 from jaxsfm.config import PRESETS, Config
-from jaxsfm.core.pair import match_pair, match_pairs, pair_key
+from jaxsfm.core import pair
+from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.pair import match_pairs, pair_key
 from jaxsfm.core.types import Status, Thresholds
-from jaxsfm.host.features import ImageFeatures, capacity, compute_features, pad_features
+from jaxsfm.host.features import ImageFeatures, capacity, pad_features
 from jaxsfm.host.images import ImageFile, WorkingImage
-from jaxsfm.pipeline import match_features
+from jaxsfm.matching import match_features
 
+join = jax.jit(join_octaves)
 THRESHOLDS = Thresholds(np.float32(10), np.int32(26), np.float32(0.999))
 SIZE = (384, 320)
 
@@ -50,6 +54,10 @@ def features_of(weights, warped):
 @pytest.fixture(scope="module")
 def features(features_of):
     return features_of(PRESETS["paper"])
+
+
+def match_pair(key, features0, features1, *args, **kwargs):
+    return pair.match_pair(key, join(features0), join(features1), *args, **kwargs)
 
 
 def matches_of(found, f0, f1):
@@ -110,7 +118,8 @@ def test_a_batch_is_its_pairs_one_by_one_bit_for_bit(features_of):
     shape = PRESETS["default"].pair
     keys = jnp.stack([pair_key(jax.random.key(0), a, b) for a, b in pairs])
     left, right = (
-        jax.tree.map(lambda *x: np.stack(x), *[features[p[side]] for p in pairs]) for side in (0, 1)
+        jax.tree.map(lambda *x: jnp.stack(x), *[join(features[p[side]]) for p in pairs])
+        for side in (0, 1)
     )
     single = [
         match_pair(k, features[a], features[b], THRESHOLDS, shape=shape)
@@ -171,12 +180,12 @@ def test_a_blank_image_says_too_few_matches(features, key):
 def test_one_compilation_serves_all_values(features, key):
     shape = dataclasses.replace(PRESETS["paper"].pair, max_hypotheses=640)
     run = match_pair
-    before = run._cache_size()
+    before = pair.match_pair._cache_size()
     for other in features:
         for px in (5.0, 10.0):
             limits = THRESHOLDS._replace(threshold_px=np.float32(px))
             run(key, features[0], other, limits, shape=shape)
-    assert run._cache_size() == before + 1
+    assert pair.match_pair._cache_size() == before + 1
 
 
 def test_the_pipeline_widens_the_votes_for_wide_images(features):

@@ -7,6 +7,7 @@ import oracles
 from hypothesis import given, settings
 from strategies import rng_of, seeds
 
+from jaxsfm.core.numerics import squared_norm
 from jaxsfm.core.relocalize import flat_pyramid, relocalize
 
 ROWS, COLS = 3, 5
@@ -29,7 +30,7 @@ def cells() -> tuple[np.ndarray, np.ndarray]:
 
 @jax.jit
 def walk(maps, row, col):
-    norms, levels = flat_pyramid([jnp.asarray(m) for m in maps])
+    norms, levels = flat_pyramid([squared_norm(jnp.asarray(m)) for m in maps])
     return relocalize(norms, levels, jnp.asarray(row), jnp.asarray(col))
 
 

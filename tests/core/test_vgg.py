@@ -1,5 +1,7 @@
 """Laws of the feature pyramid."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +52,34 @@ def test_padding_an_image_does_not_change_its_features(weights, photo, size):
         assert not np.asarray(map_[0, rows:]).any() and not np.asarray(map_[0, :, cols:]).any(), (
             level
         )
+
+
+@pytest.mark.parametrize("size", [(64, 80), (57, 71), (33, 66), (9, 80)])
+def test_levels_are_the_pyramid_without_its_largest_maps(weights, photo, size):
+    """On CPUs by strips: images that end inside one, at its edge, before the first ends."""
+    images, sizes = np.stack([photo, photo[::-1]]), [size, (64, 80)]
+    maps = apply(weights.params, images, sizes)
+    levels = jax.jit(functools.partial(VGG16().apply, method="levels"))(
+        weights.params, jnp.asarray(images), jnp.asarray(sizes, jnp.int32)
+    )
+    for ours, expected in zip(levels.norms, (maps.conv1_2, maps.pool1, maps.pool2), strict=True):
+        assert_maps_equal(ours, np.square(np.asarray(expected)).sum(-1))
+    assert_maps_equal(levels.pool3, np.asarray(maps.pool3))
+    assert_maps_equal(levels.pool4, np.asarray(maps.pool4))
+
+
+@pytest.mark.parametrize("rows", [1, 20, 64, 100])
+def test_strips_of_any_height_give_the_same(weights, photo, monkeypatch, rows):
+    def levels():
+        jax.clear_caches()  # what was compiled before has other strips
+        images, sizes = jnp.asarray(photo[None]), jnp.asarray([[50, 70]])
+        return VGG16().apply(weights.params, images, sizes, method="levels")
+
+    expected = levels()
+    monkeypatch.setattr(vgg, "STRIP_ROWS", 2 * rows)
+    for ours, want in zip(jax.tree.leaves(levels()), jax.tree.leaves(expected), strict=True):
+        assert_maps_equal(ours, np.asarray(want))
+    jax.clear_caches()
 
 
 def test_a_batch_is_its_images_one_by_one(weights, photo):

@@ -2,12 +2,10 @@
 
 import os
 
-import jax
 import numpy as np
 import pytest
 
 from jaxsfm.core.types import DenseFeatures, Status
-from jaxsfm.host import workfolder
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import PairResult
@@ -17,8 +15,8 @@ from jaxsfm.host.workfolder import WorkFolder
 def features(name: str = "a.jpg", digit: str = "a") -> ImageFeatures:
     rng = np.random.default_rng(ord(digit))
     dense = DenseFeatures(
-        tuple(rng.normal(size=(n, 8)).astype(np.float32) for n in (4, 1)),
-        tuple(rng.normal(size=(n, 4)).astype(np.float32) for n in (16, 4)),
+        tuple(rng.normal(size=(n, 8)).astype(np.float16) for n in (4, 1)),
+        tuple(rng.normal(size=(n, 4)).astype(np.float16) for n in (16, 4)),
         rng.normal(size=(16, 2)).astype(np.float32),
         np.asarray([2, 2], np.int32),
         np.asarray([4, 4], np.int32),
@@ -141,33 +139,6 @@ def test_an_interrupted_write_leaves_nothing_that_is_read(tmp_path, monkeypatch)
     assert folder.load_features(features().image) is None
     folder.save_matches(result())  # and it does not stand in the way
     assert_same(folder.load_matches(result().pair), result())
-
-
-def test_memory_keeps_the_last_two_features_whatever_the_bound(tmp_path, monkeypatch):
-    monkeypatch.setattr(workfolder, "MEMORY_BYTES", 1)
-    folder = WorkFolder(tmp_path)
-    images = []
-    for digit in "abcd":
-        folder.save_features(features(digit, digit))
-        images.append(features(digit, digit).image)
-    for path in (tmp_path / "features").iterdir():
-        path.unlink()
-    assert [folder.load_features(image) is not None for image in images] == [0, 0, 1, 1]
-
-
-def test_memory_below_the_bound_keeps_all_and_drops_the_least_recent(tmp_path, monkeypatch):
-    size = sum(array.nbytes for array in jax.tree.leaves(features().dense))
-    monkeypatch.setattr(workfolder, "MEMORY_BYTES", 3 * size)
-    folder = WorkFolder(tmp_path)
-    saved = {digit: features(digit, digit) for digit in "abcd"}
-    for digit in "abc":
-        folder.save_features(saved[digit])
-    folder.load_features(saved["a"].image)
-    folder.save_features(saved["d"])
-    for path in (tmp_path / "features").iterdir():
-        path.unlink()
-    kept = {d: folder.load_features(f.image) is not None for d, f in saved.items()}
-    assert kept == {"a": True, "b": False, "c": True, "d": True}
 
 
 def test_dropping_features_keeps_matches(tmp_path):

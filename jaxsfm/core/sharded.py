@@ -1,0 +1,152 @@
+"""Batches over all devices: every device runs the same program on its own items.
+
+Items are laid along the one axis of a mesh (`jax.sharding`); nothing is exchanged between devices,
+so an item's result is that of one device, and a loop ends on each device when its own items end.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int, UInt8, UInt32
+
+from jaxsfm.config import PairShape
+from jaxsfm.core.features import extract, stored
+from jaxsfm.core.numerics import one_by_one
+from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.pair import match_pairs, pair_key
+from jaxsfm.core.types import DenseFeatures, JoinedFeatures, PairMatches, PRNGKey, Thresholds
+from jaxsfm.core.vgg import Preprocessing
+
+AXIS = "items"
+_EACH, _SAME = PartitionSpec(AXIS), PartitionSpec()
+
+
+def device_mesh(devices: Sequence[Any]) -> Mesh:
+    """The devices in a row."""
+    return Mesh(np.asarray(devices), (AXIS,))
+
+
+def _sharded(function: Callable[..., Any], mesh: Mesh, in_specs: tuple, out_specs: Any) -> Any:
+    # Without the check that values vary alike: loops start from constants.
+    return jax.shard_map(
+        function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
+    )
+
+
+@functools.partial(
+    jax.jit,
+    static_argnames=(
+        "mesh",
+        "batch_size",
+        "preprocessing",
+        "num_coarse",
+        "relocalized",
+        "octaves",
+        "centred",
+    ),
+)
+def extract_batch(
+    params: dict,
+    images: UInt8[Array, "b h w 3"],
+    sizes: Int[Array, "b 2"],
+    *,
+    mesh: Mesh,
+    batch_size: int,
+    preprocessing: Preprocessing,
+    num_coarse: int,
+    relocalized: bool,
+    octaves: int,
+    centred: bool,
+) -> DenseFeatures:
+    """`jaxsfm.core.features.extract` of images that share a padded size, as they are `stored`.
+
+    Args:
+      images: a multiple of the number of devices.
+      batch_size: images a device computes side by side, the others in turn.
+    """
+
+    def local(params, images, sizes):
+        def one(item):
+            image, size = item
+            return stored(
+                extract(
+                    params,
+                    image,
+                    size,
+                    preprocessing=preprocessing,
+                    num_coarse=num_coarse,
+                    num_fine=4 * num_coarse,
+                    relocalized=relocalized,
+                    octaves=octaves,
+                    centred=centred,
+                )
+            )
+
+        return one_by_one(one, (images, sizes), batch_size=batch_size)
+
+    return _sharded(local, mesh, (_SAME, _EACH, _EACH), _EACH)(params, images, sizes)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh",))
+def join_everywhere(features: DenseFeatures, *, mesh: Mesh) -> JoinedFeatures:
+    """One image's joined features on every device: leading axis of devices, all alike."""
+
+    def local(features):
+        return jax.tree.map(lambda x: x[None], join_octaves(features))
+
+    return _sharded(local, mesh, (_SAME,), _EACH)(features)
+
+
+def pick(joined: Sequence[JoinedFeatures], *, mesh: Mesh) -> JoinedFeatures:
+    """For each device the features of another image, from results of `join_everywhere`; nothing is
+    copied."""
+    if mesh.size == 1:
+        return joined[0]
+    sharding = NamedSharding(mesh, _EACH)
+    places = {device: d for d, device in enumerate(mesh.devices.flat)}
+
+    def one(*arrays):
+        shards = [
+            next(s.data for s in array.addressable_shards if places[s.device] == d)
+            for d, array in enumerate(arrays)
+        ]
+        return jax.make_array_from_single_device_arrays(arrays[0].shape, sharding, shards)
+
+    return jax.tree.map(one, *joined)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "shape", "batch_size"))
+def match_batch(
+    root: PRNGKey,
+    identities: UInt32[Array, "d b 2"],
+    sides: tuple[tuple[JoinedFeatures, JoinedFeatures], ...],
+    thresholds: Thresholds,
+    *,
+    mesh: Mesh,
+    shape: PairShape,
+    batch_size: int,
+) -> PairMatches:
+    """`jaxsfm.core.pair.match_pairs` with b pairs for each of d devices.
+
+    Args:
+      root: key of the run; a pair's own is `pair_key`'s.
+      identities: of the two images of every pair.
+      sides: for each of the b the features of both images, leading axis d (from `pick`).
+
+    Returns:
+      Leading axes d, b.
+    """
+
+    def local(root, identities, sides, thresholds):
+        keys = jax.vmap(lambda ids: pair_key(root, ids[0], ids[1]))(identities[0])
+        left, right = jax.tree.map(lambda *x: jnp.concatenate(x), *sides)
+        found = match_pairs(keys, left, right, thresholds, shape=shape, batch_size=batch_size)
+        return jax.tree.map(lambda x: x[None], found)
+
+    specs = (_SAME, _EACH, _EACH, _SAME)
+    return _sharded(local, mesh, specs, _EACH)(root, identities, sides, thresholds)

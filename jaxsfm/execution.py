@@ -1,0 +1,137 @@
+"""How the compiled programs run: devices, batches, memory. Never what they give.
+
+Everything here follows from the machine and the images' sizes, not from what is free at the moment:
+with more than one item side by side, the last place of a product may differ.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from jaxsfm.config import Config
+from jaxsfm.core.octaves import join_octaves, octave_capacity
+from jaxsfm.core.sharded import device_mesh
+from jaxsfm.core.types import DenseFeatures
+from jaxsfm.core.vgg import LAYERS
+from jaxsfm.errors import UserError
+from jaxsfm.host.features import extraction_bytes, total_memory
+
+HOST_SHARE, DEVICE_SHARE = 1 / 8, 1 / 2
+"""Of a machine's memory, or of an accelerator's, that joined features may take."""
+HOST_BYTES = 3 << 29
+"""And at most this of a host's: ten images of 1536 x 1024 with four octaves."""
+MAX_IMAGES, MAX_PAIRS = 16, 64
+"""Side by side on an accelerator; more keep it no busier, but wait longer for the slowest."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Execution:
+    """None: chosen from the machine."""
+
+    devices: int | None = None
+    """How many of the visible ones; None: all."""
+    images_at_once: int | None = None
+    """Extracted side by side on each device; None: one on a CPU, which one image keeps busy."""
+    pairs_at_once: int | None = None
+    """Matched side by side on each device; None: one on a CPU."""
+    memory_gb: float | None = None
+    """For the joined features of the images at hand, on each device; None: half of an accelerator,
+    an eighth of a host, at most 1.6 GB. Less makes images come back more often."""
+
+    def __post_init__(self) -> None:
+        for name in ("devices", "images_at_once", "pairs_at_once"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1; got {value}")
+        if self.memory_gb is not None and not self.memory_gb > 0:
+            raise ValueError(f"memory_gb must be positive; got {self.memory_gb}")
+
+
+def chosen_devices(execution: Execution) -> Mesh:
+    """The devices to use, in a row.
+
+    Raises:
+      UserError: there are not so many.
+    """
+    devices = jax.local_devices()
+    if execution.devices is not None and execution.devices > len(devices):
+        raise UserError(
+            f"--devices {execution.devices}: there are {len(devices)} ({devices[0].platform})"
+        )
+    return device_mesh(devices[: execution.devices])
+
+
+def _device_memory(mesh: Mesh) -> int | None:
+    """Bytes that JAX may use on each accelerator; None for CPUs, or where it does not tell."""
+    device = mesh.devices.flat[0]
+    stats = None if device.platform == "cpu" else device.memory_stats()
+    return stats.get("bytes_limit") if stats else None
+
+
+def _bytes(tree: Any) -> int:
+    return sum(int(np.prod(x.shape)) * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
+def joined_bytes(num_coarse: int, *, octaves: int) -> int:
+    """Of one image's joined features, about 98 per working pixel with four octaves, 24 with one."""
+
+    def blank() -> DenseFeatures:
+        def octave(cells: int, layer: str) -> tuple[jax.Array, ...]:
+            rooms = (octave_capacity(cells, k) for k in range(octaves))
+            return tuple(jnp.zeros((room, LAYERS[layer][1])) for room in rooms)
+
+        fine, grid = 4 * num_coarse, jnp.zeros(2, jnp.int32)
+        return DenseFeatures(
+            octave(num_coarse, "conv4_3"), octave(fine, "conv3_3"), jnp.zeros((fine, 2)), grid, grid
+        )
+
+    return _bytes(jax.eval_shape(lambda: join_octaves(blank())))
+
+
+def resident_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:
+    """How many images' joined features stay on each device, at least the two of a pair."""
+    memory = _device_memory(mesh)
+    if execution.memory_gb is not None:
+        budget = execution.memory_gb * 1e9
+    elif memory is not None:
+        budget = DEVICE_SHARE * memory
+    else:
+        budget = min(HOST_BYTES, HOST_SHARE * (total_memory() or HOST_BYTES / HOST_SHARE))
+        budget /= mesh.size
+    return max(2, int(budget / joined_bytes(num_coarse, octaves=config.octaves)))
+
+
+def images_at_once(execution: Execution, mesh: Mesh, pixels: int, *, config: Config) -> int:
+    """Images extracted side by side on each device.
+
+    Args:
+      pixels: of one padded image.
+    """
+    if execution.images_at_once is not None:
+        return execution.images_at_once
+    memory = _device_memory(mesh)
+    if memory is None:
+        return 1
+    fits = DEVICE_SHARE * memory / extraction_bytes(pixels, config=config)
+    return int(np.clip(fits, 1, MAX_IMAGES))
+
+
+PAIR_BYTES_PER_CELL = 60_000
+"""Working memory of a pair, per coarse cell (of `default`, its tile of 1024 rows and the fine
+windows): measured by the compiler's own account (docs/performance.md)."""
+
+
+def pairs_at_once(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:
+    """Pairs matched side by side on each device."""
+    if execution.pairs_at_once is not None:
+        return execution.pairs_at_once
+    memory = _device_memory(mesh)
+    if memory is None:
+        return 1
+    # A batch copies both sides of its pairs, in what the resident images leave.
+    each = 2 * joined_bytes(num_coarse, octaves=config.octaves) + PAIR_BYTES_PER_CELL * num_coarse
+    return int(np.clip((1 - DEVICE_SHARE) * memory / 2 / each, 1, MAX_PAIRS))

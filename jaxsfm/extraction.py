@@ -1,0 +1,151 @@
+"""Image files to dense features, in batches over all devices."""
+
+import dataclasses
+import itertools
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from jaxsfm.config import Config
+from jaxsfm.core.sharded import extract_batch
+from jaxsfm.core.types import DenseFeatures
+from jaxsfm.execution import Execution, chosen_devices, images_at_once
+from jaxsfm.host.features import ImageFeatures, check_memory, padded_size, room_of
+from jaxsfm.host.images import ImageError, ImageFile, WorkingImage, read_image, working_size
+from jaxsfm.host.weights import Weights
+
+READERS = 8
+"""Threads that decode at most: one JPEG takes 20 ms, an accelerator wants 150 a second."""
+
+
+def on_device(weights: Weights) -> Weights:
+    """The same weights with their arrays on the accelerator, copied once instead of per image."""
+    return dataclasses.replace(weights, params=jax.device_put(weights.params))
+
+
+def _start(
+    weights: Weights, working: Sequence[WorkingImage], config: Config, mesh: Mesh, batch_size: int
+) -> DenseFeatures:
+    """Features, with a leading axis, of images that share a padded size and capacity; on the
+    devices, and not waited for."""
+    padded, num_coarse = _shapes(working[0].rgb.shape[1::-1])
+    room = batch_size * mesh.size
+    images = np.zeros((room, *padded, 3), np.uint8)
+    sizes = np.zeros((room, 2), np.int32)
+    for k, each in enumerate(working):
+        height, width = sizes[k] = each.rgb.shape[:2]
+        images[k, :height, :width] = each.rgb
+    return extract_batch(
+        weights.params,
+        images,
+        sizes,
+        mesh=mesh,
+        batch_size=batch_size,
+        preprocessing=weights.preprocessing,
+        num_coarse=num_coarse,
+        relocalized=config.keypoints == "relocalized",
+        octaves=config.octaves,
+        centred=config.centred,
+    )
+
+
+def _collect(dense: DenseFeatures, count: int) -> list[DenseFeatures]:
+    """The first `count` images' features, numpy."""
+    host = jax.device_get(dense)
+    return [jax.tree.map(lambda x, k=k: x[k].copy(), host) for k in range(count)]
+
+
+def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
+    """Padded size and capacity of a working image of (width, height): they fix the program."""
+    return padded_size(size), room_of(size).num_coarse
+
+
+def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
+    """Read one image and compute its features.
+
+    Raises:
+      ImageError: the image cannot be used.
+      UserError: it needs more memory than there is.
+    """
+    ((_, found),) = extracted(weights, [image], config=config, execution=Execution(devices=1))
+    if isinstance(found, ImageError):
+        raise found
+    return found
+
+
+def extracted(
+    weights: Weights,
+    images: Iterable[ImageFile],
+    *,
+    config: Config,
+    execution: Execution | None = None,
+) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
+    """Features of every image, or why it has none, as batches are done; images of one padded size
+    follow each other. The next images are read meanwhile.
+
+    Raises:
+      UserError: an image needs more memory than there is.
+    """
+    execution = execution or Execution()
+    mesh = chosen_devices(execution)
+
+    def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
+        return _shapes(working_size(image.size, config.max_size, config.enlarge))
+
+    running: tuple[DenseFeatures, list[tuple[ImageFile, WorkingImage]]] | None = None
+    for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
+        pixels = padded[0] * padded[1]
+        side_by_side = images_at_once(execution, mesh, pixels, config=config)
+        step = side_by_side * mesh.size
+        read = _read_ahead(group, config=config, ahead=2 * step)
+        while some := list(itertools.islice(read, step)):
+            for image, each in some:
+                if isinstance(each, ImageError):
+                    yield image, each
+            good = [(image, each) for image, each in some if isinstance(each, WorkingImage)]
+            if not good:
+                continue
+            if running is not None:
+                jax.block_until_ready(running[0])
+            found = _start(weights, [each for _, each in good], config, mesh, side_by_side)
+            if running is not None:
+                yield from _results(*running)
+            running = found, good
+    if running is not None:
+        yield from _results(*running)
+
+
+def _results(
+    found: DenseFeatures, read: list[tuple[ImageFile, WorkingImage]]
+) -> Iterator[tuple[ImageFile, ImageFeatures]]:
+    for (image, working), dense in zip(read, _collect(found, len(read)), strict=True):
+        yield image, ImageFeatures(image, working.scale, dense)
+
+
+def _read_ahead(
+    images: Iterable[ImageFile], *, config: Config, ahead: int
+) -> Iterator[tuple[ImageFile, WorkingImage | ImageError]]:
+    """Images in order, decoded by threads up to `ahead` of the one that is wanted."""
+
+    def read(image: ImageFile) -> WorkingImage | ImageError:
+        try:
+            return read_image(image, max_size=config.max_size, enlarge=config.enlarge)
+        except ImageError as error:
+            return error
+
+    waiting: deque[tuple[ImageFile, Future]] = deque()
+    todo = iter(images)
+    with ThreadPoolExecutor(min(READERS, os.cpu_count() or 1)) as pool:
+        while True:
+            for image in itertools.islice(todo, ahead - len(waiting)):
+                check_memory(image, config=config)
+                waiting.append((image, pool.submit(read, image)))
+            if not waiting:
+                return
+            image, working = waiting.popleft()
+            yield image, working.result()

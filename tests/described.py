@@ -1,0 +1,31 @@
+"""Dense features of one image in float32, before they are stored."""
+
+import jax
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.core.features import extract
+from jaxsfm.core.types import DenseFeatures
+from jaxsfm.host.features import padded_size, room_of
+from jaxsfm.host.images import WorkingImage
+from jaxsfm.host.weights import Weights
+
+
+def compute_features(weights: Weights, working: WorkingImage, *, config: Config) -> DenseFeatures:
+    height, width = working.rgb.shape[:2]
+    image = np.zeros((*padded_size((width, height)), 3), np.uint8)
+    image[:height, :width] = working.rgb
+    num_coarse = room_of((width, height)).num_coarse
+    return jax.device_get(
+        extract(
+            weights.params,
+            image,
+            np.asarray([height, width], np.int32),
+            preprocessing=weights.preprocessing,
+            num_coarse=num_coarse,
+            num_fine=4 * num_coarse,
+            relocalized=config.keypoints == "relocalized",
+            octaves=config.octaves,
+            centred=config.centred,
+        )
+    )
