@@ -12,7 +12,7 @@ os.environ.setdefault("OMP_NUM_THREADS", str(len(os.sched_getaffinity(0))))
 
 import tyro
 
-from benchmarks import extraction, homographies, machine, matching
+from benchmarks import extraction, homographies, machine, matching, scaling
 from benchmarks.timing import Metric
 
 DATA = Path(os.environ.get("JAXSFM_DATA", "../shared/data"))
@@ -27,6 +27,10 @@ def groups(data: Path) -> dict[str, Callable[[], Iterator[Metric]]]:
         "mutual": matching.measure_mutual,
         "pairs": lambda: matching.measure_pairs(data),
         "homographies": homographies.measure,
+        "scaling": lambda: scaling.measure_pairs(data),
+        "pixels": lambda: scaling.measure_pixels(data),
+        "start": lambda: scaling.measure_start(data),
+        "stage": lambda: scaling.measure_stage(data),
     }
 
 
@@ -55,7 +59,8 @@ def main(
     """Measure speed, with accuracy beside it.
 
     Args:
-      only: groups: machine, extraction, mutual, pairs, homographies; all by default.
+      only: groups: machine, extraction, mutual, pairs, homographies, scaling, pixels, start, stage;
+        all by default.
       gate: exit with 1 if a ratio lost more than its tolerance against the baseline.
       update: write the baseline.
       data: folder of the data sets; what needs them is skipped without.

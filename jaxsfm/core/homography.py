@@ -8,7 +8,7 @@ lose all of float32's digits.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsfm.core.numerics import HIGHEST, squared_norm
+from jaxsfm.core.numerics import HIGHEST
 
 MIN_AREA = 1e-4
 """Twice the triangle area, in normalised units squared, below which three points are collinear."""
@@ -25,13 +25,14 @@ def normalisation(xy: Float[Array, "k 2"], weight: Float[Array, " k"]) -> Float[
     One scale for both axes, so that a radius in pixels stays a radius.
     Source: Hartley 1997, section 5.
     """
+    x, y = xy[:, 0], xy[:, 1]  # columns: sums over (k, 2) are read with a stride of two
     total = jnp.maximum(weight.sum(), 1.0)
-    mean = (weight[:, None] * xy).sum(0) / total
-    spread = (weight * squared_norm(xy - mean)).sum() / total
+    mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
+    spread = (weight * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum() / total
     scale = jnp.sqrt(2.0 / jnp.where(spread > 0, spread, 2.0))
     return jnp.asarray([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]]) * scale + jnp.zeros((3, 3)).at[
         :, 2
-    ].set(jnp.stack([-scale * mean[0], -scale * mean[1], jnp.ones_like(scale)]))
+    ].set(jnp.stack([-scale * mean_x, -scale * mean_y, jnp.ones_like(scale)]))
 
 
 def apply_affine(t: Float[Array, "3 3"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
@@ -104,17 +105,16 @@ def least_squares(
     Source: Hartley and Zisserman, 2nd ed., algorithm 4.2.
     """
     t0, t1 = normalisation(xy0, weight), normalisation(xy1, weight)
-    p = homogeneous(apply_affine(t0, xy0))
-    q = apply_affine(t1, xy1)
-    zero = jnp.zeros_like(p)
-    rows = jnp.concatenate(
-        [
-            jnp.concatenate([p, zero, -q[:, :1] * p], axis=1),
-            jnp.concatenate([zero, p, -q[:, 1:] * p], axis=1),
-        ]
-    )
-    weights = jnp.concatenate([weight, weight])
-    normal = jnp.einsum("ki,k,kj->ij", rows, weights, rows, precision=HIGHEST)
+    p, q = apply_affine(t0, xy0), apply_affine(t1, xy1)
+    x, y, u, v = p[:, 0], p[:, 1], q[:, 0], q[:, 1]
+    one = jnp.ones_like(x)
+    # The rows (p, 0, -u p) and (0, p, -v p) meet in sums of p p' times 1, u, v and u^2 + v^2.
+    squares = jnp.stack([x * x, x * y, y * y, x, y, one])
+    factors = weight * jnp.stack([one, -u, -v, u * u + v * v])
+    sums = jnp.einsum("fk,sk->fs", factors, squares, precision=HIGHEST)
+    s, su, sv, suv = sums[:, jnp.asarray([[0, 1, 3], [1, 2, 4], [3, 4, 5]])]
+    zero = jnp.zeros_like(s)
+    normal = jnp.block([[s, zero, su], [zero, s, sv], [su, sv, suv]])
     _, vectors = jnp.linalg.eigh(normal)
     h = vectors[:, 0].reshape(3, 3)
     return orient(compose(adjugate(t1), compose(h, t0)))

@@ -25,12 +25,10 @@ from jaxsfm.host.images import (
 
 SIDE_BUCKET = 128
 """Padding costs at most 8 % of a 1600 px side."""
-BYTES_PER_PIXEL = 2100
-"""Peak memory of an extraction on CPUs; measured 1670 at 800 x 600, 1280 at 3200 x 2432, before
-Winograd's convolution, which adds 410 and 280 (the compiled programs' own figures)."""
-OCTAVES_BYTES_PER_PIXEL = 2900
-"""The same with four octaves; measured 2400 at 800 x 600, 1830 at 1600 x 1200, with 460 and 360 to
-add."""
+BYTES_PER_PIXEL, OCTAVES_BYTES_PER_PIXEL = 700, 900
+"""Peak memory of an extraction on CPUs per working pixel, with one octave and with four, beside
+half a gigabyte for the programs and their compilation: between 800 x 600 and 1600 x 1200 it grows
+by 660 and 860 (measured, docs/performance.md)."""
 _MENU = tuple(1024 * n // 2 for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
 """Coarse capacities: 512 .. 32768, half an octave apart."""
 

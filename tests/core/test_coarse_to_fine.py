@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+import tolerances
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import rng_of, seeds, unit_rows
@@ -102,6 +103,15 @@ def test_the_chunk_size_changes_nothing(chunk):
     np.testing.assert_array_equal(
         c2f.match_windows(f0, f1, coarse, chunk=chunk), c2f.match_windows(f0, f1, coarse, chunk=5)
     )
+
+
+@pytest.mark.parametrize("found", [0, 1, 7, 8, 61, 100])
+def test_similarities_are_products_as_far_as_there_are_correspondences(found):
+    f0, f1, _ = problem(5, GRIDS[0], GRIDS[2])
+    cells = jnp.asarray(rng_of(0).integers(0, 48, (61, 2)), jnp.int32)
+    ours = c2f.similarities(f0, f1, cells, jnp.int32(found), chunk=8)
+    expected = (np.asarray(f0.fine)[cells[:, 0]] * np.asarray(f1.fine)[cells[:, 1]]).sum(1)
+    np.testing.assert_allclose(ours[:found], expected[:found], **tolerances.UNIT)
 
 
 @settings(max_examples=40, deadline=None)

@@ -1,0 +1,164 @@
+"""What a larger job costs: pairs, pixels, the start, and COLMAP's SIFT on the same photos."""
+
+import dataclasses
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import jaxsfm
+from benchmarks.timing import Metric, median, ratio
+from jaxsfm.config import Config, preset
+from jaxsfm.extraction import extracted, on_device
+from jaxsfm.host.images import ImageFile
+from jaxsfm.host.rootsift import write_rootsift_database
+from jaxsfm.host.weights import Weights, load_weights
+from jaxsfm.matching import matched
+
+SMALL = 384
+"""Longer side for a thousand pairs in a minute; the programs are those of any other size."""
+PAIRS = 1000
+FEW = 10
+
+
+def _photos(data: Path) -> list[ImageFile]:
+    folders = sorted((data / "strecha").glob("*/images"))
+    return [
+        dataclasses.replace(image, name=f"{folder.parent.name}/{image.name}")
+        for folder in folders
+        for image in jaxsfm.open_images(folder)[0]
+    ]
+
+
+def measure_pairs(data: Path) -> Iterator[Metric]:
+    """Seconds per pair of a thousand pairs over those of ten: ten times ten, spread evenly over the
+    thousand, because pairs that overlap take less than others."""
+    photos = _photos(data)
+    pairs = list(itertools.combinations(sorted(photo.name for photo in photos), 2))[:PAIRS]
+    if len(pairs) < PAIRS:
+        print(f"skipped: scaling (not {PAIRS} pairs of photos in {data}/strecha)")
+        return
+    config = dataclasses.replace(preset("default"), max_size=SMALL)
+    features = jaxsfm.extract(load_weights(), photos, config=config)
+    rooms = {name: each.room for name, each in features.items()}
+
+    def seconds(some: list) -> float:
+        start = time.perf_counter()
+        for _ in matched(features.__getitem__, rooms, some, config=config):
+            pass
+        return (time.perf_counter() - start) / len(some)
+
+    seconds(pairs[:: PAIRS // FEW])
+    few = [seconds(pairs[k :: PAIRS // FEW]) for k in range(10)]
+    many = seconds(pairs)
+    yield Metric("scaling.pair.seconds", many, "s", "lower")
+    mean = float(np.mean(few))
+    yield Metric("scaling.pair.1000_over_10", many / mean, "x", "lower", 0.1)
+
+
+def measure_pixels(data: Path) -> Iterator[Metric]:
+    """Seconds per pixel from 384 x 256 to 2304 x 1536, the largest over the smallest."""
+    config = preset("default")
+    weights = on_device(load_weights())
+    photos = _photos(data)[:1]
+    if not photos:
+        print(f"skipped: pixels (no photos in {data}/strecha)")
+        return
+    costs = {}
+    for longer in (384, 768, 1536, 2304):
+        # Enlarged where the photo is smaller: only its size matters here.
+        sized = dataclasses.replace(config, max_size=longer, enlarge=2.0)
+        times = _extraction_times(weights, photos[0], sized, repeat=3)
+        costs[longer] = median(times) / (longer * longer * 2 / 3)
+        yield Metric(f"scaling.pixels.{longer}", costs[longer] * 1e6, "s per megapixel", "lower")
+    spread = max(costs.values()) / min(costs.values())
+    yield Metric("scaling.pixels.largest_over_least", spread, "x", "lower", 0.2)
+
+
+def _extraction_times(
+    weights: Weights, photo: ImageFile, config: Config, *, repeat: int
+) -> list[float]:
+    times = []
+    for _ in range(repeat + 1):
+        start = time.perf_counter()
+        for _ in extracted(weights, [photo], config=config):
+            pass
+        times.append(time.perf_counter() - start)
+    return times[1:]
+
+
+SCRIPT = """
+import json, sys, time
+from jaxsfm.host.compiled import keep_compiled
+keep_compiled()
+from pathlib import Path
+import jaxsfm
+from jaxsfm.extraction import extracted, on_device
+images, _ = jaxsfm.open_images(Path(sys.argv[1]))
+weights = on_device(jaxsfm.load_weights())
+times = []
+for _ in range(3):
+    start = time.time()
+    list(extracted(weights, images[:1], config=jaxsfm.preset("default")))
+    times.append((start, time.time()))
+print(json.dumps(times))
+"""
+
+
+def measure_start(data: Path) -> Iterator[Metric]:
+    """From the start of a process to its first image's features, less what an image takes: the
+    interpreter, imports, weights, the photos' headers, and the compiled program from the cache."""
+    folder = data / "strecha" / "fountain-P11" / "images"
+    if not folder.is_dir():
+        print(f"skipped: start (no {folder})")
+        return
+    waits = []
+    for _ in range(4):  # the first fills the cache
+        begin = time.time()
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT, str(folder)], capture_output=True, text=True, check=True
+        )
+        times = json.loads(done.stdout.splitlines()[-1])
+        image = min(end - start for start, end in times[1:])
+        waits.append(times[0][1] - begin - image)
+    yield Metric("start.seconds", median(waits[1:]), "s", "lower")
+
+
+def measure_stage(data: Path) -> Iterator[Metric]:
+    """Five photos of 1536 x 1024, extraction and all ten pairs: COLMAP's SIFT on the CPU, verified,
+    and ours."""
+    folder = data / "strecha" / "fountain-P11" / "images"
+    photos = jaxsfm.open_images(folder)[0][3:8] if folder.is_dir() else []
+    if len(photos) < 5:
+        print(f"skipped: stage (no five photos in {folder})")
+        return
+    weights = on_device(load_weights())
+
+    def sift() -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            database = Path(scratch) / "database.db"
+            write_rootsift_database(database, folder, photos, None, seed=0, threads=-1)
+
+    def ours(config: Config) -> None:
+        features = jaxsfm.extract(weights, photos, config=config)
+        jaxsfm.match(features, jaxsfm.exhaustive_pairs(features), config=config)
+
+    configs = {name: preset(name) for name in ("paper", "default")}
+    for config in configs.values():
+        ours(config)
+    times: dict[str, list[float]] = {"sift": [], **{name: [] for name in configs}}
+    for _ in range(2):
+        for name, own in times.items():
+            start = time.perf_counter()
+            ours(configs[name]) if name in configs else sift()
+            own.append(time.perf_counter() - start)
+    yield Metric("stage.sift.seconds", median(times["sift"]), "s", "lower")
+    for name in configs:
+        yield Metric(f"stage.{name}.seconds", median(times[name]), "s", "lower")
+        yield ratio(f"stage.{name}.over_colmap_sift", times[name], times["sift"], "lower", 0.25)
