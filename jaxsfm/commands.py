@@ -12,7 +12,7 @@ from typing import Literal
 
 import tyro
 
-from jaxsfm.config import Config, Keypoints, Refinement, preset
+from jaxsfm.config import Config, Convolutions, Keypoints, Refinement, preset
 from jaxsfm.errors import UserError
 
 Positional = tyro.conf.Positional
@@ -26,9 +26,12 @@ def _config(
     keypoints: Keypoints,
     view_graph: Switch = "preset",
     refine: int | None = None,
+    convolutions: Convolutions = "float32",
 ) -> Config:
     try:
-        config = dataclasses.replace(preset(name), max_size=max_size, keypoints=keypoints)
+        config = dataclasses.replace(
+            preset(name), max_size=max_size, keypoints=keypoints, convolutions=convolutions
+        )
         if view_graph != "preset":
             config = dataclasses.replace(config, view_graph=view_graph == "yes")
         if refine is not None:
@@ -68,6 +71,7 @@ def reconstruct(
     refine: int | None = None,
     max_size: int = 1600,
     keypoints: Keypoints = "relocalized",
+    convolutions: Convolutions = "float32",
     mapper: Literal["incremental", "global"] = "incremental",
     seed: int = 0,
     threads: int = -1,
@@ -95,6 +99,7 @@ def reconstruct(
       refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
       max_size: Longer side of the working images, pixels.
       keypoints: relocalized, or grid: cell centres (for the ablation).
+      convolutions: What the network multiplies in; bfloat16 is for accelerators.
       mapper: COLMAP's incremental or global mapper.
       seed: Of everything random.
       threads: Of COLMAP's part; 1 makes the model repeatable to the last byte; -1: all.
@@ -105,7 +110,7 @@ def reconstruct(
       memory_gb: For the features at hand, on each device; default: half of an accelerator, an
         eighth of a host, at most 1.6. Less makes photos come back more often.
     """
-    config = _config(preset, max_size, keypoints, view_graph, refine)
+    config = _config(preset, max_size, keypoints, view_graph, refine, convolutions)
     from jaxsfm.execution import Execution
     from jaxsfm.report import summary_lines
     from jaxsfm.run import RunOptions, run_folder
@@ -151,6 +156,7 @@ def match(
     preset: Preset = "default",
     max_size: int = 1600,
     keypoints: Keypoints = "relocalized",
+    convolutions: Convolutions = "float32",
     seed: int = 0,
 ) -> int:
     """Match two images; writes keypoints, planes and homographies.
@@ -165,9 +171,10 @@ def match(
       preset: See reconstruct.
       max_size: Longer side of the working images, pixels.
       keypoints: relocalized, or grid: cell centres.
+      convolutions: See reconstruct.
       seed: Of the RANSAC draws.
     """
-    config = _config(preset, max_size, keypoints)
+    config = _config(preset, max_size, keypoints, convolutions=convolutions)
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
     import numpy as np

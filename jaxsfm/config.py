@@ -9,6 +9,7 @@ import dataclasses
 from typing import Literal
 
 Keypoints = Literal["relocalized", "grid"]
+Convolutions = Literal["float32", "bfloat16"]
 OneToOne = Literal["first", "similarity"]
 
 
@@ -124,6 +125,8 @@ class Config:
     """Sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
     """Subtract an image's mean descriptor from its descriptors."""
+    convolutions: Convolutions = "float32"
+    """What the network multiplies in; it adds in float32. CPUs round and gain nothing."""
     keypoints: Keypoints = "relocalized"
     """Where a fine cell's keypoint lies: at its relocalized pixel, or at the cell's centre."""
     threshold_px: float = 10.0
@@ -144,7 +147,7 @@ class Config:
 
     def extraction(self) -> "Config":
         """The part that an image's features depend on; the rest at its defaults."""
-        names = ("max_size", "enlarge", "octaves", "centred", "keypoints")
+        names = ("max_size", "enlarge", "octaves", "centred", "convolutions", "keypoints")
         return Config(**{name: getattr(self, name) for name in names})
 
     def matching(self) -> dict[str, object]:
@@ -163,6 +166,10 @@ class Config:
         if not 0 <= self.aligned_octaves <= MAX_OCTAVES:
             raise ValueError(
                 f"aligned_octaves must lie in 0..{MAX_OCTAVES}; got {self.aligned_octaves}"
+            )
+        if self.convolutions not in ("float32", "bfloat16"):
+            raise ValueError(
+                f"convolutions must be 'float32' or 'bfloat16'; got {self.convolutions!r}"
             )
         if self.keypoints not in ("relocalized", "grid"):
             raise ValueError(f"keypoints must be 'relocalized' or 'grid'; got {self.keypoints!r}")

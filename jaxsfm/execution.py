@@ -18,7 +18,7 @@ from jaxsfm.core.sharded import device_mesh
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
-from jaxsfm.host.features import extraction_bytes, total_memory
+from jaxsfm.host.features import total_memory
 
 HOST_SHARE, DEVICE_SHARE = 1 / 8, 1 / 2
 """Of a machine's memory, or of an accelerator's, that joined features may take."""
@@ -105,7 +105,12 @@ def resident_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config
     return max(2, int(budget / joined_bytes(num_coarse, octaves=config.octaves)))
 
 
-def images_at_once(execution: Execution, mesh: Mesh, pixels: int, *, config: Config) -> int:
+ACCELERATOR_BYTES_PER_PIXEL = 3000
+"""Of an extraction where the largest maps exist whole: the compiler's own account for CPUs was
+1540, and a library's convolutions want room of their own. Not measured on a GPU yet."""
+
+
+def images_at_once(execution: Execution, mesh: Mesh, pixels: int) -> int:
     """Images extracted side by side on each device.
 
     Args:
@@ -116,13 +121,13 @@ def images_at_once(execution: Execution, mesh: Mesh, pixels: int, *, config: Con
     memory = _device_memory(mesh)
     if memory is None:
         return 1
-    fits = DEVICE_SHARE * memory / extraction_bytes(pixels, config=config)
+    fits = DEVICE_SHARE * memory / (ACCELERATOR_BYTES_PER_PIXEL * pixels)
     return int(np.clip(fits, 1, MAX_IMAGES))
 
 
-PAIR_BYTES_PER_CELL = 60_000
-"""Working memory of a pair, per coarse cell (of `default`, its tile of 1024 rows and the fine
-windows): measured by the compiler's own account (docs/performance.md)."""
+PAIR_BYTES_PER_CELL = 35_000
+"""Working memory of a pair per coarse cell, alone or side by side: the compiler's own account of
+`default`'s program at 1600 x 1200; `paper` takes 13 000."""
 
 
 def pairs_at_once(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:

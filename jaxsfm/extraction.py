@@ -51,6 +51,7 @@ def _start(
         relocalized=config.keypoints == "relocalized",
         octaves=config.octaves,
         centred=config.centred,
+        bfloat16=config.convolutions == "bfloat16",
     )
 
 
@@ -100,7 +101,7 @@ def extracted(
     running: tuple[DenseFeatures, list[tuple[ImageFile, WorkingImage]]] | None = None
     for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
         pixels = padded[0] * padded[1]
-        side_by_side = images_at_once(execution, mesh, pixels, config=config)
+        side_by_side = images_at_once(execution, mesh, pixels)
         step = side_by_side * mesh.size
         read = _read_ahead(group, config=config, ahead=2 * step)
         while some := list(itertools.islice(read, step)):

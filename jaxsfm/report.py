@@ -5,13 +5,13 @@ from typing import Any
 
 from jaxsfm.core.types import Status
 from jaxsfm.host.images import shown_name
-from jaxsfm.host.pairs import Pair, PairResult, component_of
+from jaxsfm.host.pairs import Pair, PairCounts, component_of
 
 
 def lost_images(
     names: Iterable[str],
     registered: Iterable[str],
-    results: Mapping[Pair, PairResult],
+    results: Mapping[Pair, PairCounts],
     verified: Mapping[Pair, int],
     untrusted: Collection[Pair] = (),
 ) -> list[dict[str, str]]:

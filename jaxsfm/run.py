@@ -4,7 +4,7 @@ import dataclasses
 import importlib.metadata
 import json
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -22,11 +22,11 @@ from jaxsfm.host.features import ImageFeatures, room_of
 from jaxsfm.host.images import ImageError, ImageFile, working_size
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, Mapper
-from jaxsfm.host.pairs import Pair, PairResult, best_pairs, exhaustive_pairs, read_pairs
+from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.viewgraph import Verdict
 from jaxsfm.host.weights import Weights, load_weights
-from jaxsfm.host.workfolder import WorkFolder, open_folder, write_atomic
+from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
 from jaxsfm.matching import matched
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures
@@ -94,7 +94,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
         by_name = {image.name: image for image in usable if image.name not in skipped}
         pairs = [pair for pair in pairs if pair[0] in by_name and pair[1] in by_name]
         with _timed(seconds, "extraction"):
-            results = {p: r for p in pairs if (r := folder.load_matches(p)) is not None}
+            results = {p: r.counts for p in pairs if (r := folder.load_matches(p)) is not None}
             missing = [pair for pair in pairs if pair not in results]
             skipped |= _extract(folder, weights, by_name, missing, config, options)
             missing = [pair for pair in missing if not skipped.keys() & set(pair)]
@@ -102,10 +102,10 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             _check_enough(images, good, skipped)
         with _timed(seconds, "matching"):
             for result in _match(folder, weights, by_name, missing, config, options):
-                results[result.pair] = result
+                results[result.pair] = result.counts
         with folder.publish() as fresh:
             chosen = _choose(results, options.best_pairs)
-            handed_on = {pair: results[pair] for pair in chosen}
+            handed_on = SavedMatches(folder, sorted(chosen))
             made = _map(fresh, good, handed_on, intrinsics, config, options, seconds)
             models, verified = made.models, made.verified
             untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
@@ -124,8 +124,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     "trusted": len(verified) - len(untrusted) if made.verdicts else None,
                     "overflowed": sum(r.num_dropped > 0 for r in results.values()),
                     "each": [
-                        _pair_figures(r, chosen, verified, made.verdicts)
-                        for _, r in sorted(results.items())
+                        _pair_figures(pair, counts, chosen, verified, made.verdicts)
+                        for pair, counts in sorted(results.items())
                     ],
                 },
                 "models": figures,
@@ -154,7 +154,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
 def _map(
     fresh: Path,
     images: list[ImageFile],
-    matches: dict[Pair, PairResult],
+    matches: Mapping[Pair, PairResult],
     intrinsics: Intrinsics | None,
     config: Config,
     options: RunOptions,
@@ -304,7 +304,7 @@ def _match(
         yield result
 
 
-def _choose(results: dict[Pair, PairResult], n: int | None) -> set[Pair]:
+def _choose(results: dict[Pair, PairCounts], n: int | None) -> set[Pair]:
     counts = {pair: result.num_inliers for pair, result in results.items()}
     if n is None:
         return {pair for pair, count in counts.items() if count}
@@ -312,19 +312,20 @@ def _choose(results: dict[Pair, PairResult], n: int | None) -> set[Pair]:
 
 
 def _pair_figures(
-    result: PairResult,
+    pair: Pair,
+    counts: PairCounts,
     chosen: set[Pair],
     verified: dict[Pair, int],
     verdicts: dict[Pair, Verdict],
 ) -> dict[str, Any]:
-    verdict = verdicts.get(result.pair)
+    verdict = verdicts.get(pair)
     return {
-        "pair": list(result.pair),
-        "status": result.status.name.lower(),
-        "tentative": result.num_tentative,
-        "inliers": result.num_inliers,
-        "planes": len(result.homographies),
-        "handed_on": result.pair in chosen,
-        "colmap_inliers": verified.get(result.pair, 0),
+        "pair": list(pair),
+        "status": counts.status.name.lower(),
+        "tentative": counts.num_tentative,
+        "inliers": counts.num_inliers,
+        "planes": counts.num_planes,
+        "handed_on": pair in chosen,
+        "colmap_inliers": verified.get(pair, 0),
         "view_graph": None if verdict is None else dataclasses.asdict(verdict),
     }

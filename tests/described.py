@@ -27,5 +27,6 @@ def compute_features(weights: Weights, working: WorkingImage, *, config: Config)
             relocalized=config.keypoints == "relocalized",
             octaves=config.octaves,
             centred=config.centred,
+            bfloat16=config.convolutions == "bfloat16",
         )
     )

@@ -202,7 +202,7 @@ def test_memory_is_what_the_formula_says(features):
 
 def test_a_cpu_takes_one_at_a_time_unless_told():
     config = preset("default")
-    assert execution.images_at_once(Execution(), MESH, 10**6, config=config) == 1
+    assert execution.images_at_once(Execution(), MESH, 10**6) == 1
     assert execution.pairs_at_once(Execution(), MESH, 6144, config=config) == 1
     assert execution.pairs_at_once(Execution(pairs_at_once=7), MESH, 6144, config=config) == 7
 
@@ -212,7 +212,7 @@ def test_an_accelerator_takes_what_fits(monkeypatch):
     chosen = []
     for memory in (8e9, 24e9, 140e9):
         monkeypatch.setattr(execution, "_device_memory", lambda _, memory=memory: int(memory))
-        images = execution.images_at_once(Execution(), MESH, 1600 * 1200, config=config)
+        images = execution.images_at_once(Execution(), MESH, 1600 * 1200)
         pairs = execution.pairs_at_once(Execution(), MESH, 8192, config=config)
         kept = execution.resident_images(Execution(), MESH, 8192, config=config)
         joined = execution.joined_bytes(8192, octaves=4)

@@ -29,12 +29,13 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
     "no-consensus": lambda c: _with_pair(c, consensus=0),
     "no-competition": lambda c: _with_pair(c, plane_rounds=0),
     "no-alignment": lambda c: dataclasses.replace(c, aligned_octaves=0),
+    "bfloat16": lambda c: dataclasses.replace(c, convolutions="bfloat16"),
     "no-placing": lambda c: dataclasses.replace(
         c, refinement=c.refinement and dataclasses.replace(c.refinement, weak_octaves=0)
     ),
 }
-"""One idea left out of a preset: METHOD-no-IDEA. Without placing models change, not matches;
-without alignment matches of single pairs, not models."""
+"""One idea left out of a preset, or exchanged: METHOD-IDEA. Without placing models change, not
+matches; without alignment matches of single pairs, not models."""
 ABLATED = tuple(
     f"{name}-{idea}"
     for name in ("default", "robust")
@@ -46,7 +47,7 @@ RUN_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-ali
 
 
 def method_config(method: str, *, max_size: int | None = None) -> Config:
-    """A preset by its name; PRESET-no-IDEA: without that idea (`ABLATIONS`); paper-grid: paper at
+    """A preset by its name; PRESET-IDEA: without that idea (`ABLATIONS`); paper-grid: paper at
     cell centres; grid and reloc: the default preset without refinement and alignment, at cell
     centres or relocalized.
 

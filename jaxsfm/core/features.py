@@ -100,6 +100,7 @@ def stored(features: DenseFeatures) -> DenseFeatures:
         "relocalized",
         "octaves",
         "centred",
+        "bfloat16",
     ),
 )
 def extract(
@@ -113,6 +114,7 @@ def extract(
     relocalized: bool,
     octaves: int = 1,
     centred: bool = False,
+    bfloat16: bool = False,
 ) -> DenseFeatures:
     """DenseFeatures of one RGB image, padded at the bottom and on the right beyond `size`.
 
@@ -121,7 +123,7 @@ def extract(
     x = preprocess(image, preprocessing)
     levels: list[Levels] = []
     for k in range(octaves):
-        maps = VGG16().apply(params, x[None], (size >> k)[None], method="levels")
+        maps = VGG16(bfloat16).apply(params, x[None], (size >> k)[None], method="levels")
         assert isinstance(maps, Levels)
         levels.append(maps)
         if k + 1 < octaves:

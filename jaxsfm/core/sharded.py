@@ -48,6 +48,7 @@ def _sharded(function: Callable[..., Any], mesh: Mesh, in_specs: tuple, out_spec
         "relocalized",
         "octaves",
         "centred",
+        "bfloat16",
     ),
 )
 def extract_batch(
@@ -62,6 +63,7 @@ def extract_batch(
     relocalized: bool,
     octaves: int,
     centred: bool,
+    bfloat16: bool,
 ) -> DenseFeatures:
     """`jaxsfm.core.features.extract` of images that share a padded size, as they are `stored`.
 
@@ -84,6 +86,7 @@ def extract_batch(
                     relocalized=relocalized,
                     octaves=octaves,
                     centred=centred,
+                    bfloat16=bfloat16,
                 )
             )
 

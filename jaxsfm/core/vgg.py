@@ -10,7 +10,7 @@ Source: Simonyan and Zisserman 2015, configuration D.
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax
@@ -91,35 +91,43 @@ class Parameters(nn.Module):
 
 
 def _library(
-    x: Float[Array, "b h w c"], kernel: Array, precision: lax.Precision, rows: int = 1
+    x: Float[Array, "b h w c"], kernel: Array, *, bfloat16: bool, rows: int = 1
 ) -> Float[Array, "b _h w o"]:
     """The backend's own convolution; `rows` of zeros are added above and below."""
+    if bfloat16:
+        x, kernel = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
     return lax.conv_general_dilated(
         x,
         kernel,
         (1, 1),
         ((rows, rows), (1, 1)),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=precision,
+        precision=HIGHEST,
+        preferred_element_type=jnp.float32,
     )
 
 
-def conv(
-    x: Float[Array, "b h w c"], layer: Layer, precision: lax.Precision
-) -> Float[Array, "b h w o"]:
+def _rounded(x: Array, bfloat16: bool) -> Array:
+    """As bfloat16 has it: CPUs multiply float32 and get what accelerators get."""
+    return lax.reduce_precision(x, exponent_bits=8, mantissa_bits=7) if bfloat16 else x
+
+
+def conv(x: Float[Array, "b h w c"], layer: Layer, *, bfloat16: bool) -> Float[Array, "b h w o"]:
     """3 x 3 convolution with zero padding of one, plus bias: the fastest way of the platform
     compiled for."""
+    height, width, channels = x.shape[1:]
+    small = channels < WINOGRAD_CHANNELS or height * width < WINOGRAD_PIXELS
 
-    def library(x, kernel):
-        return _library(x, kernel, precision)
-
-    def winograd(x, kernel):
+    def on_cpu(x, kernel):
+        x, kernel = _rounded(x, bfloat16), _rounded(kernel, bfloat16)
+        if small:
+            return _library(x, kernel, bfloat16=False)
         return lax.map(lambda image: conv3x3(image, kernel), x)
 
-    height, width, channels = x.shape[1:]
-    if channels < WINOGRAD_CHANNELS or height * width < WINOGRAD_PIXELS:
-        return library(x, layer.kernel) + layer.bias
-    return lax.platform_dependent(x, layer.kernel, cpu=winograd, default=library) + layer.bias
+    elsewhere = functools.partial(_library, bfloat16=bfloat16)
+    if small and not bfloat16:
+        return elsewhere(x, layer.kernel) + layer.bias
+    return lax.platform_dependent(x, layer.kernel, cpu=on_cpu, default=elsewhere) + layer.bias
 
 
 def _pool(x: Float[Array, "b h w c"], size: Int[Array, "b 2"]) -> Float[Array, "b h2 w2 c"]:
@@ -132,18 +140,19 @@ def _convolved(
     x: Float[Array, "b h w c"],
     size: Int[Array, "b 2"],
     layers: Sequence[Layer],
-    precision: lax.Precision,
+    *,
+    bfloat16: bool,
 ) -> list[Float[Array, "b h w _o"]]:
     """The convolutions of a block before their rectifiers."""
     maps: list[Array] = []
     for layer in layers:
-        x = _clear_padding(conv(nn.relu(maps[-1]) if maps else x, layer, precision), size)
+        x = _clear_padding(conv(nn.relu(maps[-1]) if maps else x, layer, bfloat16=bfloat16), size)
         maps.append(x)
     return maps
 
 
 def _strips(
-    x: Float[Array, "h w c"], size: Int[Array, " 2"], layers: Sequence[Layer], precision: Any
+    x: Float[Array, "h w c"], size: Int[Array, " 2"], layers: Sequence[Layer], *, bfloat16: bool
 ) -> tuple[Float[Array, "h w"], Float[Array, "h2 w2 o"]]:
     """Squared norms of a block's last convolution and its pooled map, STRIP_ROWS at a time: with
     a row more on either side for every layer, nothing else of the maps ever exists."""
@@ -156,7 +165,8 @@ def _strips(
     def strip(start):
         y = lax.dynamic_slice_in_dim(padded, start, rows + 2 * depth)[None]
         for margin, layer in zip(reversed(range(depth)), layers, strict=True):
-            y = _library(nn.relu(y) if margin + 1 < depth else y, layer.kernel, precision, rows=0)
+            y = _rounded(nn.relu(y) if margin + 1 < depth else y, bfloat16)
+            y = _library(y, _rounded(layer.kernel, bfloat16), bfloat16=False, rows=0)
             row = start - margin + jnp.arange(rows + 2 * margin)
             inside = ((row >= 0) & (row < size[0]))[:, None] & columns
             y = jnp.where(inside[:, :, None], y + layer.bias, 0.0)
@@ -173,7 +183,8 @@ class VGG16(nn.Module):
     With `method="levels"` -> Levels: what features are made of, without the largest maps.
     """
 
-    precision: lax.Precision = HIGHEST
+    bfloat16: bool = False
+    """Convolutions multiply in bfloat16 and add in float32."""
 
     def setup(self) -> None:
         """Thirteen layers with the canonical names."""
@@ -193,7 +204,7 @@ class VGG16(nn.Module):
         x = _clear_padding(images, size)
         maps: list[Array] = []
         for block in range(1, len(BLOCKS) + 1):
-            last = _convolved(x, size, self._layers(block), self.precision)[-1]
+            last = _convolved(x, size, self._layers(block), bfloat16=self.bfloat16)[-1]
             if block == 1:
                 maps.append(last)
             x = _pool(last, size)
@@ -210,11 +221,11 @@ class VGG16(nn.Module):
             layers = self._layers(block)
 
             def whole(x, size, layers):
-                last = _convolved(x, size, layers, self.precision)[-1]
+                last = _convolved(x, size, layers, bfloat16=self.bfloat16)[-1]
                 return squared_norm(last), _pool(last, size)
 
             def strips(x, size, layers):
-                one = functools.partial(_strips, layers=layers, precision=self.precision)
+                one = functools.partial(_strips, layers=layers, bfloat16=self.bfloat16)
                 return lax.map(lambda item: one(*item), (x, size))
 
             if block <= STRIP_BLOCKS:

@@ -9,7 +9,7 @@ heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even 
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,30 +40,35 @@ def keypoint_tables(results: Iterable[PairResult]) -> dict[str, tuple[np.ndarray
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for result in results:
         for side, xy in enumerate((result.keypoints0, result.keypoints1)):
-            parts.setdefault(result.pair[side], []).append((result.cells[:, side], xy))
-    tables = {}
-    for name, rows in parts.items():
-        cells, first = np.unique(np.concatenate([c for c, _ in rows]), return_index=True)
-        tables[name] = (cells, np.concatenate([xy for _, xy in rows])[first])
-    return tables
+            rows = parts.setdefault(result.pair[side], [])
+            rows.append((result.cells[:, side], xy))
+            if len(rows) > UNITED:  # a cell comes back in most pairs
+                rows[:] = [_united(rows)]
+    return {name: _united(rows) for name, rows in parts.items()}
 
 
-def _checked_matches(
-    result: PairResult, tables: Mapping[str, tuple[np.ndarray, np.ndarray]]
-) -> np.ndarray:
-    """Indices into the keypoint tables, uint32 (n, 2); ValueError for what COLMAP dies of."""
-    columns = []
-    for side, name in enumerate(result.pair):
-        cells = tables[name][0]
-        index = np.searchsorted(cells, result.cells[:, side])
-        if len(index) and (
-            index.max() >= len(cells) or (cells[index] != result.cells[:, side]).any()
-        ):
-            raise ValueError(f"pair {describe(result.pair)}: a match has no keypoint")
-        if len(np.unique(index)) != len(index):
-            raise ValueError(f"pair {describe(result.pair)}: a keypoint is matched twice")
-        columns.append(index)
-    return np.stack(columns, axis=1).astype(np.uint32)
+UNITED = 16
+"""Pairs of an image whose keypoints are held apart: all would be gigabytes for 500 images."""
+
+
+def _united(rows: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Every cell once, ascending, with its first (x, y)."""
+    cells, xy = (np.concatenate(column) for column in zip(*rows, strict=True))
+    cells, first = np.unique(cells, return_index=True)
+    return cells, xy[first]
+
+
+def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
+    """The results; ValueError for what COLMAP dies of."""
+    for pair, result in results.items():
+        if pair != result.pair:
+            raise ValueError(f"pair {describe(pair)} holds the result of {describe(result.pair)}")
+        n = result.num_inliers
+        if not (result.cells.shape == result.keypoints0.shape == result.keypoints1.shape == (n, 2)):
+            raise ValueError(f"pair {describe(pair)}: cells and keypoints must be {n} x 2")
+        if any(len(np.unique(column)) != n for column in result.cells.T):
+            raise ValueError(f"pair {describe(pair)}: a keypoint is matched twice")
+        yield result
 
 
 def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Camera:
@@ -100,18 +105,13 @@ def write_database(
     """A new COLMAP database with cameras, images, keypoints and matches.
 
     Args:
-      results: the pairs handed on; images without any stay in the database without keypoints.
+      results: the pairs handed on, each read twice and none held; images without any stay in the
+        database without keypoints.
 
     Raises:
       ValueError: inconsistent results (nothing is written).
     """
-    for pair, result in results.items():
-        if pair != result.pair:
-            raise ValueError(f"pair {describe(pair)} holds the result of {describe(result.pair)}")
-        n = result.num_inliers
-        if not (result.cells.shape == result.keypoints0.shape == result.keypoints1.shape == (n, 2)):
-            raise ValueError(f"pair {describe(pair)}: cells and keypoints must be {n} x 2")
-    tables = keypoint_tables(results.values())
+    tables = keypoint_tables(_consistent(results))
     names = {image.name: image for image in images}
     if unknown := sorted(tables.keys() - names.keys()):
         raise ValueError(f"results name images that are not given: {unknown[0]!r}")
@@ -120,11 +120,6 @@ def write_database(
             raise ValueError(f"{name}: keypoints must be finite")
         if (xy < -0.5).any() or (xy > np.asarray(names[name].size) - 0.5).any():
             raise ValueError(f"{name}: keypoints outside the image {names[name].size}")
-    matches = {
-        pair: _checked_matches(result, tables)
-        for pair, result in sorted(results.items())
-        if result.num_inliers
-    }
     empty = np.zeros((0, 2), np.float32)
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
@@ -136,8 +131,12 @@ def write_database(
             ids[image.name] = db.write_image(pycolmap.Image(name=image.name, camera_id=camera_id))
             xy = tables[image.name][1] if image.name in tables else empty
             db.write_keypoints(ids[image.name], (xy + PIXEL_OFFSET).astype(np.float32))
-        for (a, b), index in matches.items():
-            db.write_matches(ids[a], ids[b], index)
+        for a, b in sorted(results):
+            cells = results[a, b].cells
+            if len(cells):
+                columns = zip((a, b), cells.T, strict=True)
+                index = [np.searchsorted(tables[name][0], column) for name, column in columns]
+                db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
 
 
 def verify(path: Path, *, seed: int, threads: int, scale: float, relative_poses: bool) -> None:

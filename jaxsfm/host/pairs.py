@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,27 @@ class PairResult:
     def num_inliers(self) -> int:
         """One-to-one verified matches."""
         return len(self.plane)
+
+    @property
+    def counts(self) -> "PairCounts":
+        """What can be held of a hundred thousand pairs."""
+        return PairCounts(
+            num_inliers=self.num_inliers,
+            num_planes=len(self.homographies),
+            num_tentative=self.num_tentative,
+            num_dropped=self.num_dropped,
+            status=self.status,
+        )
+
+
+class PairCounts(NamedTuple):
+    """A pair's result in numbers."""
+
+    num_inliers: int
+    num_planes: int
+    num_tentative: int
+    num_dropped: int
+    status: Status
 
 
 def make_pair(a: str, b: str) -> Pair:

@@ -13,7 +13,7 @@ import logging
 import os
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
@@ -23,7 +23,7 @@ from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
-from jaxsfm.host.pairs import Pair, PairResult
+from jaxsfm.host.pairs import Pair, PairResult, describe
 
 logger = logging.getLogger(__name__)
 
@@ -194,7 +194,34 @@ class WorkFolder:
             return None
 
 
-_OPTIONS = {"max_size": "--max-size", "keypoints": "--keypoints", "seed": "--seed"}
+class SavedMatches(Mapping[Pair, PairResult]):
+    """Pairs' results in a folder, read when they are asked for."""
+
+    def __init__(self, folder: WorkFolder, pairs: Iterable[Pair]) -> None:
+        self._folder, self._pairs = folder, dict.fromkeys(pairs)
+
+    def __getitem__(self, pair: Pair) -> PairResult:
+        if pair not in self._pairs:
+            raise KeyError(pair)
+        found = self._folder.load_matches(pair)
+        if found is None:
+            raise UserError(
+                f"--out {self._folder.path}: the matches of {describe(pair)} are gone or damaged; "
+                "run the same command again"
+            )
+        return found
+
+    def __iter__(self) -> Iterator[Pair]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+
+_OPTIONS = {
+    name: f"--{name.replace('_', '-')}"
+    for name in ("max_size", "keypoints", "convolutions", "seed")
+}
 
 
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> str:

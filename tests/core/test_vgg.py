@@ -68,6 +68,22 @@ def test_levels_are_the_pyramid_without_its_largest_maps(weights, photo, size):
     assert_maps_equal(levels.pool4, np.asarray(maps.pool4))
 
 
+def test_bfloat16_rounds_what_is_multiplied_and_adds_in_float32(weights, photo):
+    """One layer exactly; the network as bfloat16's eight bits let it."""
+    x, layer = jnp.asarray(photo[None]), weights.params["params"]["conv1_1"]
+    kernel = jnp.asarray(layer["kernel"])
+    ours = vgg.conv(x, vgg.Layer(kernel, jnp.asarray(layer["bias"])), bfloat16=True)
+    low = [np.asarray(a.astype(jnp.bfloat16).astype(jnp.float32)) for a in (x[0], kernel)]
+    assert_maps_equal(ours[0], oracles.convolution(*low, layer["bias"]))
+    images, sizes = jnp.asarray(photo[None]), jnp.asarray([photo.shape[:2]])
+    exact = VGG16().apply(weights.params, images, sizes, method="levels")
+    half = VGG16(bfloat16=True).apply(weights.params, images, sizes, method="levels")
+    for name in ("pool3", "pool4"):
+        a, b = (np.asarray(getattr(maps, name)) for maps in (exact, half))
+        apart = np.linalg.norm(a - b) / np.linalg.norm(a)
+        assert 1e-4 < apart < 0.02, name
+
+
 @pytest.mark.parametrize("rows", [1, 20, 64, 100])
 def test_strips_of_any_height_give_the_same(weights, photo, monkeypatch, rows):
     def levels():

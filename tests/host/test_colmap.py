@@ -8,7 +8,7 @@ import pytest
 from mapped import map_database
 
 from jaxsfm.evaluation import evaluate
-from jaxsfm.host import mapping
+from jaxsfm.host import colmap, mapping
 from jaxsfm.host.colmap import (
     keypoint_tables,
     read_two_views,
@@ -100,6 +100,17 @@ def test_a_cell_is_one_keypoint_in_all_pairs(scene):
                 result.cells[:, side], (result.keypoints0, result.keypoints1)[side], strict=True
             ):
                 assert row[cell] == tuple(p)
+
+
+def test_keypoints_are_the_same_however_many_pairs_are_held_apart(scene, monkeypatch):
+    tables = keypoint_tables(scene.results.values())
+    for held in (0, 1, 2, 1000):
+        monkeypatch.setattr(colmap, "UNITED", held)
+        again = keypoint_tables(scene.results.values())
+        assert again.keys() == tables.keys()
+        for name, (cells, xy) in tables.items():
+            np.testing.assert_array_equal(again[name][0], cells)
+            np.testing.assert_array_equal(again[name][1], xy)
 
 
 def test_seed_threads_and_scale_reach_all_of_colmaps_options():

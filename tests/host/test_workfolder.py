@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from jaxsfm.core.types import DenseFeatures, Status
+from jaxsfm.errors import UserError
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import PairResult
-from jaxsfm.host.workfolder import WorkFolder
+from jaxsfm.host.workfolder import SavedMatches, WorkFolder
 
 
 def features(name: str = "a.jpg", digit: str = "a") -> ImageFeatures:
@@ -149,3 +150,26 @@ def test_dropping_features_keeps_matches(tmp_path):
     assert not (tmp_path / "features").exists() and not folder.has_features(features().image)
     assert_same(folder.load_matches(result().pair), result())
     folder.drop_features()  # again: nothing to drop
+
+
+def test_saved_matches_are_read_when_asked_for(tmp_path):
+    folder = WorkFolder(tmp_path)
+    pairs = [("a.jpg", "b.jpg"), ("a.jpg", "c.jpg")]
+    for n, pair in enumerate(pairs, start=3):
+        folder.save_matches(result(pair, n))
+    saved = SavedMatches(folder, pairs)
+    assert list(saved) == pairs and len(saved) == 2
+    assert_same(saved[pairs[1]], result(pairs[1], 4))
+    assert ("b.jpg", "c.jpg") not in saved and saved.get(("b.jpg", "c.jpg")) is None
+    folder.save_matches(result(("b.jpg", "c.jpg")))  # another run's, or not handed on
+    assert ("b.jpg", "c.jpg") not in saved
+    for path in (tmp_path / "matches").iterdir():
+        path.write_bytes(b"")
+    with pytest.raises(UserError, match="a.jpg.*damaged"):
+        saved[pairs[0]]
+
+
+def test_counts_say_what_a_result_holds():
+    counts = result(n=5).counts
+    assert (counts.num_inliers, counts.num_planes, counts.num_tentative) == (5, 2, 77)
+    assert (counts.num_dropped, counts.status) == (3, Status.NO_PLANE)
