@@ -9,6 +9,7 @@ from typing import Annotated
 
 # Before JAX starts: both sides of every comparison use the cores this process may use.
 os.environ.setdefault("OMP_NUM_THREADS", str(len(os.sched_getaffinity(0))))
+os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP tells of every step
 
 import tyro
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from jaxsfm.errors import UserError as UserError
     from jaxsfm.evaluation import Evaluation as Evaluation
     from jaxsfm.evaluation import evaluate as evaluate
+    from jaxsfm.execution import Execution as Execution
     from jaxsfm.host.intrinsics import parse_intrinsics as parse_intrinsics
     from jaxsfm.host.mapping import MapOptions as MapOptions
     from jaxsfm.host.pairs import PairResult as PairResult
@@ -38,6 +39,7 @@ _HOME = {
     "UserError": "errors",
     "Evaluation": "evaluation",
     "evaluate": "evaluation",
+    "Execution": "execution",
     "MapOptions": "host.mapping",
     "parse_intrinsics": "host.intrinsics",
     "PairResult": "host.pairs",

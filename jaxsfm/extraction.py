@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsfm.config import Config
 from jaxsfm.core.sharded import extract_batch
@@ -92,8 +92,12 @@ def extracted(
     Raises:
       UserError: an image needs more memory than there is.
     """
-    execution = execution or Execution()
+    execution, images = execution or Execution(), list(images)
     mesh = chosen_devices(execution)
+    for image in images:  # before the first is computed
+        check_memory(image, config=config)
+    params = jax.device_put(weights.params, NamedSharding(mesh, PartitionSpec()))
+    weights = dataclasses.replace(weights, params=params)
 
     def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
         return _shapes(working_size(image.size, config.max_size, config.enlarge))
@@ -144,7 +148,6 @@ def _read_ahead(
     with ThreadPoolExecutor(min(READERS, os.cpu_count() or 1)) as pool:
         while True:
             for image in itertools.islice(todo, ahead - len(waiting)):
-                check_memory(image, config=config)
                 waiting.append((image, pool.submit(read, image)))
             if not waiting:
                 return
