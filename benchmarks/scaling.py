@@ -15,7 +15,7 @@ import numpy as np
 import jaxsfm
 from benchmarks.timing import Metric, median, ratio
 from jaxsfm.config import Config, preset
-from jaxsfm.extraction import extracted, on_device
+from jaxsfm.extraction import extracted
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import Weights, load_weights
@@ -65,7 +65,7 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
 def measure_pixels(data: Path) -> Iterator[Metric]:
     """Seconds per pixel from 384 x 256 to 2304 x 1536, the largest over the smallest."""
     config = preset("default")
-    weights = on_device(load_weights())
+    weights = load_weights()
     photos = _photos(data)[:1]
     if not photos:
         print(f"skipped: pixels (no photos in {data}/strecha)")
@@ -99,9 +99,9 @@ from jaxsfm.host.compiled import keep_compiled
 keep_compiled()
 from pathlib import Path
 import jaxsfm
-from jaxsfm.extraction import extracted, on_device
+from jaxsfm.extraction import extracted
 images, _ = jaxsfm.open_images(Path(sys.argv[1]))
-weights = on_device(jaxsfm.load_weights())
+weights = jaxsfm.load_weights()
 times = []
 for _ in range(3):
     start = time.time()
@@ -138,7 +138,7 @@ def measure_stage(data: Path) -> Iterator[Metric]:
     if len(photos) < 5:
         print(f"skipped: stage (no five photos in {folder})")
         return
-    weights = on_device(load_weights())
+    weights = load_weights()
 
     def sift() -> None:
         with tempfile.TemporaryDirectory() as scratch:

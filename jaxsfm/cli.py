@@ -87,7 +87,11 @@ def main(argv: list[str] | None = None) -> int:
         # XLA's allocator raises its own type; the rest is a fault of ours and keeps its traceback.
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        print("jaxsfm: out of memory; try a smaller --max-size", file=sys.stderr)
+        print(
+            "jaxsfm: out of memory; a smaller --max-size needs less, and reconstruct goes on with "
+            "a smaller --memory-gb, --images-at-once or --pairs-at-once",
+            file=sys.stderr,
+        )
         return 1
 
 

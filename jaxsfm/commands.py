@@ -99,7 +99,7 @@ def reconstruct(
       refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
       max_size: Longer side of the working images, pixels.
       keypoints: relocalized, or grid: cell centres (for the ablation).
-      convolutions: What the network multiplies in; bfloat16 is for accelerators.
+      convolutions: What the network multiplies; bfloat16 is meant for accelerators.
       mapper: COLMAP's incremental or global mapper.
       seed: Of everything random.
       threads: Of COLMAP's part; 1 makes the model repeatable to the last byte; -1: all.
@@ -179,7 +179,7 @@ def match(
     check_writable(plot, "--plot", (".png", ".jpg"))
     import numpy as np
 
-    from jaxsfm.extraction import image_features, on_device
+    from jaxsfm.extraction import image_features
     from jaxsfm.host.images import inspect_image, read_image
     from jaxsfm.host.weights import load_weights
     from jaxsfm.host.workfolder import atomic_file
@@ -189,7 +189,7 @@ def match(
 
     check_seed(seed)
     files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
-    weights = on_device(load_weights())
+    weights = load_weights()
     features = [image_features(weights, file, config=config) for file in files]
     result = match_features(features[0], features[1], config=config, seed=seed)
     keypoints1, aligned = align(result, files[0], files[1], config=config)

@@ -34,7 +34,7 @@ class PairShape:
     consensus: int = 0
     """Radius, coarse cells, of the neighbourhood that votes on coarse matches; 0: none."""
     coarse_columns: int = 128
-    """Widest coarse grid the votes reach across: 2048 px; the pipeline widens it where needed."""
+    """Widest coarse grid the votes reach across: 2048 px; widened for wider images."""
     coarse_tile: int = 1024
     """Rows of the coarse similarity matrix held at once."""
     fine_chunk: int = 16
@@ -126,7 +126,8 @@ class Config:
     centred: bool = False
     """Subtract an image's mean descriptor from its descriptors."""
     convolutions: Convolutions = "float32"
-    """What the network multiplies in; it adds in float32. CPUs round and gain nothing."""
+    """What the network multiplies; sums are float32, then rounded alike. Meant for accelerators
+    (where no gain has been measured yet); CPUs round and gain nothing."""
     keypoints: Keypoints = "relocalized"
     """Where a fine cell's keypoint lies: at its relocalized pixel, or at the cell's centre."""
     threshold_px: float = 10.0

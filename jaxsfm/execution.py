@@ -1,11 +1,14 @@
-"""How the compiled programs run: devices, batches, memory. Never what they give.
+"""How the compiled programs run: devices, batches, memory. Never what they give, up to rounding:
+with more than one item side by side on a device, the last place of a product may differ.
 
-Everything here follows from the machine and the images' sizes, not from what is free at the moment:
-with more than one item side by side, the last place of a product may differ.
+Everything here follows from the machine, the images' sizes and how many there are, not from what is
+free at the moment.
 """
 
 import dataclasses
-from typing import Any
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +21,7 @@ from jaxsfm.core.sharded import device_mesh
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
+from jaxsfm.host import interrupt
 from jaxsfm.host.features import total_memory
 
 HOST_SHARE, DEVICE_SHARE = 1 / 8, 1 / 2
@@ -47,8 +51,12 @@ class Execution:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"{name} must be at least 1; got {value}")
-        if self.memory_gb is not None and not self.memory_gb > 0:
+        if self.memory_gb is not None and not 0 < self.memory_gb < math.inf:
             raise ValueError(f"memory_gb must be positive; got {self.memory_gb}")
+
+
+SINGLE = Execution(devices=1, images_at_once=1, pairs_at_once=1)
+"""For one image or one pair."""
 
 
 def chosen_devices(execution: Execution) -> Mesh:
@@ -110,19 +118,28 @@ ACCELERATOR_BYTES_PER_PIXEL = 3000
 1540, and a library's convolutions want room of their own. Not measured on a GPU yet."""
 
 
-def images_at_once(execution: Execution, mesh: Mesh, pixels: int) -> int:
+def images_at_once(execution: Execution, mesh: Mesh, pixels: int, count: int) -> int:
     """Images extracted side by side on each device.
 
     Args:
       pixels: of one padded image.
+      count: images there are of that size.
     """
-    if execution.images_at_once is not None:
-        return execution.images_at_once
     memory = _device_memory(mesh)
-    if memory is None:
-        return 1
-    fits = DEVICE_SHARE * memory / (ACCELERATOR_BYTES_PER_PIXEL * pixels)
-    return int(np.clip(fits, 1, MAX_IMAGES))
+    if execution.images_at_once is not None:
+        fits = execution.images_at_once
+    elif memory is None:
+        fits = 1
+    else:
+        fits = DEVICE_SHARE * memory / (ACCELERATOR_BYTES_PER_PIXEL * pixels)
+        fits = int(np.clip(fits, 1, MAX_IMAGES))
+    return min(fits, _share(count, mesh))
+
+
+def _share(count: int, mesh: Mesh) -> int:
+    """Of `count` items for each device, up to a power of two: few programs are compiled."""
+    each = -(-count // mesh.size)
+    return 1 << (each - 1).bit_length()
 
 
 PAIR_BYTES_PER_CELL = 35_000
@@ -130,13 +147,55 @@ PAIR_BYTES_PER_CELL = 35_000
 `default`'s program at 1600 x 1200; `paper` takes 13 000."""
 
 
-def pairs_at_once(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:
-    """Pairs matched side by side on each device."""
-    if execution.pairs_at_once is not None:
-        return execution.pairs_at_once
+def pairs_at_once(
+    execution: Execution, mesh: Mesh, num_coarse: int, count: int, *, config: Config
+) -> int:
+    """Pairs matched side by side on each device, of `count`."""
     memory = _device_memory(mesh)
-    if memory is None:
-        return 1
-    # A batch copies both sides of its pairs, in what the resident images leave.
-    each = 2 * joined_bytes(num_coarse, octaves=config.octaves) + PAIR_BYTES_PER_CELL * num_coarse
-    return int(np.clip((1 - DEVICE_SHARE) * memory / 2 / each, 1, MAX_PAIRS))
+    if execution.pairs_at_once is not None:
+        fits = execution.pairs_at_once
+    elif memory is None:
+        fits = 1
+    else:
+        # A batch copies both sides of its pairs, in half of what the images at hand leave.
+        joined = joined_bytes(num_coarse, octaves=config.octaves)
+        each = 2 * joined + PAIR_BYTES_PER_CELL * num_coarse
+        fits = int(np.clip((1 - DEVICE_SHARE) / 2 * memory / each, 1, MAX_PAIRS))
+    return min(fits, _share(count, mesh))
+
+
+Batch = TypeVar("Batch")
+Started = TypeVar("Started")
+Result = TypeVar("Result")
+
+
+def one_ahead(
+    batches: Iterable[Batch],
+    start: Callable[[Batch], Started],
+    finish: Callable[[Started], Iterable[Result]],
+) -> Iterator[Result]:
+    """Results of batches, of which one runs on the devices while the next is loaded (`batches` is
+    asked for it) and the one before is handed out.
+
+    Whatever goes wrong with the next (Ctrl-C, a photo that went away, no memory): what has been
+    started is finished and handed out first.
+    """
+    todo = iter(batches)
+    running: list[Started] = []
+    while True:
+        try:
+            interrupt.check()
+            batch = next(todo, None)
+            if batch is None:
+                break
+            jax.block_until_ready(running)
+            started = start(batch)
+        except BaseException:
+            for last in running:
+                yield from finish(last)
+            raise
+        done, running = running, [started]
+        for last in done:
+            yield from finish(last)
+    for last in running:
+        yield from finish(last)

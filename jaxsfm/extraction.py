@@ -6,6 +6,7 @@ import os
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,18 +15,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxsfm.config import Config
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.execution import Execution, chosen_devices, images_at_once
+from jaxsfm.execution import SINGLE, Execution, chosen_devices, images_at_once, one_ahead
 from jaxsfm.host.features import ImageFeatures, check_memory, padded_size, room_of
 from jaxsfm.host.images import ImageError, ImageFile, WorkingImage, read_image, working_size
 from jaxsfm.host.weights import Weights
 
 READERS = 8
 """Threads that decode at most: one JPEG takes 20 ms, an accelerator wants 150 a second."""
-
-
-def on_device(weights: Weights) -> Weights:
-    """The same weights with their arrays on the accelerator, copied once instead of per image."""
-    return dataclasses.replace(weights, params=jax.device_put(weights.params))
 
 
 def _start(
@@ -45,7 +41,6 @@ def _start(
         images,
         sizes,
         mesh=mesh,
-        batch_size=batch_size,
         preprocessing=weights.preprocessing,
         num_coarse=num_coarse,
         relocalized=config.keypoints == "relocalized",
@@ -53,12 +48,6 @@ def _start(
         centred=config.centred,
         bfloat16=config.convolutions == "bfloat16",
     )
-
-
-def _collect(dense: DenseFeatures, count: int) -> list[DenseFeatures]:
-    """The first `count` images' features, numpy."""
-    host = jax.device_get(dense)
-    return [jax.tree.map(lambda x, k=k: x[k].copy(), host) for k in range(count)]
 
 
 def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
@@ -73,7 +62,7 @@ def image_features(weights: Weights, image: ImageFile, *, config: Config) -> Ima
       ImageError: the image cannot be used.
       UserError: it needs more memory than there is.
     """
-    ((_, found),) = extracted(weights, [image], config=config, execution=Execution(devices=1))
+    ((_, found),) = extracted(weights, [image], config=config, execution=SINGLE)
     if isinstance(found, ImageError):
         raise found
     return found
@@ -94,42 +83,50 @@ def extracted(
     """
     execution, images = execution or Execution(), list(images)
     mesh = chosen_devices(execution)
+    at_once = mesh.size * (execution.images_at_once or 1)
     for image in images:  # before the first is computed
-        check_memory(image, config=config)
+        check_memory(image, at_once, config=config)
     params = jax.device_put(weights.params, NamedSharding(mesh, PartitionSpec()))
     weights = dataclasses.replace(weights, params=params)
 
     def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
         return _shapes(working_size(image.size, config.max_size, config.enlarge))
 
-    running: tuple[DenseFeatures, list[tuple[ImageFile, WorkingImage]]] | None = None
-    for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
-        pixels = padded[0] * padded[1]
-        side_by_side = images_at_once(execution, mesh, pixels)
-        step = side_by_side * mesh.size
-        read = _read_ahead(group, config=config, ahead=2 * step)
-        while some := list(itertools.islice(read, step)):
-            for image, each in some:
-                if isinstance(each, ImageError):
-                    yield image, each
-            good = [(image, each) for image, each in some if isinstance(each, WorkingImage)]
-            if not good:
-                continue
-            if running is not None:
-                jax.block_until_ready(running[0])
-            found = _start(weights, [each for _, each in good], config, mesh, side_by_side)
-            if running is not None:
-                yield from _results(*running)
-            running = found, good
-    if running is not None:
-        yield from _results(*running)
+    def batches() -> Iterator[_Batch]:
+        for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
+            some = list(group)
+            pixels = padded[0] * padded[1]
+            side_by_side = images_at_once(execution, mesh, pixels, len(some))
+            read = _read_ahead(some, config=config, ahead=side_by_side * mesh.size + READERS)
+            while batch := list(itertools.islice(read, side_by_side * mesh.size)):
+                yield _Batch(batch, side_by_side)
+
+    def start(batch: _Batch) -> tuple[_Batch, DenseFeatures | None]:
+        good = [each for _, each in batch.read if isinstance(each, WorkingImage)]
+        return batch, _start(weights, good, config, mesh, batch.side_by_side) if good else None
+
+    return one_ahead(batches(), start, _results)
+
+
+class _Batch(NamedTuple):
+    """Images that were read together, and how many of them a device computes side by side."""
+
+    read: list[tuple[ImageFile, WorkingImage | ImageError]]
+    side_by_side: int
 
 
 def _results(
-    found: DenseFeatures, read: list[tuple[ImageFile, WorkingImage]]
-) -> Iterator[tuple[ImageFile, ImageFeatures]]:
-    for (image, working), dense in zip(read, _collect(found, len(read)), strict=True):
-        yield image, ImageFeatures(image, working.scale, dense)
+    started: tuple[_Batch, DenseFeatures | None],
+) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
+    batch, found = started
+    dense, k = jax.device_get(found), 0
+    for image, each in batch.read:
+        if isinstance(each, ImageError):
+            yield image, each
+        else:
+            own = jax.tree.map(lambda x, k=k: x[k].copy(), dense)  # not a view of the whole batch
+            yield image, ImageFeatures(image, each.scale, own)
+            k += 1
 
 
 def _read_ahead(
@@ -145,7 +142,8 @@ def _read_ahead(
 
     waiting: deque[tuple[ImageFile, Future]] = deque()
     todo = iter(images)
-    with ThreadPoolExecutor(min(READERS, os.cpu_count() or 1)) as pool:
+    pool = ThreadPoolExecutor(min(READERS, os.cpu_count() or 1))
+    try:
         while True:
             for image in itertools.islice(todo, ahead - len(waiting)):
                 waiting.append((image, pool.submit(read, image)))
@@ -153,3 +151,5 @@ def _read_ahead(
                 return
             image, working = waiting.popleft()
             yield image, working.result()
+    finally:  # an interrupted run does not wait for what it will not use
+        pool.shutdown(cancel_futures=True)

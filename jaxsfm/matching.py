@@ -6,9 +6,8 @@ of all pairs, so that an image comes back as rarely as that memory allows.
 
 import dataclasses
 import itertools
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Generic, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -16,11 +15,21 @@ from jax.sharding import Mesh
 
 from jaxsfm.config import Config, PairShape
 from jaxsfm.core.grid import rescale
-from jaxsfm.core.sharded import join_everywhere, match_batch, pick
+from jaxsfm.core.sharded import match_batch, pick
 from jaxsfm.core.types import JoinedFeatures, PairMatches, Status, Thresholds
-from jaxsfm.execution import Execution, chosen_devices, pairs_at_once, resident_images
-from jaxsfm.host.features import ImageFeatures, Room, pad_features
+from jaxsfm.execution import (
+    SINGLE,
+    Execution,
+    chosen_devices,
+    one_ahead,
+    pairs_at_once,
+    resident_images,
+)
+from jaxsfm.host.features import ImageFeatures, Room
 from jaxsfm.host.pairs import PairResult, make_pair
+from jaxsfm.resident import OnDevice, Resident, by_tiles, join
+
+Name = TypeVar("Name")
 
 
 def match_features(
@@ -29,7 +38,7 @@ def match_features(
     """Verified matches of two images, in the order given."""
     both = {0: features0, 1: features1}
     rooms = {side: features.room for side, features in both.items()}
-    return next(_matched(both.__getitem__, rooms, [(0, 1)], config, seed, Execution(devices=1)))
+    return next(_matched(both.__getitem__, rooms, [(0, 1)], config, seed, SINGLE))
 
 
 def matched(
@@ -44,7 +53,8 @@ def matched(
     """Verified matches of pairs (the lesser name first), as batches are done.
 
     A pair's result depends on the two images, the config and the seed; not on the other pairs, nor
-    on their order, nor on how many devices there are.
+    on their order, nor on how many devices there are. With several pairs side by side on a device
+    products may round differently in the last place (`jaxsfm.execution`).
 
     Args:
       load: an image's features by its name; asked again when they have left the device.
@@ -78,60 +88,11 @@ def _program(room0: Room, room1: Room, config: Config) -> _Program:
     return _Program(max(room0.num_coarse, room1.num_coarse), shape)
 
 
-Name = TypeVar("Name")
+class _Started(NamedTuple):
+    """A batch on the devices, and the hosts' part of its images."""
 
-
-def by_tiles(pairs: Sequence[tuple[Name, Name]], side: int) -> list[tuple[Name, Name]]:
-    """Pairs in an order in which 2 `side` images at a time go far: those between two blocks of
-    `side` images after each other."""
-    place = {name: k // side for k, name in enumerate(dict.fromkeys(n for p in pairs for n in p))}
-    return sorted(pairs, key=lambda pair: sorted((place[pair[0]], place[pair[1]])))
-
-
-class _OnDevice(NamedTuple):
-    """One image between batches: its joined features on every device, the rest on the host."""
-
-    features: ImageFeatures
-    """Without descriptors."""
-    joined: JoinedFeatures
-
-
-class _Resident(Generic[Name]):
-    """The images at hand for a list of pairs; the one that is wanted again last makes room."""
-
-    def __init__(
-        self,
-        load: Callable[[Name], ImageFeatures],
-        pairs: Sequence[tuple[Name, Name]],
-        mesh: Mesh,
-        room: int,
-        most: int,
-    ) -> None:
-        self._load, self._mesh, self._room, self._most = load, mesh, room, most
-        self._images: dict[Name, _OnDevice] = {}
-        self._uses: dict[Name, deque[int]] = {}
-        for k, pair in enumerate(pairs):
-            for name in pair:
-                self._uses.setdefault(name, deque()).append(k)
-
-    def take(self, name: Name) -> _OnDevice:
-        """For the next of its pairs."""
-        if name not in self._images:
-            while len(self._images) >= self._most:
-                del self._images[max(self._images, key=lambda other: self._uses[other][0])]
-            self._images[name] = self._join(name)
-        image = self._images[name]
-        self._uses[name].popleft()
-        if not self._uses[name]:
-            del self._images[name]
-        return image
-
-    def _join(self, name: Name) -> _OnDevice:
-        features = self._load(name)
-        dense = pad_features(features.dense, self._room)
-        bare = features.dense._replace(coarse=(), fine=())
-        joined = join_everywhere(dense, mesh=self._mesh)
-        return _OnDevice(features._replace(dense=bare), joined)
+    found: PairMatches
+    sides: list[tuple[ImageFeatures, ImageFeatures]]
 
 
 def _matched(
@@ -146,43 +107,52 @@ def _matched(
     programs: dict[_Program, list[tuple[Name, Name]]] = {}
     for a, b in pairs:
         programs.setdefault(_program(rooms[a], rooms[b], config), []).append((a, b))
-    for program, some in programs.items():
-        side_by_side = pairs_at_once(execution, mesh, program.room, config=config)
-        most = resident_images(execution, mesh, program.room, config=config)
-        some = by_tiles(some, max(1, most // 2))
-        resident = _Resident(load, some, mesh, program.room, most)
-        running: tuple[PairMatches, list[tuple[_OnDevice, _OnDevice]]] | None = None
-        todo = iter(some)
-        step = side_by_side * mesh.size
-        while batch := list(itertools.islice(todo, step)):
-            # Loaded while the devices are busy with the batch before.
-            images = [(resident.take(a), resident.take(b)) for a, b in batch]
-            if running is not None:
-                jax.block_until_ready(running[0])
-            filled = images + [images[-1]] * (step - len(images))
-            found = match_batch(
-                root,
-                _identities(filled, mesh),
-                tuple(_columns(filled, mesh)),
-                thresholds(config),
-                mesh=mesh,
-                shape=program.shape,
-                batch_size=side_by_side,
-            )
-            if running is not None:
-                yield from _results(*running)
-            running = found, images
-        if running is not None:
-            yield from _results(*running)
+
+    def batches() -> Iterator[_Batch]:
+        for program, some in programs.items():
+            side_by_side = pairs_at_once(execution, mesh, program.room, len(some), config=config)
+            most = resident_images(execution, mesh, program.room, config=config)
+            ordered = by_tiles(some, max(1, most // 2))
+
+            def joined(name: Name, room: int = program.room) -> OnDevice:
+                return join(load(name), room, mesh)
+
+            resident, todo = Resident(joined, ordered, most), iter(ordered)
+            while batch := list(itertools.islice(todo, side_by_side * mesh.size)):
+                images = [(resident.take(a), resident.take(b)) for a, b in batch]
+                yield _Batch(program, side_by_side, images)
+
+    def start(batch: _Batch) -> _Started:
+        missing = batch.side_by_side * mesh.size - len(batch.images)
+        filled = batch.images + batch.images[-1:] * missing
+        found = match_batch(
+            root,
+            _identities(filled, mesh),
+            tuple(_columns(filled, mesh)),
+            thresholds(config),
+            mesh=mesh,
+            shape=batch.program.shape,
+        )
+        return _Started(found, [(a.features, b.features) for a, b in batch.images])
+
+    return one_ahead(batches(), start, _results)
 
 
-def _identities(images: Sequence[tuple[_OnDevice, _OnDevice]], mesh: Mesh) -> np.ndarray:
+class _Batch(NamedTuple):
+    """Pairs of one program, loaded, and how many of them a device computes side by side."""
+
+    program: _Program
+    side_by_side: int
+    images: list[tuple[OnDevice, OnDevice]]
+
+
+def _identities(images: Sequence[tuple[OnDevice, OnDevice]], mesh: Mesh) -> np.ndarray:
     ids = [[each.features.image.identity for each in sides] for sides in images]
     return np.asarray(ids, np.uint32).reshape(mesh.size, -1, 2)
 
 
 def _columns(
-    images: Sequence[tuple[_OnDevice, _OnDevice]], mesh: Mesh
+    images: Sequence[tuple[OnDevice, OnDevice]], mesh: Mesh
 ) -> Iterator[tuple[JoinedFeatures, JoinedFeatures]]:
     """For each place in a device's batch both sides, over the devices."""
     each = len(images) // mesh.size
@@ -194,13 +164,11 @@ def _columns(
         )
 
 
-def _results(
-    found: PairMatches, images: Sequence[tuple[_OnDevice, _OnDevice]]
-) -> Iterator[PairResult]:
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.device_get(found))
-    for k, (one, other) in enumerate(images):
-        pair = jax.tree.map(lambda x, k=k: x[k], flat)
-        yield to_original_pixels(pair, one.features, other.features)
+def _results(started: _Started) -> Iterator[PairResult]:
+    host = jax.device_get(started.found)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), host)
+    for k, sides in enumerate(started.sides):
+        yield to_original_pixels(jax.tree.map(lambda x, k=k: x[k], flat), *sides)
 
 
 def to_original_pixels(

@@ -1,4 +1,4 @@
-"""The stages composed: extract -> match -> reconstruct; the only module that runs core and host.
+"""The stages composed: extract -> match -> reconstruct.
 
 Every stage is a function of its inputs and a config. `jaxsfm.run_folder` strings them together in a
 work folder.
@@ -17,7 +17,7 @@ from tqdm import tqdm
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
-from jaxsfm.extraction import extracted, on_device
+from jaxsfm.extraction import extracted
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import (
     ImageError,
@@ -74,7 +74,7 @@ def extract(
       ImageError: an image cannot be decoded.
     """
     features = {}
-    for image, found in extracted(on_device(weights), images, config=config, execution=execution):
+    for image, found in extracted(weights, images, config=config, execution=execution):
         if isinstance(found, ImageError):
             raise found
         features[image.name] = found

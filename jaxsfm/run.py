@@ -15,11 +15,11 @@ from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.execution import Execution
-from jaxsfm.extraction import extracted, image_features, on_device
+from jaxsfm.extraction import extracted, image_features
 from jaxsfm.host import interrupt
 from jaxsfm.host.colmap import write_models
-from jaxsfm.host.features import ImageFeatures, room_of
-from jaxsfm.host.images import ImageError, ImageFile, working_size
+from jaxsfm.host.features import ImageFeatures, image_room
+from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, Mapper
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
@@ -244,10 +244,7 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def _bar(items: Iterable[T], total: int, stage: str, unit: str, options: RunOptions) -> Iterator[T]:
-    bar = tqdm(items, total=total, desc=stage, unit=unit, disable=not options.progress)
-    for item in bar:
-        yield item
-        interrupt.check()
+    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=not options.progress)
     interrupt.check()
 
 
@@ -265,7 +262,7 @@ def _extract(
     skipped: dict[str, str] = {}
     if not todo:
         return skipped
-    stream = extracted(on_device(weights), todo, config=config, execution=options.execution)
+    stream = extracted(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
             folder.mark_unusable(image, str(found))
@@ -292,10 +289,7 @@ def _match(
             folder.save_features(found)
         return found
 
-    rooms = {
-        name: room_of(working_size(image.size, config.max_size, config.enlarge))
-        for name, image in images.items()
-    }
+    rooms = {name: image_room(image, config=config) for name, image in images.items()}
     stream = matched(
         load, rooms, pairs, config=config, seed=options.seed, execution=options.execution
     )

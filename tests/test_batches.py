@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsfm
-from jaxsfm import execution, matching
+from jaxsfm import execution
 from jaxsfm.config import preset
 from jaxsfm.core.features import stored
 from jaxsfm.core.octaves import join_octaves
@@ -26,7 +26,8 @@ from jaxsfm.execution import Execution
 from jaxsfm.extraction import extracted, image_features
 from jaxsfm.host.features import room_of
 from jaxsfm.host.images import ImageError, read_image
-from jaxsfm.matching import by_tiles, match_features
+from jaxsfm.matching import match_features
+from jaxsfm.resident import Resident, by_tiles
 
 FIELDS = ("cells", "keypoints0", "keypoints1", "plane", "homographies", "num_tentative")
 MESH = device_mesh(jax.local_devices()[:1])
@@ -169,18 +170,12 @@ def test_tiles_keep_every_pair_once_and_images_at_hand(count, side, random):
     assert sorted(ordered) == sorted(pairs)
 
     loads = []
-
-    class Counted(matching._Resident):
-        def _join(self, name):
-            loads.append(name)
-            return name
-
     most = 2 * side
-    resident = Counted(None, ordered, MESH, 0, most)
+    resident = Resident(lambda name: loads.append(name) or name, ordered, most)
     for a, b in ordered:
         assert (resident.take(a), resident.take(b)) == (a, b)
-        assert len(resident._images) <= most
-    assert not resident._images
+        assert len(resident) <= most
+    assert len(resident) == 0
     blocks = -(-count // side)
     # A tile needs both its blocks; the first of them is still there from the tile before.
     assert len(loads) <= side * (blocks * (blocks + 1) // 2 + blocks)
@@ -202,28 +197,62 @@ def test_memory_is_what_the_formula_says(features):
 
 def test_a_cpu_takes_one_at_a_time_unless_told():
     config = preset("default")
-    assert execution.images_at_once(Execution(), MESH, 10**6) == 1
-    assert execution.pairs_at_once(Execution(), MESH, 6144, config=config) == 1
-    assert execution.pairs_at_once(Execution(pairs_at_once=7), MESH, 6144, config=config) == 7
+    assert execution.images_at_once(Execution(), MESH, 10**6, 99) == 1
+    assert execution.pairs_at_once(Execution(), MESH, 6144, 99, config=config) == 1
+    told = Execution(images_at_once=6, pairs_at_once=7)
+    assert execution.images_at_once(told, MESH, 10**6, 99) == 6
+    assert execution.pairs_at_once(told, MESH, 6144, 99, config=config) == 7
+    for count, most in ((1, 1), (2, 2), (3, 4), (5, 7)):  # no more than there are, few programs
+        assert execution.pairs_at_once(told, MESH, 6144, count, config=config) == most
 
 
-def test_an_accelerator_takes_what_fits(monkeypatch):
+@pytest.mark.parametrize("memory", [8e9, 24e9, 140e9])
+def test_an_accelerator_takes_what_fits(monkeypatch, memory):
     config = preset("default")
-    chosen = []
-    for memory in (8e9, 24e9, 140e9):
-        monkeypatch.setattr(execution, "_device_memory", lambda _, memory=memory: int(memory))
-        images = execution.images_at_once(Execution(), MESH, 1600 * 1200)
-        pairs = execution.pairs_at_once(Execution(), MESH, 8192, config=config)
-        kept = execution.resident_images(Execution(), MESH, 8192, config=config)
-        joined = execution.joined_bytes(8192, octaves=4)
-        assert kept * joined <= memory / 2
-        chosen.append((images, pairs, kept))
-    assert chosen == sorted(chosen) and chosen[0] < chosen[-1]
-    assert chosen[-1][0] <= execution.MAX_IMAGES and chosen[-1][1] <= execution.MAX_PAIRS
+    monkeypatch.setattr(execution, "_device_memory", lambda _: int(memory))
+    pixels, cells = 1600 * 1200, 8192
+    images = execution.images_at_once(Execution(), MESH, pixels, 999)
+    pairs = execution.pairs_at_once(Execution(), MESH, cells, 999, config=config)
+    kept = execution.resident_images(Execution(), MESH, cells, config=config)
+    joined = execution.joined_bytes(cells, octaves=4)
+    assert images == 1 or images * execution.ACCELERATOR_BYTES_PER_PIXEL * pixels <= memory / 2
+    batch = pairs * (2 * joined + execution.PAIR_BYTES_PER_CELL * cells)
+    assert kept * joined + batch <= memory
+    # And not much less than fits, up to what is asked for at most.
+    assert images in (1, execution.MAX_IMAGES, int(memory / 2 / (3000 * pixels)))
+    assert pairs == execution.MAX_PAIRS or batch > memory / 8
+
+
+def test_the_next_batch_is_loaded_while_one_runs():
+    log = []
+
+    def batches():
+        for k in range(3):
+            log.append(f"load {k}")
+            yield k
+
+    def start(k):
+        log.append(f"start {k}")
+        return k
+
+    def finish(k):
+        log.append(f"finish {k}")
+        yield k
+
+    assert list(execution.one_ahead(batches(), start, finish)) == [0, 1, 2]
+    expected = "load 0, start 0, load 1, start 1, finish 0, load 2, start 2, finish 1, finish 2"
+    assert ", ".join(log) == expected
 
 
 def test_executions_refuse_what_makes_no_sense():
-    for wrong in ({"devices": 0}, {"images_at_once": 0}, {"pairs_at_once": -1}, {"memory_gb": 0.0}):
+    for wrong in (
+        {"devices": 0},
+        {"images_at_once": 0},
+        {"pairs_at_once": -1},
+        {"memory_gb": 0.0},
+        {"memory_gb": float("inf")},
+        {"memory_gb": float("nan")},
+    ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Execution(**wrong)
     with pytest.raises(UserError, match="--devices 99: there are"):

@@ -373,7 +373,7 @@ def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
 
 
 def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("jaxsfm.host.features.total_memory", lambda: 10_000_000)
+    monkeypatch.setattr("jaxsfm.host.features.total_memory", lambda: 920_000_000)
     images = [scene / "images" / n for n in ("view0.png", "view2.png")]
     refuse(capsys, ["match", *images, "--out", tmp_path / "m.npz"], "view0.png", "--max-size")
     args = ["match", *map(str, images), "--out", str(tmp_path / "m.npz"), "--max-size", "64"]

@@ -9,7 +9,9 @@ import time
 import pytest
 
 import jaxsfm.run
+from jaxsfm import extraction, matching
 from jaxsfm.cli import main
+from jaxsfm.errors import UserError
 from jaxsfm.host.workfolder import WorkFolder
 
 
@@ -80,7 +82,30 @@ def test_an_interrupt_that_a_callback_swallowed_still_ends_the_run(
     monkeypatch.setattr(WorkFolder, "save_features", swallowing)
     assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == 130
     assert "interrupted" in capsys.readouterr().err
-    assert len(list((tmp_path / "out" / "features").iterdir())) == 1
+    # The photo that was saved, and the one that was on its way meanwhile.
+    assert len(list((tmp_path / "out" / "features").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    "owner, stage",
+    [(extraction, "features"), (matching, "matches")],
+    ids=["extraction", "matching"],
+)
+@pytest.mark.parametrize("error, code", [(KeyboardInterrupt, 130), (UserError("gone"), 2)])
+def test_what_has_been_started_is_saved(scene, tmp_path, monkeypatch, owner, stage, error, code):
+    """Ctrl-C reaches Python when a batch has just been computed; so does what fails next."""
+    name = {"features": "extract_batch", "matches": "match_batch"}[stage]
+    original, calls = getattr(owner, name), [0]
+
+    def failing(*args, **kwargs):
+        calls[0] += 1
+        if calls[0] == 2:
+            raise error
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, failing)
+    assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == code
+    assert len(list((tmp_path / "out" / stage).glob("*.npz"))) == 1
 
 
 def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):

@@ -20,15 +20,15 @@ from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.extraction import image_features, on_device
+from jaxsfm.extraction import image_features
 from jaxsfm.host.colmap import drop_pairs, read_two_views
-from jaxsfm.host.features import ImageFeatures
+from jaxsfm.host.features import ImageFeatures, image_room
 from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.host.poses import Poses, model_poses
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.weights import load_weights
-from jaxsfm.matching import match_features
+from jaxsfm.matching import matched
 from jaxsfm.pipeline import reconstruct
 
 METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", *RUN_ABLATED)
@@ -87,13 +87,14 @@ def _rootsift_models(
 def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: int) -> list[Made]:
     """Per subset; a photo's features and a pair's matches are computed once."""
     config = method_config(method)
-    weights = on_device(load_weights())
+    weights = load_weights()
     largest = max(len(subset.day) + 1 for subset in scene.subsets)
 
     @functools.lru_cache(maxsize=max(FEATURES, largest))
     def features(name: str) -> ImageFeatures:
         return image_features(weights, scene.images[name], config=config)
 
+    rooms = {name: image_room(image, config=config) for name, image in scene.images.items()}
     last_use = {
         pair: k
         for k, subset in enumerate(scene.subsets)
@@ -104,9 +105,9 @@ def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: 
     models = []
     for k, subset in enumerate(scene.subsets):
         pairs = exhaustive_pairs([*subset.day, subset.night])
-        for a, b in pairs:
-            if (a, b) not in results:
-                results[a, b] = match_features(features(a), features(b), config=config, seed=seed)
+        missing = [pair for pair in pairs if pair not in results]
+        for result in matched(features, rooms, missing, config=config, seed=seed):
+            results[result.pair] = result
         made = reconstruct(
             [scene.images[name] for name in sorted({*subset.day, subset.night})],
             {pair: results[pair] for pair in pairs},

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxsfm.bench.common import PAIR_ABLATED, method_config, versions
 from jaxsfm.config import Config
-from jaxsfm.extraction import image_features, on_device
+from jaxsfm.extraction import image_features
 from jaxsfm.host.colmap import read_matches
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
@@ -81,7 +81,7 @@ class Matcher:
 
     def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
         if self._weights is None:
-            self._weights = on_device(load_weights())
+            self._weights = load_weights()
         start = time.monotonic()
         features = image_features(self._weights, image, config=config)
         return features, time.monotonic() - start

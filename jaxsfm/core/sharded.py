@@ -42,7 +42,6 @@ def _sharded(function: Callable[..., Any], mesh: Mesh, in_specs: tuple, out_spec
     jax.jit,
     static_argnames=(
         "mesh",
-        "batch_size",
         "preprocessing",
         "num_coarse",
         "relocalized",
@@ -57,7 +56,6 @@ def extract_batch(
     sizes: Int[Array, "b 2"],
     *,
     mesh: Mesh,
-    batch_size: int,
     preprocessing: Preprocessing,
     num_coarse: int,
     relocalized: bool,
@@ -68,8 +66,7 @@ def extract_batch(
     """`jaxsfm.core.features.extract` of images that share a padded size, as they are `stored`.
 
     Args:
-      images: a multiple of the number of devices.
-      batch_size: images a device computes side by side, the others in turn.
+      images: a multiple of the number of devices; each computes its share side by side.
     """
 
     def local(params, images, sizes):
@@ -90,7 +87,7 @@ def extract_batch(
                 )
             )
 
-        return one_by_one(one, (images, sizes), batch_size=batch_size)
+        return one_by_one(one, (images, sizes), batch_size=len(sizes))
 
     return _sharded(local, mesh, (_SAME, _EACH, _EACH), _EACH)(params, images, sizes)
 
@@ -123,7 +120,7 @@ def pick(joined: Sequence[JoinedFeatures], *, mesh: Mesh) -> JoinedFeatures:
     return jax.tree.map(one, *joined)
 
 
-@functools.partial(jax.jit, static_argnames=("mesh", "shape", "batch_size"))
+@functools.partial(jax.jit, static_argnames=("mesh", "shape"))
 def match_batch(
     root: PRNGKey,
     identities: UInt32[Array, "d b 2"],
@@ -132,9 +129,8 @@ def match_batch(
     *,
     mesh: Mesh,
     shape: PairShape,
-    batch_size: int,
 ) -> PairMatches:
-    """`jaxsfm.core.pair.match_pairs` with b pairs for each of d devices.
+    """`jaxsfm.core.pair.match_pairs` with b pairs, side by side, on each of d devices.
 
     Args:
       root: key of the run; a pair's own is `pair_key`'s.
@@ -148,7 +144,7 @@ def match_batch(
     def local(root, identities, sides, thresholds):
         keys = jax.vmap(lambda ids: pair_key(root, ids[0], ids[1]))(identities[0])
         left, right = jax.tree.map(lambda *x: jnp.concatenate(x), *sides)
-        found = match_pairs(keys, left, right, thresholds, shape=shape, batch_size=batch_size)
+        found = match_pairs(keys, left, right, thresholds, shape=shape, batch_size=len(sides))
         return jax.tree.map(lambda x: x[None], found)
 
     specs = (_SAME, _EACH, _EACH, _SAME)

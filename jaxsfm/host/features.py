@@ -1,4 +1,4 @@
-"""From image files to DenseFeatures: shape buckets, so that few programs are compiled.
+"""The shapes and the memory of an image's features: buckets, so that few programs are compiled.
 
 An image is padded to a multiple of `SIDE_BUCKET` pixels per side and its cells to a menu of
 capacities. Both follow from the image's own size alone, so what is computed for an image never
@@ -26,9 +26,10 @@ from jaxsfm.host.images import (
 SIDE_BUCKET = 128
 """Padding costs at most 8 % of a 1600 px side."""
 BYTES_PER_PIXEL, OCTAVES_BYTES_PER_PIXEL = 700, 900
-"""Peak memory of an extraction on CPUs per working pixel, with one octave and with four, beside
-half a gigabyte for the programs and their compilation: between 800 x 600 and 1600 x 1200 it grows
-by 660 and 860 (measured, docs/performance.md)."""
+"""Peak memory of an extraction on CPUs per working pixel, with one octave and with four: between
+800 x 600 and 1600 x 1200 it grows by 660 and 860 (measured, docs/performance.md)."""
+PROCESS_BYTES = 900_000_000
+"""Beside that: libraries and weights 0.3 GB, programs and their compilation 0.4 to 0.6 GB."""
 _MENU = tuple(1024 * n // 2 for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
 """Coarse capacities: 512 .. 32768, half an octave apart."""
 
@@ -81,6 +82,11 @@ def room_of(size: tuple[int, int]) -> Room:
     return Room(capacity(cells), width // 16)
 
 
+def image_room(image: ImageFile, *, config: Config) -> Room:
+    """The room of an image's features, known before it is decoded."""
+    return room_of(working_size(image.size, config.max_size, config.enlarge))
+
+
 def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
     """The same features with room for `num_coarse` coarse and 4 x as many fine cells."""
 
@@ -115,19 +121,18 @@ def total_memory() -> int | None:
     return total
 
 
-def extraction_bytes(pixels: int, *, config: Config) -> int:
-    """Peak memory of extracting one image of so many working pixels."""
-    return pixels * (BYTES_PER_PIXEL if config.octaves == 1 else OCTAVES_BYTES_PER_PIXEL)
-
-
-def check_memory(image: ImageFile, *, config: Config) -> None:
+def check_memory(image: ImageFile, at_once: int = 1, *, config: Config) -> None:
     """Refuse an image whose features cannot fit, before the system kills the process.
+
+    Args:
+      at_once: so many like it are computed together.
 
     Raises:
       UserError: what it needs and what there is.
     """
     width, height = working_size(image.size, config.max_size, config.enlarge)
-    needed = extraction_bytes(width * height, config=config)
+    per_pixel = BYTES_PER_PIXEL if config.octaves == 1 else OCTAVES_BYTES_PER_PIXEL
+    needed = PROCESS_BYTES + at_once * per_pixel * width * height
     total = total_memory() if jax.default_backend() == "cpu" else None
     if total is not None and needed > total:
         raise UserError(

@@ -211,6 +211,9 @@ class SavedMatches(Mapping[Pair, PairResult]):
             )
         return found
 
+    def __contains__(self, pair: object) -> bool:
+        return pair in self._pairs
+
     def __iter__(self) -> Iterator[Pair]:
         return iter(self._pairs)
 
