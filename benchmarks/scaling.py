@@ -7,18 +7,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 import jaxsfm
-from benchmarks.timing import Metric, median, ratio
+from benchmarks.timing import Metric, median, ratio, seconds
 from jaxsfm.config import Config, preset
 from jaxsfm.extraction import extracted
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import write_rootsift_database
-from jaxsfm.host.weights import Weights, load_weights
+from jaxsfm.host.weights import load_weights
 from jaxsfm.matching import matched
 
 SMALL = 384
@@ -48,16 +48,19 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
     rooms = {name: each.room for name, each in features.items()}
     names = [str(name) for name in np.random.default_rng(0).permutation(sorted(features))]
 
-    def seconds(some: list[str]) -> float:
+    def per_pair(some: list[str]) -> float:
         pairs = list(itertools.combinations(some, 2))
         start = time.perf_counter()
         for _ in matched(features.__getitem__, rooms, pairs, config=config):
             pass
         return (time.perf_counter() - start) / len(pairs)
 
-    seconds(names[:FEW])
-    few = [seconds(names[k : k + FEW]) for k in range(0, PHOTOS, FEW)]
-    many = seconds(names)
+    fives = [names[k : k + FEW] for k in range(0, PHOTOS, FEW)]
+    per_pair(fives[0])
+    # Half of the fives before and half after, should the machine's mood change meanwhile.
+    before = [per_pair(five) for five in fives[::2]]
+    many = per_pair(names)
+    few = before + [per_pair(five) for five in fives[1::2]]
     yield Metric("scaling.pair.seconds", many, "s", "lower")
     yield Metric("scaling.pair.990_over_10", many / float(np.mean(few)), "x", "lower", 0.1)
 
@@ -70,27 +73,18 @@ def measure_pixels(data: Path) -> Iterator[Metric]:
     if not photos:
         print(f"skipped: pixels (no photos in {data}/strecha)")
         return
-    costs = {}
-    for longer in (384, 768, 1536, 2304):
+
+    def work(longer: int) -> Callable[[], list]:
         # Enlarged where the photo is smaller: only its size matters here.
         sized = dataclasses.replace(config, max_size=longer, enlarge=2.0)
-        times = _extraction_times(weights, photos[0], sized, repeat=3)
-        costs[longer] = median(times) / (longer * longer * 2 / 3)
-        yield Metric(f"scaling.pixels.{longer}", costs[longer] * 1e6, "s per megapixel", "lower")
-    spread = max(costs.values()) / min(costs.values())
-    yield Metric("scaling.pixels.largest_over_least", spread, "x", "lower", 0.2)
+        return lambda: [found for _, found in extracted(weights, photos[:1], config=sized)][0].dense
 
-
-def _extraction_times(
-    weights: Weights, photo: ImageFile, config: Config, *, repeat: int
-) -> list[float]:
-    times = []
-    for _ in range(repeat + 1):
-        start = time.perf_counter()
-        for _ in extracted(weights, [photo], config=config):
-            pass
-        times.append(time.perf_counter() - start)
-    return times[1:]
+    sizes = (384, 768, 1536, 2304)
+    turns = seconds(*(work(longer) for longer in sizes), repeat=3)
+    costs = [median(times) / (n * n * 2 / 3) for n, times in zip(sizes, turns, strict=True)]
+    for longer, cost in zip(sizes, costs, strict=True):
+        yield Metric(f"scaling.pixels.{longer}", cost * 1e6, "s per megapixel", "lower")
+    yield Metric("scaling.pixels.largest_over_least", max(costs) / min(costs), "x", "lower", 0.2)
 
 
 SCRIPT = """

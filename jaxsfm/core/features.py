@@ -82,8 +82,8 @@ def dense_features(
 
 
 def stored(features: DenseFeatures) -> DenseFeatures:
-    """The same with descriptors of half the size, as they are kept: float16, which rounds a unit
-    vector by 3e-4, a hundredth of what separates neighbouring cells (docs/design.md)."""
+    """The same with descriptors of half the size, as they are kept: float16, which moves a unit
+    vector by 2.4e-4 at most, a thousandth of what separates neighbouring cells (docs/design.md)."""
 
     def half(octaves: tuple[Array, ...]) -> tuple[Array, ...]:
         return tuple(octave.astype(jnp.float16) for octave in octaves)
