@@ -1,11 +1,13 @@
 """What a run did, as plain JSON and as the last lines on the screen; why images were lost."""
 
+import dataclasses
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from jaxsfm.core.types import Status
 from jaxsfm.host.images import shown_name
 from jaxsfm.host.pairs import Pair, PairCounts, component_of
+from jaxsfm.host.viewgraph import Verdict
 
 
 def lost_images(
@@ -150,3 +152,24 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
     if report.get("evaluation_failed"):
         lines.append(f"not evaluated    {report['evaluation_failed']}")
     return lines
+
+
+def pair_figures(
+    pair: Pair,
+    counts: PairCounts,
+    chosen: set[Pair],
+    verified: dict[Pair, int],
+    verdicts: dict[Pair, Verdict],
+) -> dict[str, Any]:
+    """A pair's part of the report, plain JSON."""
+    verdict = verdicts.get(pair)
+    return {
+        "pair": list(pair),
+        "status": counts.status.name.lower(),
+        "tentative": counts.num_tentative,
+        "inliers": counts.num_inliers,
+        "planes": counts.num_planes,
+        "handed_on": pair in chosen,
+        "colmap_inliers": verified.get(pair, 0),
+        "view_graph": None if verdict is None else dataclasses.asdict(verdict),
+    }

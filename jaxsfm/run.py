@@ -24,12 +24,11 @@ from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, Mapper
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
-from jaxsfm.host.viewgraph import Verdict
 from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
 from jaxsfm.matching import matched
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
-from jaxsfm.report import lost_images, model_figures
+from jaxsfm.report import lost_images, model_figures, pair_figures
 
 T = TypeVar("T")
 
@@ -124,7 +123,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     "trusted": len(verified) - len(untrusted) if made.verdicts else None,
                     "overflowed": sum(r.num_dropped > 0 for r in results.values()),
                     "each": [
-                        _pair_figures(pair, counts, chosen, verified, made.verdicts)
+                        pair_figures(pair, counts, chosen, verified, made.verdicts)
                         for pair, counts in sorted(results.items())
                     ],
                 },
@@ -303,23 +302,3 @@ def _choose(results: dict[Pair, PairCounts], n: int | None) -> set[Pair]:
     if n is None:
         return {pair for pair, count in counts.items() if count}
     return best_pairs(counts, n)
-
-
-def _pair_figures(
-    pair: Pair,
-    counts: PairCounts,
-    chosen: set[Pair],
-    verified: dict[Pair, int],
-    verdicts: dict[Pair, Verdict],
-) -> dict[str, Any]:
-    verdict = verdicts.get(pair)
-    return {
-        "pair": list(pair),
-        "status": counts.status.name.lower(),
-        "tentative": counts.num_tentative,
-        "inliers": counts.num_inliers,
-        "planes": counts.num_planes,
-        "handed_on": pair in chosen,
-        "colmap_inliers": verified.get(pair, 0),
-        "view_graph": None if verdict is None else dataclasses.asdict(verdict),
-    }

@@ -148,10 +148,12 @@ def test_reference_means_of_seeds_hold_their_bounds():
         assert figure["min"] <= figure["mean"] <= figure["max"]
 
 
-def test_an_ablation_leaves_out_one_idea():
+def test_an_ablation_leaves_out_or_exchanges_one_idea():
     assert method_config("robust-no-octaves") == dataclasses.replace(preset("robust"), octaves=1)
     changed = method_config("default-no-consensus")
     assert changed.pair.consensus == 0 and changed != preset("default")
-    assert len(set(map(method_config, ABLATED))) == len(ABLATED) == 13
+    assert len(set(map(method_config, ABLATED))) == len(ABLATED) == 15
+    low = method_config("default-bfloat16")
+    assert low == dataclasses.replace(preset("default"), convolutions="bfloat16")
     with pytest.raises(ValueError, match="default-no-enlarging"):
         method_config("default-no-enlarging")  # default does not enlarge
