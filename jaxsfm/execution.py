@@ -125,21 +125,19 @@ def images_at_once(execution: Execution, mesh: Mesh, pixels: int, count: int) ->
       pixels: of one padded image.
       count: images there are of that size.
     """
+    each = ACCELERATOR_BYTES_PER_PIXEL * pixels
+    return _at_once(execution.images_at_once, mesh, DEVICE_SHARE, each, MAX_IMAGES, count)
+
+
+def _at_once(asked: int | None, mesh: Mesh, share: float, each: int, most: int, count: int) -> int:
+    """Items side by side on a device: as asked for, else what fits into a share of its memory (one
+    on a CPU); no more than each device gets of `count`, up to a power of two, so that few programs
+    are compiled."""
     memory = _device_memory(mesh)
-    if execution.images_at_once is not None:
-        fits = execution.images_at_once
-    elif memory is None:
-        fits = 1
-    else:
-        fits = DEVICE_SHARE * memory / (ACCELERATOR_BYTES_PER_PIXEL * pixels)
-        fits = int(np.clip(fits, 1, MAX_IMAGES))
-    return min(fits, _share(count, mesh))
-
-
-def _share(count: int, mesh: Mesh) -> int:
-    """Of `count` items for each device, up to a power of two: few programs are compiled."""
-    each = -(-count // mesh.size)
-    return 1 << (each - 1).bit_length()
+    if asked is None:
+        asked = 1 if memory is None else int(np.clip(share * memory / each, 1, most))
+    own = -(-count // mesh.size)
+    return min(asked, 1 << (own - 1).bit_length())
 
 
 PAIR_BYTES_PER_CELL = 35_000
@@ -151,17 +149,11 @@ def pairs_at_once(
     execution: Execution, mesh: Mesh, num_coarse: int, count: int, *, config: Config
 ) -> int:
     """Pairs matched side by side on each device, of `count`."""
-    memory = _device_memory(mesh)
-    if execution.pairs_at_once is not None:
-        fits = execution.pairs_at_once
-    elif memory is None:
-        fits = 1
-    else:
-        # A batch copies both sides of its pairs, in half of what the images at hand leave.
-        joined = joined_bytes(num_coarse, octaves=config.octaves)
-        each = 2 * joined + PAIR_BYTES_PER_CELL * num_coarse
-        fits = int(np.clip((1 - DEVICE_SHARE) / 2 * memory / each, 1, MAX_PAIRS))
-    return min(fits, _share(count, mesh))
+    # A batch copies both sides of its pairs, in half of what the images at hand leave.
+    share = (1 - DEVICE_SHARE) / 2
+    joined = joined_bytes(num_coarse, octaves=config.octaves)
+    each = 2 * joined + PAIR_BYTES_PER_CELL * num_coarse
+    return _at_once(execution.pairs_at_once, mesh, share, each, MAX_PAIRS, count)
 
 
 Batch = TypeVar("Batch")
