@@ -57,6 +57,7 @@ def _of_pairs(
     methods: tuple[str, ...],
     seeds: int,
     max_size: int | None,
+    relocalizer: Path | None,
     json: Path | None,
 ) -> dict[str, Any]:
     from jaxsfm.bench.matches import PAIR_METHODS
@@ -68,6 +69,7 @@ def _of_pairs(
         methods=_methods(methods, PAIR_METHODS),
         seeds=seeds,
         max_size=max_size,
+        relocalizer=relocalizer,
         progress=True,
         keep=_keeper(json),
     )
@@ -81,6 +83,7 @@ def strecha(
     intrinsics: Literal["known", "unknown"] = "known",
     json: Path | None = None,
     out: Path | None = None,
+    relocalizer: Path | None = None,
     seed: int = 0,
     threads: int = -1,
 ) -> int:
@@ -89,11 +92,13 @@ def strecha(
     Args:
       root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
       sets: Which of them, by commas or blanks; default: all.
-      methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc: the default
-        preset without refinement, at cell centres or relocalized. default, robust: the presets.
+      methods: By commas or blanks. rootsift: COLMAP's own features. grid, reloc, learned: the
+        default preset without refinement, at cell centres, relocalized by norms, by learned scores.
+        default, robust: the presets; PRESET-IDEA as in bench daynight.
       intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
       json: Write all figures here.
       out: Keep databases and models here, and go on from what is there.
+      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
       seed: Of everything random.
       threads: Of COLMAP's part; -1: all.
     """
@@ -106,6 +111,7 @@ def strecha(
         methods=_methods(methods, bench.METHODS),
         known_intrinsics=intrinsics == "known",
         out=out,
+        relocalizer=relocalizer,
         seed=seed,
         threads=threads,
         progress=True,
@@ -121,6 +127,7 @@ def wxbs(
     methods: tuple[str, ...] = ("rootsift,paper,default,robust",),
     seeds: int = 5,
     max_size: int | None = None,
+    relocalizer: Path | None = None,
     json: Path | None = None,
 ) -> int:
     """Pairs under changes of viewpoint, illumination and season (WxBS).
@@ -129,15 +136,17 @@ def wxbs(
       root: Folder of the categories: CATEGORY/NAME/{01,02}.png, corrs.txt.
       sets: CATEGORY or CATEGORY/NAME, by commas or blanks; default: all.
       methods: By commas or blanks: rootsift, paper, grid (the default preset at cell centres),
-        default, robust, and either of these without one idea: default-no-IDEA (octaves, centring,
-        consensus, competition; robust-no-enlarging too).
+        paper-learned, reloc and learned (without alignment, by norms, by learned scores), default,
+        robust, and either of these without one idea: default-no-IDEA (octaves, centring, consensus,
+        competition; robust-no-enlarging too), default-norm, default-learned.
       seeds: Runs of each method, with seeds 0, 1, ...
       max_size: Longer side of our working images, pixels; default: the preset's.
+      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
       json: Write all figures here.
     """
     from jaxsfm.bench import wxbs as bench
 
-    figures = _of_pairs(bench.bench_wxbs, root, sets, methods, seeds, max_size, json)
+    figures = _of_pairs(bench.bench_wxbs, root, sets, methods, seeds, max_size, relocalizer, json)
     return _finish(bench.table_lines(figures))
 
 
@@ -148,6 +157,7 @@ def homography(
     methods: tuple[str, ...] = ("rootsift,paper,default,robust",),
     seeds: int = 5,
     max_size: int | None = None,
+    relocalizer: Path | None = None,
     json: Path | None = None,
 ) -> int:
     """Sequences with known homographies (Oxford affine, HPatches).
@@ -158,11 +168,14 @@ def homography(
       methods: As in bench wxbs.
       seeds: Runs of each method, with seeds 0, 1, ...
       max_size: Longer side of our working images, pixels; default: the preset's.
+      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
       json: Write all figures here.
     """
     from jaxsfm.bench import homography as bench
 
-    figures = _of_pairs(bench.bench_homography, root, sets, methods, seeds, max_size, json)
+    figures = _of_pairs(
+        bench.bench_homography, root, sets, methods, seeds, max_size, relocalizer, json
+    )
     return _finish(bench.table_lines(figures))
 
 
@@ -206,6 +219,7 @@ def daynight(
     severity: float = 2.0,
     denoise: bool = True,
     jpeg: bool = True,
+    relocalizer: Path | None = None,
     json: Path | None = None,
     seed: int = 0,
     threads: int = -1,
@@ -217,10 +231,12 @@ def daynight(
         to a synthetic night one after the other), or Aachen Day-Night.
       sets: Which scenes, by commas or blanks; default: all.
       methods: By commas or blanks: rootsift, paper-grid and paper (the paper's method at cell
-        centres and relocalized), default, robust; ablations as in `bench wxbs`, and placing.
+        centres and relocalized), paper-learned, default, robust; ablations as in `bench wxbs`, and
+        placing.
       severity: Of the synthetic night: 0: day, 1: clean, 2: noisy, 3: dark, 5: noise.
       denoise: Whether the synthetic night's camera removes noise.
       jpeg: Whether it stores JPEG.
+      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
       json: Write all figures here.
       seed: Of everything random.
       threads: Of COLMAP's part; -1: all.
@@ -235,8 +251,40 @@ def daynight(
         severity=severity,
         denoise=denoise,
         jpeg=jpeg,
+        relocalizer=relocalizer,
         seed=seed,
         threads=threads,
+        progress=True,
+        keep=_keeper(json),
+    )
+    return _finish(bench.table_lines(result))
+
+
+def warps(
+    *,
+    root: Path,
+    methods: tuple[str, ...] = ("norm,learned",),
+    seeds: int = 5,
+    relocalizer: Path | None = None,
+    json: Path | None = None,
+) -> int:
+    """Relocalization rules on views made of photos, under known homographies (synthetic).
+
+    Args:
+      root: Folder of any photos; sub-folders are included.
+      methods: By commas or blanks: norm (the paper's rule), learned.
+      seeds: Sets of 64 pairs of views.
+      relocalizer: Learned scores; default: jaxsfm's own.
+      json: Write all figures here.
+    """
+    _check(json, seeds)
+    from jaxsfm.bench import warps as bench
+
+    result = bench.bench_warps(
+        root,
+        methods=_methods(methods, bench.METHODS),
+        seeds=seeds,
+        relocalizer=relocalizer,
         progress=True,
         keep=_keeper(json),
     )

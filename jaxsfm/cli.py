@@ -10,11 +10,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxsfm.bench_commands import daynight, homography, planes, strecha, wxbs
+from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, wxbs
 from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
+from jaxsfm.train_commands import train
 
 BENCHMARKS = {
     "strecha": strecha,
@@ -22,6 +23,7 @@ BENCHMARKS = {
     "wxbs": wxbs,
     "homography": homography,
     "planes": planes,
+    "warps": warps,
 }
 _Benchmark = functools.reduce(
     operator.or_,
@@ -43,6 +45,7 @@ COMMANDS = {
     "evaluate": evaluate,
     "demo": demo,
     "weights": weights,
+    "train": train,
     "bench": bench,
 }
 

@@ -17,21 +17,29 @@ from jaxsfm.errors import UserError
 
 Positional = tyro.conf.Positional
 Preset = Literal["paper", "default", "robust"]
+ChosenKeypoints = Keypoints | Literal["preset"]
 Switch = Literal["preset", "yes", "no"]
 
 
 def _config(
     name: str,
     max_size: int,
-    keypoints: Keypoints,
+    keypoints: ChosenKeypoints,
     view_graph: Switch = "preset",
     refine: int | None = None,
     convolutions: Convolutions = "float32",
+    relocalizer: Path | None = None,
 ) -> Config:
     try:
-        config = dataclasses.replace(
-            preset(name), max_size=max_size, keypoints=keypoints, convolutions=convolutions
-        )
+        config = dataclasses.replace(preset(name), max_size=max_size, convolutions=convolutions)
+        if relocalizer is not None:
+            if keypoints not in ("preset", "learned"):
+                raise ValueError(
+                    f"relocalizer {relocalizer} needs learned keypoints; got {keypoints}"
+                )
+            keypoints = "learned"
+        if keypoints != "preset":
+            config = dataclasses.replace(config, keypoints=keypoints)
         if view_graph != "preset":
             config = dataclasses.replace(config, view_graph=view_graph == "yes")
         if refine is not None:
@@ -70,7 +78,8 @@ def reconstruct(
     view_graph: Switch = "preset",
     refine: int | None = None,
     max_size: int = 1600,
-    keypoints: Keypoints = "relocalized",
+    keypoints: ChosenKeypoints = "preset",
+    relocalizer: Path | None = None,
     convolutions: Convolutions = "float32",
     mapper: Literal["incremental", "global"] = "incremental",
     seed: int = 0,
@@ -98,7 +107,9 @@ def reconstruct(
         that repeat themselves).
       refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
       max_size: Longer side of the working images, pixels.
-      keypoints: relocalized, or grid: cell centres (for the ablation).
+      keypoints: relocalized: by the largest norms, the paper's rule. learned: by learned scores.
+        grid: cell centres (for the ablation).
+      relocalizer: File of learned scores (jaxsfm train relocalizer); default: jaxsfm's own.
       convolutions: What the network multiplies; bfloat16 is meant for accelerators.
       mapper: COLMAP's incremental or global mapper.
       seed: Of everything random.
@@ -110,7 +121,7 @@ def reconstruct(
       memory_gb: For the features at hand, on each device; default: half of an accelerator, an
         eighth of a host, at most 1.6. Less makes photos come back more often.
     """
-    config = _config(preset, max_size, keypoints, view_graph, refine, convolutions)
+    config = _config(preset, max_size, keypoints, view_graph, refine, convolutions, relocalizer)
     from jaxsfm.execution import Execution
     from jaxsfm.report import summary_lines
     from jaxsfm.run import RunOptions, run_folder
@@ -128,6 +139,7 @@ def reconstruct(
         pairs=pairs,
         best_pairs=best_pairs,
         intrinsics=intrinsics,
+        relocalizer=relocalizer,
         refine_intrinsics=refine_intrinsics,
         mapper=mapper,
         seed=seed,
@@ -155,7 +167,8 @@ def match(
     plot: Path | None = None,
     preset: Preset = "default",
     max_size: int = 1600,
-    keypoints: Keypoints = "relocalized",
+    keypoints: ChosenKeypoints = "preset",
+    relocalizer: Path | None = None,
     convolutions: Convolutions = "float32",
     seed: int = 0,
 ) -> int:
@@ -170,11 +183,14 @@ def match(
       plot: Picture of the matches, a colour for each plane.
       preset: See reconstruct.
       max_size: Longer side of the working images, pixels.
-      keypoints: relocalized, or grid: cell centres.
+      keypoints: See reconstruct.
+      relocalizer: See reconstruct.
       convolutions: See reconstruct.
       seed: Of the RANSAC draws.
     """
-    config = _config(preset, max_size, keypoints, convolutions=convolutions)
+    config = _config(
+        preset, max_size, keypoints, convolutions=convolutions, relocalizer=relocalizer
+    )
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
     import numpy as np
@@ -189,7 +205,7 @@ def match(
 
     check_seed(seed)
     files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
-    weights = load_weights()
+    weights = load_weights(relocalizer=relocalizer)
     features = [image_features(weights, file, config=config) for file in files]
     result = match_features(features[0], features[1], config=config, seed=seed)
     keypoints1, aligned = align(result, files[0], files[1], config=config)
@@ -263,17 +279,28 @@ def _dump(value: object) -> str:
     return json.dumps(value, indent=1)
 
 
-def weights() -> int:
-    """Show which weights are in use, and check them."""
+def weights(*, relocalizer: Path | None = None) -> int:
+    """Show which weights are in use, and check them.
+
+    Args:
+      relocalizer: File of learned scores; default: jaxsfm's own.
+    """
+    from jaxsfm.host.relocalizer import shipped_relocalizer
     from jaxsfm.host.weights import default_path, load_weights
 
-    loaded = load_weights()
+    loaded = load_weights(relocalizer=relocalizer)
     p = loaded.preprocessing
     print(f"weights          ImageNet VGG-16, {loaded.source}")
     print(f"file             {default_path()}")
     print(f"family           {loaded.family}")
     print(f"preprocessing    RGB / {p.scale:g}, minus {p.mean}, divided by {p.std}")
     print(f"sha256           {loaded.sha256} (checked)")
+    learned = loaded.relocalizer or shipped_relocalizer()
+    print(f"relocalizer      {relocalizer or 'of jaxsfm'}, for learned keypoints")
+    print(f"sha256           {learned.sha256}")
+    for name, value in learned.about.items():
+        if name != "history":
+            print(f"  {name:14s} {value}")
     return 0
 
 

@@ -6,9 +6,9 @@ recompile. Imports neither jax nor cv2.
 """
 
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
-Keypoints = Literal["relocalized", "grid"]
+Keypoints = Literal["relocalized", "learned", "grid"]
 Convolutions = Literal["float32", "bfloat16"]
 OneToOne = Literal["first", "similarity"]
 
@@ -129,7 +129,8 @@ class Config:
     """What the network multiplies; sums are float32, then rounded alike. Meant for accelerators
     (where no gain has been measured yet); CPUs round and gain nothing."""
     keypoints: Keypoints = "relocalized"
-    """Where a fine cell's keypoint lies: at its relocalized pixel, or at the cell's centre."""
+    """Where a fine cell's keypoint lies: at the pixel it walks to by the largest norms (the paper's
+    rule), or by learned scores (`jaxsfm.host.relocalizer`), or at the cell's centre."""
     threshold_px: float = 10.0
     """Inlier radius of a homography, pixels of the working image."""
     min_inliers: int = 26
@@ -172,8 +173,10 @@ class Config:
             raise ValueError(
                 f"convolutions must be 'float32' or 'bfloat16'; got {self.convolutions!r}"
             )
-        if self.keypoints not in ("relocalized", "grid"):
-            raise ValueError(f"keypoints must be 'relocalized' or 'grid'; got {self.keypoints!r}")
+        if self.keypoints not in get_args(Keypoints):
+            raise ValueError(
+                f"keypoints must be one of {get_args(Keypoints)}; got {self.keypoints!r}"
+            )
         if not self.threshold_px > 0:
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
         if self.min_inliers < 4:

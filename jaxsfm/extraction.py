@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsfm.config import Config
+from jaxsfm.core.features import Extraction
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.execution import SINGLE, Execution, chosen_devices, images_at_once, one_ahead
@@ -38,12 +39,20 @@ def _start(
         images[k, :height, :width] = each.rgb
     return extract_batch(
         weights.params,
+        weights.scores(config),
         images,
         sizes,
         mesh=mesh,
+        settings=extraction_settings(weights, config, num_coarse),
+    )
+
+
+def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Extraction:
+    """The config's part of the extraction's program."""
+    return Extraction(
         preprocessing=weights.preprocessing,
         num_coarse=num_coarse,
-        relocalized=config.keypoints == "relocalized",
+        relocalized=config.keypoints != "grid",
         octaves=config.octaves,
         centred=config.centred,
         bfloat16=config.convolutions == "bfloat16",

@@ -15,19 +15,17 @@ It is a model, not a night: every result made with it says `synthetic`. What it 
 import cv2
 import numpy as np
 
-GAMMA = 2.2
-AMBIENT = 0.006 * np.asarray([0.7, 0.85, 1.2])
-LAMPS = (
-    np.asarray([1.25, 0.9, 0.5]),  # sodium
-    np.asarray([1.1, 1.0, 0.8]),  # warm white
-    np.asarray([0.85, 1.05, 1.0]),  # mercury
+from jaxsfm.core.night import (
+    AMBIENT,
+    BLUR_PX,
+    FULL_WELL,
+    GAMMA,
+    LAMPS,
+    MIN_FULL_SCALE,
+    NUM_LAMPS,
+    READ_NOISE,
+    SATURATED_SHARE,
 )
-NUM_LAMPS = 6
-SATURATED_SHARE = 0.01
-FULL_WELL = 20_000.0
-MIN_FULL_SCALE = 100.0
-READ_NOISE = 2.0
-BLUR_PX = 0.3
 
 
 def _lamp_light(shape: tuple[int, int], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -35,12 +33,12 @@ def _lamp_light(shape: tuple[int, int], rng: np.random.Generator) -> tuple[np.nd
     height, width = shape
     diagonal = np.hypot(height, width)
     y, x = np.mgrid[:height, :width]
-    light = np.broadcast_to(AMBIENT, (height, width, 3)).copy()
+    light = np.broadcast_to(np.asarray(AMBIENT), (height, width, 3)).copy()
     glare = np.zeros((height, width, 3))
     for _ in range(NUM_LAMPS):
         at = rng.uniform([0.05, 0.05], [0.95, 0.75]) * (width, height)
         reach = rng.uniform(0.06, 0.16) * diagonal
-        colour = LAMPS[rng.integers(len(LAMPS))] * rng.uniform(0.4, 1.0)
+        colour = np.asarray(LAMPS)[rng.integers(len(LAMPS))] * rng.uniform(0.4, 1.0)
         square = (x - at[0]) ** 2 + (y - at[1]) ** 2
         light += (1 / (1 + square / reach**2) ** 2)[..., None] * colour
         glare += np.exp(-square / (2 * (0.006 * diagonal) ** 2))[..., None] * colour

@@ -63,17 +63,34 @@ def draw_matches(
     return figure
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure; the suffix chooses the format (.png, .jpg)."""
+def encode_figure(figure: Figure, suffix: str, *, jpeg_quality: int = 95) -> bytes:
+    """A figure as the content of an image file, for notebooks too.
+
+    Args:
+      suffix: .png or .jpg.
+
+    Raises:
+      ValueError: OpenCV writes no such format.
+    """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    rgba = np.asarray(canvas.buffer_rgba())
+    bgr = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
+    is_jpeg = suffix.lower() in (".jpg", ".jpeg")
+    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if is_jpeg else []
     try:
-        ok, data = cv2.imencode(path.suffix, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGR))
-        if not ok:
-            raise UserError(f"--plot {path}: cannot be encoded")
-        path.write_bytes(data.tobytes())
+        ok, data = cv2.imencode(suffix, bgr, options)
     except cv2.error as error:
+        raise ValueError(f"suffix must be .png or .jpg; got {suffix!r}") from error
+    if not ok:
+        raise ValueError(f"the figure cannot be encoded as {suffix}")
+    return data.tobytes()
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure; the suffix chooses the format (.png, .jpg)."""
+    try:
+        path.write_bytes(encode_figure(figure, path.suffix))
+    except ValueError as error:
         raise UserError(f"--plot {path}: use .png or .jpg, not {path.suffix!r}") from error
     except OSError as error:
         raise UserError(f"--plot {path}: cannot be written ({error.strerror})") from error

@@ -48,6 +48,8 @@ class RunOptions:
     mapper: Mapper = "incremental"
     seed: int = 0
     threads: int = -1
+    relocalizer: Path | None = None
+    """Learned scores for the config's keypoints "learned"; None: jaxsfm's own."""
     reference: Path | None = None
     """Reference poses to evaluate the model against."""
     execution: Execution = dataclasses.field(default_factory=Execution)
@@ -78,10 +80,12 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
-    weights = load_weights()
+    weights = load_weights(relocalizer=options.relocalizer)
+    relocalizer = weights.chosen_relocalizer(config)
     identity = {
         "version": importlib.metadata.version("jaxsfm"),
         "weights": weights.sha256,
+        "relocalizer": relocalizer and relocalizer.sha256,
         "config": config.matching(),
         "seed": options.seed,
         "images": {image.name: image.sha256 for image in usable},

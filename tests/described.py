@@ -6,6 +6,7 @@ import numpy as np
 from jaxsfm.config import Config
 from jaxsfm.core.features import extract
 from jaxsfm.core.types import DenseFeatures
+from jaxsfm.extraction import extraction_settings
 from jaxsfm.host.features import padded_size, room_of
 from jaxsfm.host.images import WorkingImage
 from jaxsfm.host.weights import Weights
@@ -21,12 +22,7 @@ def compute_features(weights: Weights, working: WorkingImage, *, config: Config)
             weights.params,
             image,
             np.asarray([height, width], np.int32),
-            preprocessing=weights.preprocessing,
-            num_coarse=num_coarse,
-            num_fine=4 * num_coarse,
-            relocalized=config.keypoints == "relocalized",
-            octaves=config.octaves,
-            centred=config.centred,
-            bfloat16=config.convolutions == "bfloat16",
+            settings=extraction_settings(weights, config, num_coarse),
+            scores=weights.scores(config),
         )
     )

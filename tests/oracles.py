@@ -39,14 +39,34 @@ def vgg(params: dict, image: np.ndarray) -> list[np.ndarray]:
     return maps
 
 
-def relocalize(maps: list[np.ndarray], row: int, col: int) -> tuple[int, int]:
+def children_of(shape, row: int, col: int, k: int) -> list[tuple[int, int]]:
+    """The k x k cells around the 2 x 2 below a cell, in row order, as far as there are any."""
+    first = -(k - 2) // 2
+    block = [(2 * row + first + i, 2 * col + first + j) for i in range(k) for j in range(k)]
+    return [(r, c) for r, c in block if 0 <= r < shape[0] and 0 <= c < shape[1]]
+
+
+def relocalize(maps: list[np.ndarray], row: int, col: int, k: int = 2) -> tuple[int, int]:
     """(x, y) of one cell's walk down feature maps, coarse to fine."""
     for level in maps:
-        children = [(2 * row, 2 * col), (2 * row, 2 * col + 1)]
-        children += [(2 * row + 1, 2 * col), (2 * row + 1, 2 * col + 1)]
+        children = children_of(level.shape, row, col, k)
         norms = [float((level[r, c].astype(np.float64) ** 2).sum()) for r, c in children]
         row, col = children[int(np.argmax(norms))]
     return col, row
+
+
+def random_walk(scores, row: int, col: int, temperature: float, k: int, offset: float) -> dict:
+    """(x, y) -> probability of where one cell's random walk ends, path by path."""
+    ends = {(row, col): 1.0}
+    for level in scores:
+        below: dict[tuple[int, int], float] = {}
+        for (r, c), p in ends.items():
+            children = children_of(level.shape, r, c, k)
+            share = np.asarray([(float(level[i]) + offset) ** (1 / temperature) for i in children])
+            for child, each in zip(children, share / share.sum(), strict=True):
+                below[child] = below.get(child, 0.0) + p * each
+        ends = below
+    return {(c, r): p for (r, c), p in ends.items()}
 
 
 def mutual_nn(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.host.pairs import PairResult
-from jaxsfm.plot import COLOURS, draw_matches, save_figure
+from jaxsfm.plot import COLOURS, draw_matches, encode_figure, save_figure
 
 ONE = np.ones(2)
 
@@ -55,6 +55,25 @@ def test_a_picture_has_both_images_and_the_matches(tmp_path, suffix):
     picture = cv2.imread(str(path))
     assert picture.shape[1] == 14 * 120 and picture.std() > 10
     assert ((picture == 128).all(2)).mean() > 0.5
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_an_encoded_figure_is_the_file_that_is_written(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    save_figure(draw(1), path)
+    assert encode_figure(draw(1), suffix) == path.read_bytes()
+
+
+def test_less_quality_takes_fewer_bytes_and_keeps_the_picture():
+    fine, coarse = (encode_figure(draw(2), ".jpg", jpeg_quality=q) for q in (95, 60))
+    assert len(coarse) < 0.8 * len(fine)
+    a, b = (cv2.imdecode(np.frombuffer(d, np.uint8), 1).astype(int) for d in (fine, coarse))
+    assert a.shape == b.shape and np.abs(a - b).mean() < 4
+
+
+def test_an_unknown_format_is_refused():
+    with pytest.raises(ValueError, match="must be .png or .jpg; got '.xyz'"):
+        encode_figure(draw(1), ".xyz")
 
 
 @pytest.mark.parametrize("planes", [0, 1, 3, 5])

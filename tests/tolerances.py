@@ -13,3 +13,5 @@ NEAR_TIE = 1e-5
 ALIGNED_PX = 0.03
 """Sub-pixel alignment of smooth exact patches (periods of 8 pixels and more): what interpolation
 leaves."""
+EXACT_GRADIENT = {"rtol": 1e-4, "atol": 1e-8}
+"""Central differences in float64, between the kinks of rectifiers and maxima."""

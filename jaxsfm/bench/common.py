@@ -29,6 +29,8 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
     "no-consensus": lambda c: _with_pair(c, consensus=0),
     "no-competition": lambda c: _with_pair(c, plane_rounds=0),
     "no-alignment": lambda c: dataclasses.replace(c, aligned_octaves=0),
+    "norm": lambda c: dataclasses.replace(c, keypoints="relocalized"),
+    "learned": lambda c: dataclasses.replace(c, keypoints="learned"),
     "bfloat16": lambda c: dataclasses.replace(c, convolutions="bfloat16"),
     "no-placing": lambda c: dataclasses.replace(
         c, refinement=c.refinement and dataclasses.replace(c.refinement, weak_octaves=0)
@@ -42,14 +44,16 @@ ABLATED = tuple(
     for idea, without in ABLATIONS.items()
     if without(preset(name)) != preset(name)
 )
+KEYPOINTS: dict[str, Keypoints] = {"grid": "grid", "reloc": "relocalized", "learned": "learned"}
+"""Methods that differ in where keypoints lie."""
 PAIR_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-placing"))
 RUN_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-alignment"))
 
 
 def method_config(method: str, *, max_size: int | None = None) -> Config:
-    """A preset by its name; PRESET-IDEA: without that idea (`ABLATIONS`); paper-grid: paper at
-    cell centres; grid and reloc: the default preset without refinement and alignment, at cell
-    centres or relocalized.
+    """A preset by its name; PRESET-IDEA: without that idea (`ABLATIONS`); paper-grid, -learned:
+    paper at cell centres, by learned scores; grid, reloc and learned: the default preset without
+    refinement and alignment, at cell centres, relocalized by norms, by learned scores.
 
     Args:
       max_size: longer side of the working images, pixels; None: the preset's.
@@ -59,16 +63,17 @@ def method_config(method: str, *, max_size: int | None = None) -> Config:
     elif method in ABLATED:
         name, _, idea = method.partition("-")
         config = ABLATIONS[idea](preset(name))
-    elif method == "paper-grid":
-        config = dataclasses.replace(preset("paper"), keypoints="grid")
-    elif method in ("grid", "reloc"):
-        keypoints: Keypoints = "grid" if method == "grid" else "relocalized"
+    elif method in ("paper-grid", "paper-learned"):
+        keypoints = KEYPOINTS[method.partition("-")[2]]
+        config = dataclasses.replace(preset("paper"), keypoints=keypoints)
+    elif method in KEYPOINTS:
         config = dataclasses.replace(
-            preset("default"), aligned_octaves=0, refinement=None, keypoints=keypoints
+            preset("default"), aligned_octaves=0, refinement=None, keypoints=KEYPOINTS[method]
         )
     else:
         raise ValueError(
-            f"method must be a preset, PRESET-no-IDEA, paper-grid, grid or reloc; got {method!r}"
+            "method must be a preset, PRESET-IDEA, paper-grid, paper-learned or one of "
+            f"{', '.join(KEYPOINTS)}; got {method!r}"
         )
     return config if max_size is None else dataclasses.replace(config, max_size=max_size)
 

@@ -31,7 +31,7 @@ from jaxsfm.host.weights import load_weights
 from jaxsfm.matching import matched
 from jaxsfm.pipeline import reconstruct
 
-METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", *RUN_ABLATED)
+METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", "paper-learned", *RUN_ABLATED)
 """paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has
 corners of cells and 80 px.)"""
 FEATURES = 64
@@ -52,9 +52,7 @@ class Made(NamedTuple):
     matches: NightMatches | None
 
 
-def _rootsift_models(
-    scene: Scene, scratch: Path, _method: str, seed: int, threads: int
-) -> list[Made]:
+def _rootsift_models(scene: Scene, scratch: Path, seed: int, threads: int) -> list[Made]:
     """Per subset: features and matches of all photos once, then what a subset has of them."""
     database = scratch / "all.db"
     images = [scene.images[name] for name in sorted(scene.images)]
@@ -84,10 +82,17 @@ def _rootsift_models(
     return models
 
 
-def _dense_models(scene: Scene, scratch: Path, method: str, seed: int, threads: int) -> list[Made]:
+def _dense_models(
+    scene: Scene,
+    scratch: Path,
+    method: str,
+    seed: int,
+    threads: int,
+    relocalizer: Path | None = None,
+) -> list[Made]:
     """Per subset; a photo's features and a pair's matches are computed once."""
     config = method_config(method)
-    weights = load_weights()
+    weights = load_weights(relocalizer=relocalizer)
     largest = max(len(subset.day) + 1 for subset in scene.subsets)
 
     @functools.lru_cache(maxsize=max(FEATURES, largest))
@@ -190,6 +195,7 @@ def bench_daynight(
     jpeg: bool = True,
     seed: int = 0,
     threads: int = -1,
+    relocalizer: Path | None = None,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -198,6 +204,7 @@ def bench_daynight(
     Args:
       root: see `jaxsfm.bench.scenes`.
       severity, denoise, jpeg: of the synthetic night, for Strecha sets.
+      relocalizer: learned scores; None: jaxsfm's own.
     """
     scenes.check_severity(severity)
     folders = scenes.find_scenes(root, sets)
@@ -219,8 +226,10 @@ def bench_daynight(
             )
             for method in methods:
                 start = time.monotonic()
-                make = _rootsift_models if method == "rootsift" else _dense_models
-                models = make(scene, scratch, method, seed, threads)
+                if method == "rootsift":
+                    models = _rootsift_models(scene, scratch, seed, threads)
+                else:
+                    models = _dense_models(scene, scratch, method, seed, threads, relocalizer)
                 subsets = [
                     judge(each, subset, scene.truth)
                     for each, subset in zip(models, scene.subsets, strict=True)

@@ -143,6 +143,7 @@ def bench_homography(
     methods: Sequence[str],
     seeds: int = 5,
     max_size: int | None = None,
+    relocalizer: Path | None = None,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -152,6 +153,7 @@ def bench_homography(
       root: folder of sequences (SEQUENCE/img1.png, H1to2p; or SEQUENCE/1.ppm, H_1_2).
       seeds: runs of each method with seeds 0, 1, ...
       max_size: longer side of our working images, pixels; None: the preset's.
+      relocalizer: learned scores; None: jaxsfm's own.
     """
     check_root(root)
     found = {
@@ -162,7 +164,7 @@ def bench_homography(
     if not found:
         raise UserError(f"--root {root}: no sequences (SEQUENCE/H1to2p or H_1_2) in it")
     sequences = {f.name: read_sequence(f) for f in choose_sets(found, sets, root)}
-    matcher = Matcher()
+    matcher = Matcher(relocalizer=relocalizer)
     rows = []
     for set_name, pairs in sequences.items():
         for pair in pairs:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.common import PAIR_ABLATED, method_config, versions
+from jaxsfm.bench.common import KEYPOINTS, PAIR_ABLATED, method_config, versions
 from jaxsfm.config import Config
 from jaxsfm.extraction import image_features
 from jaxsfm.host.colmap import read_matches
@@ -20,7 +20,15 @@ from jaxsfm.host.weights import Weights, load_weights
 from jaxsfm.matching import match_features
 from jaxsfm.pair_alignment import align
 
-PAIR_METHODS = ("rootsift", "paper", "grid", "default", "robust", *PAIR_ABLATED)
+PAIR_METHODS = (
+    "rootsift",
+    "paper",
+    "paper-learned",
+    *KEYPOINTS,
+    "default",
+    "robust",
+    *PAIR_ABLATED,
+)
 FEATURES = 8
 """Features held: of two images, as four methods want them."""
 
@@ -39,7 +47,9 @@ class Matcher:
     """Matches pairs; an image's features are computed once for all pairs and methods that share
     them."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, relocalizer: Path | None = None) -> None:
+        """With learned scores from a file; None: jaxsfm's own."""
+        self._relocalizer = relocalizer
         self._weights: Weights | None = None
         self._extract = functools.lru_cache(maxsize=FEATURES)(self._timed_features)
 
@@ -81,7 +91,7 @@ class Matcher:
 
     def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
         if self._weights is None:
-            self._weights = load_weights()
+            self._weights = load_weights(relocalizer=self._relocalizer)
         start = time.monotonic()
         features = image_features(self._weights, image, config=config)
         return features, time.monotonic() - start

@@ -1,5 +1,6 @@
 """`bench strecha`: the paper's comparison on standard scenes (Strecha et al., CVPR 2008)."""
 
+import dataclasses
 import json
 import shutil
 import tempfile
@@ -10,7 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from jaxsfm.bench.common import Keep, check_root, choose_sets, method_config, read_rows, versions
+from jaxsfm.bench.common import (
+    RUN_ABLATED,
+    Keep,
+    check_root,
+    choose_sets,
+    method_config,
+    read_rows,
+    versions,
+)
+from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.colmap import read_two_views, write_models
@@ -23,7 +33,8 @@ from jaxsfm.pipeline import open_images
 from jaxsfm.report import model_figures
 from jaxsfm.run import RunOptions, run_folder
 
-METHODS = ("rootsift", "grid", "reloc", "default", "robust")
+METHODS = ("rootsift", "grid", "reloc", "learned", "default", "robust", *RUN_ABLATED)
+USUAL = ("rootsift", "grid", "reloc", "default")
 PUBLISHED = (
     "published (Widya et al. 2018, mean over six full-size sets): "
     "DoG + RootSIFT 0.17 m, 0.90 deg; dense + relocalization 0.59 m, 2.27 deg"
@@ -109,9 +120,16 @@ def run_method(
     seed: int,
     threads: int,
     progress: bool,
+    relocalizer: Path | None = None,
 ) -> dict[str, Any]:
     """One of our methods on one set, in the work folder `out`."""
-    options = RunOptions(intrinsics=intrinsics, seed=seed, threads=threads, progress=progress)
+    options = RunOptions(
+        intrinsics=intrinsics,
+        relocalizer=relocalizer,
+        seed=seed,
+        threads=threads,
+        progress=progress,
+    )
     report = run_folder(folder / "images", out, config=method_config(method), options=options)
     row = _row(folder.name, method, report["models"][0] if report["models"] else None)
     return row | {"stages": report["seconds"], "seconds": sum(report["seconds"].values())}
@@ -135,28 +153,39 @@ def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
     return spent
 
 
+def _work_name(method: str) -> str:
+    """Methods that differ after mapping only share a work folder: the default preset's matches."""
+    if method == "rootsift":
+        return method
+    config = method_config(method)
+    usual = dataclasses.replace(preset("default"), keypoints=config.keypoints)
+    return f"dense-{config.keypoints}" if config.matching() == usual.matching() else method
+
+
 def bench_strecha(
     root: Path,
     *,
     sets: Sequence[str] | None = None,
-    methods: Sequence[str] = METHODS[:4],
+    methods: Sequence[str] = USUAL,
     known_intrinsics: bool = True,
     out: Path | None = None,
     seed: int = 0,
     threads: int = -1,
+    relocalizer: Path | None = None,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
     """All methods on all sets, same images, camera, verification and mapper; plain JSON.
 
-    `reloc` and `default` differ after mapping only: extraction and matching are done once and
-    counted in both rows' seconds.
+    Methods that differ after mapping only (`default` and whichever of `reloc` and `learned` has its
+    keypoints) share extraction and matching, which count in the seconds of each.
 
     Args:
       root: folder of Strecha sets (SET/images/K.txt, SET/gt_dense_cameras/*.camera).
       known_intrinsics: False: focal lengths are guessed and refined, one camera per image.
-      out: keeps the work folders here, the models of `reloc` and `default` beside them; runs in it
-        are gone on with.
+      out: keeps the work folders here, the models of methods that share one beside them; runs in
+        it are gone on with.
+      relocalizer: learned scores; None: jaxsfm's own.
     """
     folders = find_sets(root, sets)
     # All inputs are read before the first long run.
@@ -169,19 +198,26 @@ def bench_strecha(
             given = camera if known_intrinsics else None
             for method in methods:
                 work = (out or Path(scratch)) / folder.name
-                work = work / ("dense" if method in ("reloc", "default") else method)
+                work = work / _work_name(method)
                 work.parent.mkdir(parents=True, exist_ok=True)
                 if method == "rootsift":
                     row = run_rootsift(folder, work, given, seed=seed, threads=threads)
                 else:
                     row = run_method(
-                        folder, work, method, given, seed=seed, threads=threads, progress=progress
+                        folder,
+                        work,
+                        method,
+                        given,
+                        seed=seed,
+                        threads=threads,
+                        progress=progress,
+                        relocalizer=relocalizer,
                     )
                 if "stages" in row:
                     row["stages"] |= _matching_seconds(work, row["stages"])
                     row["seconds"] = sum(row["stages"].values())
                 rows.append(_finish(row, work / "sparse" / "0", truths[folder], focal))
-                if out is not None and method in ("reloc", "default"):
+                if out is not None and work.name != method:
                     kept = work.parent / f"{method}-sparse"
                     shutil.rmtree(kept, ignore_errors=True)
                     if (work / "sparse").is_dir():

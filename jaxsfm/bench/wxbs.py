@@ -61,6 +61,7 @@ def bench_wxbs(
     methods: Sequence[str],
     seeds: int = 5,
     max_size: int | None = None,
+    relocalizer: Path | None = None,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -72,6 +73,7 @@ def bench_wxbs(
       seeds: runs of each method with seeds 0, 1, ..; of RANSAC in matching and of the fundamental
         matrix.
       max_size: longer side of our working images; None: the preset's.
+      relocalizer: learned scores; None: jaxsfm's own.
     """
     check_root(root)
     found = {
@@ -93,7 +95,7 @@ def bench_wxbs(
         )
         for folder in folders
     }
-    matcher = Matcher()
+    matcher = Matcher(relocalizer=relocalizer)
     rows = []
     for folder, (image0, image1, marked) in inputs.items():
         for method in methods:

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsfm.core.numerics import HIGHEST, squared_norm
+from jaxsfm.core.numerics import HIGHEST
+from jaxsfm.core.scores import Head, score
 from jaxsfm.core.winograd import conv3x3
 
 WINOGRAD_CHANNELS = 256
@@ -105,54 +106,61 @@ def convolve(
     return x
 
 
-def norms_and_pool(
+def scores_and_pool(
     x: Float[Array, "b h w c"],
     size: Int[Array, "b 2"],
     layers: Sequence[Layer],
     *,
     large: bool,
+    head: Head | None = None,
     bfloat16: bool = False,
 ) -> tuple[Float[Array, "b h w"], Float[Array, "b h2 w2 o"]]:
-    """Squared norms of a block's last convolution, and its pooled map.
+    """Scores of a block's last convolution, and its pooled map.
 
     Args:
+      head: of the score; None: squared norms.
       large: the block's maps are far beyond any cache: CPUs compute them strip by strip.
     """
 
-    def whole(x, size, layers):
+    def whole(x, size, layers, head):
         last = convolve(x, size, layers, bfloat16=bfloat16)
-        return squared_norm(last), pool(last, size)
+        return score(last, head), pool(last, size)
 
-    def strips(x, size, layers):
-        one = functools.partial(_strips, layers=layers, bfloat16=bfloat16)
+    def strips(x, size, layers, head):
+        one = functools.partial(_strips, layers=layers, head=head, bfloat16=bfloat16)
         return lax.map(lambda item: one(*item), (x, size))
 
     if large:
-        return lax.platform_dependent(x, size, layers, cpu=strips, default=whole)
-    return whole(x, size, layers)
+        return lax.platform_dependent(x, size, layers, head, cpu=strips, default=whole)
+    return whole(x, size, layers, head)
 
 
 def _strips(
-    x: Float[Array, "h w c"], size: Int[Array, " 2"], layers: Sequence[Layer], *, bfloat16: bool
+    x: Float[Array, "h w c"],
+    size: Int[Array, " 2"],
+    layers: Sequence[Layer],
+    *,
+    head: Head | None,
+    bfloat16: bool,
 ) -> tuple[Float[Array, "h w"], Float[Array, "h2 w2 o"]]:
-    """Squared norms of a block's last convolution and its pooled map, STRIP_ROWS at a time: with
-    a row more on either side for every layer, nothing else of the maps ever exists."""
+    """Scores of a block's last convolution and its pooled map, STRIP_ROWS at a time: with a row
+    more on either side for every layer, nothing else of the maps ever exists."""
     height, width, depth = *x.shape[:2], len(layers)
     rows = min(STRIP_ROWS, height)
     strips = -(-height // rows)
     padded = jnp.pad(x, ((depth, depth + strips * rows - height), (0, 0), (0, 0)))
-    columns = jnp.arange(width) < size[1]
+    columns = jnp.arange(width, dtype=jnp.int32) < size[1]
 
     def strip(start):
         y = lax.dynamic_slice_in_dim(padded, start, rows + 2 * depth)[None]
         for margin, layer in zip(reversed(range(depth)), layers, strict=True):
             y = _rounded(nn.relu(y) if margin + 1 < depth else y, bfloat16)
             y = _rounded(_library(y, _rounded(layer.kernel, bfloat16), rows=0), bfloat16)
-            row = start - margin + jnp.arange(rows + 2 * margin)
+            row = start - margin + jnp.arange(rows + 2 * margin, dtype=jnp.int32)
             inside = ((row >= 0) & (row < size[0]))[:, None] & columns
             y = jnp.where(inside[:, :, None], y + layer.bias, 0.0)
-        return squared_norm(y[0]), nn.max_pool(nn.relu(y), (2, 2), strides=(2, 2))[0]
+        return score(y[0], head), nn.max_pool(nn.relu(y), (2, 2), strides=(2, 2))[0]
 
-    norms, pooled = lax.map(strip, rows * jnp.arange(strips))
+    scores, pooled = lax.map(strip, rows * jnp.arange(strips, dtype=jnp.int32))
     pooled = pooled.reshape(1, strips * rows // 2, width // 2, -1)[:, : height // 2]
-    return norms.reshape(-1, width)[:height], clear_padding(pooled, size[None] // 2)[0]
+    return scores.reshape(-1, width)[:height], clear_padding(pooled, size[None] // 2)[0]

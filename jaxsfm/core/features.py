@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,25 @@ from jaxtyping import Array, Float, Int, UInt8
 from jaxsfm.core.grid import COARSE_STRIDE, FINE_STRIDE, cell_rows_cols, cell_to_px
 from jaxsfm.core.numerics import squared_norm, unit
 from jaxsfm.core.octaves import halve, octave_capacity
-from jaxsfm.core.relocalize import flat_pyramid, relocalize
+from jaxsfm.core.relocalize import relocalize
+from jaxsfm.core.scores import heads_of
 from jaxsfm.core.types import DenseFeatures, Levels
 from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 
 LEAST_DIFFERENCE = 1e-3
 """Between a unit descriptor and its image's mean, for the descriptor to count."""
+
+
+class Extraction(NamedTuple):
+    """What fixes the program of `extract`, beside the image's shape; hashable."""
+
+    preprocessing: Preprocessing
+    num_coarse: int
+    """Capacity of the first octave; there are four times as many fine cells."""
+    relocalized: bool = True
+    octaves: int = 1
+    centred: bool = False
+    bfloat16: bool = False
 
 
 def _flatten(
@@ -60,8 +74,8 @@ def dense_features(
     fine_grid, coarse_grid = size // FINE_STRIDE, size // COARSE_STRIDE
     row, col = cell_rows_cols(num_fine, fine_grid[1])
     if relocalized:
-        norms, levels = flat_pyramid([norm[0] for norm in reversed(octaves[0].norms)])
-        keypoints = relocalize(norms, levels, row, col)
+        scores = [score[0] for score in reversed(octaves[0].scores)]
+        keypoints = relocalize(scores, row, col)
     else:
         cells = jnp.stack([col, row], axis=-1).astype(jnp.float32)
         keypoints = cell_to_px(cells, stride=FINE_STRIDE)
@@ -91,48 +105,39 @@ def stored(features: DenseFeatures) -> DenseFeatures:
     return features._replace(coarse=half(features.coarse), fine=half(features.fine))
 
 
-@functools.partial(
-    jax.jit,
-    static_argnames=(
-        "preprocessing",
-        "num_coarse",
-        "num_fine",
-        "relocalized",
-        "octaves",
-        "centred",
-        "bfloat16",
-    ),
-)
+@functools.partial(jax.jit, static_argnames=("settings",))
 def extract(
     params: dict,
     image: UInt8[Array, "h w 3"],
     size: Int[Array, " 2"],
     *,
-    preprocessing: Preprocessing,
-    num_coarse: int,
-    num_fine: int,
-    relocalized: bool,
-    octaves: int = 1,
-    centred: bool = False,
-    bfloat16: bool = False,
+    settings: Extraction,
+    scores: dict | None = None,
 ) -> DenseFeatures:
     """DenseFeatures of one RGB image, padded at the bottom and on the right beyond `size`.
 
     Both padded sides must be multiples of 2^(octaves - 1).
+
+    Args:
+      params: of `VGG16`.
+      scores: of `jaxsfm.core.scores.Scores`, for keypoints; None: the norm rule.
     """
-    x = preprocess(image, preprocessing)
+    x = preprocess(image, settings.preprocessing)
+    network = VGG16(settings.bfloat16)
     levels: list[Levels] = []
-    for k in range(octaves):
-        maps = VGG16(bfloat16).apply(params, x[None], (size >> k)[None], method="levels")
+    for k in range(settings.octaves):
+        # Keypoints are the first octave's.
+        heads = heads_of(scores if k == 0 else None)
+        maps = network.apply(params, x[None], (size >> k)[None], heads, method="levels")
         assert isinstance(maps, Levels)
         levels.append(maps)
-        if k + 1 < octaves:
+        if k + 1 < settings.octaves:
             x = halve(x)
     return dense_features(
         levels,
         size,
-        num_coarse=num_coarse,
-        num_fine=num_fine,
-        relocalized=relocalized,
-        centred=centred,
+        num_coarse=settings.num_coarse,
+        num_fine=4 * settings.num_coarse,
+        relocalized=settings.relocalized,
+        centred=settings.centred,
     )

@@ -15,12 +15,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, UInt8, UInt32
 
 from jaxsfm.config import PairShape
-from jaxsfm.core.features import extract, stored
+from jaxsfm.core.features import Extraction, extract, stored
 from jaxsfm.core.numerics import one_by_one
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pairs, pair_key
 from jaxsfm.core.types import DenseFeatures, JoinedFeatures, PairMatches, PRNGKey, Thresholds
-from jaxsfm.core.vgg import Preprocessing
 
 AXIS = "items"
 _EACH, _SAME = PartitionSpec(AXIS), PartitionSpec()
@@ -38,30 +37,15 @@ def _sharded(function: Callable[..., Any], mesh: Mesh, in_specs: tuple, out_spec
     )
 
 
-@functools.partial(
-    jax.jit,
-    static_argnames=(
-        "mesh",
-        "preprocessing",
-        "num_coarse",
-        "relocalized",
-        "octaves",
-        "centred",
-        "bfloat16",
-    ),
-)
+@functools.partial(jax.jit, static_argnames=("mesh", "settings"))
 def extract_batch(
     params: dict,
+    scores: dict | None,
     images: UInt8[Array, "b h w 3"],
     sizes: Int[Array, "b 2"],
     *,
     mesh: Mesh,
-    preprocessing: Preprocessing,
-    num_coarse: int,
-    relocalized: bool,
-    octaves: int,
-    centred: bool,
-    bfloat16: bool,
+    settings: Extraction,
 ) -> DenseFeatures:
     """`jaxsfm.core.features.extract` of images that share a padded size, as they are `stored`.
 
@@ -69,27 +53,14 @@ def extract_batch(
       images: a multiple of the number of devices; each computes its share side by side.
     """
 
-    def local(params, images, sizes):
+    def local(params, scores, images, sizes):
         def one(item):
-            image, size = item
-            return stored(
-                extract(
-                    params,
-                    image,
-                    size,
-                    preprocessing=preprocessing,
-                    num_coarse=num_coarse,
-                    num_fine=4 * num_coarse,
-                    relocalized=relocalized,
-                    octaves=octaves,
-                    centred=centred,
-                    bfloat16=bfloat16,
-                )
-            )
+            return stored(extract(params, *item, settings=settings, scores=scores))
 
         return one_by_one(one, (images, sizes), batch_size=len(sizes))
 
-    return _sharded(local, mesh, (_SAME, _EACH, _EACH), _EACH)(params, images, sizes)
+    specs = (_SAME, _SAME, _EACH, _EACH)
+    return _sharded(local, mesh, specs, _EACH)(params, scores, images, sizes)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh",))

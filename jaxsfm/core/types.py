@@ -27,8 +27,9 @@ class Pyramid(NamedTuple):
 class Levels(NamedTuple):
     """What features are made of: descriptors, and how strong the finer maps are."""
 
-    norms: tuple[Float[Array, "b h w"], Float[Array, "b h2 w2"], Float[Array, "b h4 w4"]]
-    """Squared norms of the pixels of conv1_2, pool1 and pool2."""
+    scores: tuple[Float[Array, "b h w"], Float[Array, "b h2 w2"], Float[Array, "b h4 w4"]]
+    """What relocalization walks by: squared norms of the cells of conv1_2, pool1 and pool2, or
+    learned scores."""
     pool3: Float[Array, "b h8 w8 256"]
     pool4: Float[Array, "b h16 w16 512"]
 

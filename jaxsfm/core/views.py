@@ -1,0 +1,136 @@
+"""Pairs of views made from one photo, with the map between them: supervision without labels.
+
+A crop of a photo is seen through two random homographies, and each view gets its own light, blur
+and noise, some a synthetic night. Everything is drawn from the key.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsfm.core.homography import homogeneous
+from jaxsfm.core.night import blur, night
+from jaxsfm.core.numerics import HIGHEST
+from jaxsfm.core.types import PRNGKey
+
+SUPERSAMPLING = 2
+"""Samples per pixel and axis: views at half the photo's scale do not alias."""
+NIGHT_SHARE = 0.3
+"""Of second views."""
+MOST_SEVERE = 2.5
+"""Of those nights."""
+
+
+class ViewPair(NamedTuple):
+    """Two views of one photo."""
+
+    view0: Float[Array, "v v 3"]
+    """Whole numbers 0 .. 255, RGB."""
+    view1: Float[Array, "v v 3"]
+    h: Float[Array, "3 3"]
+    """View 0 to view 1, pixels."""
+
+
+def warp_points(h: Float[Array, "3 3"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """Points through a homography, pixels."""
+    moved = jnp.einsum("ij,...j->...i", h, homogeneous(xy), precision=HIGHEST)
+    return moved[..., :2] / moved[..., 2:]
+
+
+def random_homography(key: PRNGKey, strength: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """About the origin, coordinates in half view sizes.
+
+    Args:
+      strength: 1: scale 0.55-1.8, turns up to 35 deg, aspect 0.7-1.4, shear 0.3, and a
+        perspective that changes the scale across the view by a third; 0: the identity.
+    """
+    u = strength * jax.random.uniform(key, (6,), minval=-1.0, maxval=1.0)
+    scale, aspect = jnp.exp(0.6 * u[0]), jnp.exp(0.35 * u[1])
+    turn, shear = 0.6 * u[2], 0.3 * u[3]
+    cos, sin = jnp.cos(turn), jnp.sin(turn)
+    rotation = jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])])
+    stretch = jnp.stack(
+        [jnp.stack([aspect, shear]), jnp.stack([jnp.zeros_like(aspect), 1 / aspect])]
+    )
+    affine = scale * jnp.matmul(rotation, stretch, precision=HIGHEST)
+    last = jnp.concatenate([0.08 * u[4:], jnp.ones((1,), u.dtype)])
+    return jnp.concatenate([jnp.pad(affine, ((0, 0), (0, 1))), last[None]])
+
+
+def sample_view(
+    photo: Float[Array, "s s 3"], h: Float[Array, "3 3"], *, size: int
+) -> Float[Array, "v v 3"]:
+    """What is seen through a homography: the mean of bilinear samples in every pixel.
+
+    Args:
+      h: view to photo, pixels; beyond the photo its edge is seen.
+      size: of the view, pixels.
+    """
+    n, side = size * SUPERSAMPLING, photo.shape[0]
+    at = (jnp.arange(n, dtype=jnp.float32) + 0.5) / SUPERSAMPLING - 0.5
+    xy = jnp.stack(jnp.meshgrid(at, at), axis=-1)
+    xy = jnp.clip(warp_points(h, xy).reshape(-1, 2), 0.0, side - 1.001)
+    low = jnp.floor(xy)
+    x, y = (xy - low)[:, :1], (xy - low)[:, 1:]
+    flat, index = photo.reshape(-1, 3), (low[:, 1] * side + low[:, 0]).astype(jnp.int32)
+    above = flat[index] * (1 - x) + flat[index + 1] * x
+    below = flat[index + side] * (1 - x) + flat[index + side + 1] * x
+    seen = (above * (1 - y) + below * y).reshape(size, SUPERSAMPLING, size, SUPERSAMPLING, 3)
+    return seen.mean(axis=(1, 3))
+
+
+def change_light(
+    key: PRNGKey, rgb: Float[Array, "h w 3"], strength: Float[Array, ""]
+) -> Float[Array, "h w 3"]:
+    """Another exposure, white balance, contrast, focus and sensor noise; 0 .. 255.
+
+    Args:
+      rgb: 0 .. 255.
+      strength: 1: exposures e^-1 to e^0.4, gains of channels e^0.3, contrast e^0.4, a blur of up to
+        1.2 px, noise of up to 6 grey levels; 0: none of it.
+    """
+    exposure, gains, contrast, focus, noisy, noise = jax.random.split(key, 6)
+
+    def draw(key, low, high, shape=()):
+        return strength * jax.random.uniform(key, shape, minval=low, maxval=high)
+
+    linear = (jnp.clip(rgb, 0.0, 255.0) / 255.0) ** 2.2
+    linear = linear * jnp.exp(draw(exposure, -1.0, 0.4)) * jnp.exp(draw(gains, -0.3, 0.3, (3,)))
+    value = blur(jnp.clip(linear, 0.0, 1.0), draw(focus, 0.0, 1.2)) ** (1 / 2.2)
+    value = 255.0 * ((value - 0.5) * jnp.exp(draw(contrast, -0.4, 0.4)) + 0.5)
+    value = value + draw(noisy, 0.0, 6.0) * jax.random.normal(noise, rgb.shape)
+    return jnp.clip(value, 0.0, 255.0)
+
+
+def view_pair(key: PRNGKey, photo: Float[Array, "s s 3"], *, size: int) -> ViewPair:
+    """Two views of a square crop of a photo: the first nearly as it is, the second through any
+    homography and under any light.
+
+    Args:
+      photo: 0 .. 255, RGB.
+      size: of the views, pixels; about half of the crop's, so that most views stay inside it.
+    """
+    keys = jax.random.split(key, 8)
+    half, side = (size - 1) / 2, photo.shape[0]
+    to_unit = jnp.asarray([[1 / half, 0, -1], [0, 1 / half, -1], [0, 0, 1]], jnp.float32)
+
+    def view_to_photo(key, place, strength):
+        shift = (side - 1) / 2 + jax.random.uniform(place, (2,), minval=-0.2, maxval=0.2) * half
+        to_photo = (jnp.eye(3) * half).at[:2, 2].set(shift).at[2, 2].set(1.0)
+        h = jnp.matmul(random_homography(key, strength), to_unit, precision=HIGHEST)
+        return jnp.matmul(to_photo, h, precision=HIGHEST)
+
+    h0 = view_to_photo(keys[0], keys[1], jnp.float32(0.2))
+    h1 = view_to_photo(keys[2], keys[3], jax.random.uniform(keys[4]))
+    view0 = change_light(keys[5], sample_view(photo, h0, size=size), jnp.float32(0.5))
+    seen = sample_view(photo, h1, size=size)
+    dark, severity = jax.random.uniform(keys[6], (2,))
+    view1 = jnp.where(
+        dark < NIGHT_SHARE,
+        night(keys[7], seen, MOST_SEVERE * severity),
+        change_light(keys[7], seen, jnp.float32(1.0)),
+    )
+    h = jnp.matmul(jnp.linalg.inv(h1), h0, precision=HIGHEST)
+    return ViewPair(jnp.round(view0), jnp.round(view1), h)

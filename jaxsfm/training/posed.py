@@ -1,0 +1,199 @@
+"""Epipolar supervision: real pairs of photos whose cameras are known.
+
+Photos are matched once, by the preset `paper`; matches whose cells lie near the true epipolar line
+are kept. A step takes windows of both photos around one of them, with all matches inside both.
+"""
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsfm.config import preset
+from jaxsfm.core.grid import FINE_STRIDE
+from jaxsfm.core.losses import CellPairs
+from jaxsfm.errors import UserError
+from jaxsfm.host.images import ImageFile, read_image
+from jaxsfm.host.intrinsics import Intrinsics, check_fits
+from jaxsfm.host.poses import CameraPose, Poses
+from jaxsfm.host.two_view import sampson_error
+from jaxsfm.host.weights import Weights
+from jaxsfm.pipeline import extract, match
+from jaxsfm.training.objective import Examples, walked_maps
+from jaxsfm.training.photos import DECODED, MAX_SIZE
+
+NEIGHBOURS = 3
+"""Photos that each photo is paired with: those taken from the nearest places, in its direction."""
+MIN_COSINE = 0.7
+"""Between the optical axes of a pair (45 deg)."""
+MAX_ERROR_PX = 8.0
+"""Largest distance of a match's cell centres to the epipolar geometry: a cell's side."""
+MIN_MATCHES = 50
+CAPACITY = 256
+"""Matches of a window."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Pair:
+    images: tuple[ImageFile, ImageFile]
+    f: np.ndarray
+    """float64 (3, 3): x1' F x0 = 0, working pixels."""
+    cells: tuple[np.ndarray, np.ndarray]
+    """int (n, 2) each: (row, column) of the matches."""
+
+
+class PosedPairs:
+    """Windows of pairs of photos with known cameras; those of a step depend on the step alone."""
+
+    def __init__(self, pairs: Sequence[_Pair], *, view: int, batch: int, seed: int) -> None:
+        self._pairs, self._view, self._batch, self._seed = list(pairs), view, batch, seed
+        self._read = functools.lru_cache(maxsize=DECODED)(_working)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what the windows are drawn from."""
+        whole = hashlib.sha256()
+        for pair in self._pairs:
+            whole.update("".join(image.sha256 for image in pair.images).encode())
+            whole.update(pair.f.tobytes())
+            whole.update(pair.cells[0].tobytes())
+        return whole.hexdigest()
+
+    def draw(self, step: int, weights: Weights) -> Examples:
+        """A step's windows, as the maps that keypoints walk through."""
+        rng = np.random.default_rng([self._seed, step])
+        windows = [self._window(rng) for _ in range(self._batch)]
+        views0, views1, cells, known = (list(part) for part in zip(*windows, strict=True))
+        maps = [_maps(weights, np.stack(views)) for views in (views0, views1)]
+        batch = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *cells)
+        return Examples(maps[0], maps[1], batch, jnp.asarray(np.stack(known), jnp.float32))
+
+    def _window(
+        self, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, CellPairs, np.ndarray]:
+        pair = self._pairs[int(rng.integers(len(self._pairs)))]
+        chosen = int(rng.integers(len(pair.cells[0])))
+        side = self._view // FINE_STRIDE
+        views, inside, starts = [], np.ones(len(pair.cells[0]), bool), []
+        for image, cells in zip(pair.images, pair.cells, strict=True):
+            rgb = self._read(image)
+            most = np.asarray(rgb.shape[:2]) // FINE_STRIDE - side
+            start = np.clip(cells[chosen] - side // 2, 0, most)
+            # The window's own border changes the maps by what the network cannot see beyond it.
+            inside &= ((cells > start) & (cells < start + side - 1)).all(axis=1)
+            row, col = FINE_STRIDE * start
+            views.append(rgb[row : row + self._view, col : col + self._view].astype(np.float32))
+            starts.append(start)
+        some = np.flatnonzero(inside)
+        some = rng.permutation(some)[:CAPACITY]
+        both = np.zeros((2, CAPACITY, 2), np.int32)
+        for k in (0, 1):
+            both[k, : len(some)] = pair.cells[k][some] - starts[k]
+        weight = (np.arange(CAPACITY) < len(some)).astype(np.float32)
+        shift = [np.eye(3), np.eye(3)]
+        for k in (0, 1):
+            shift[k][:2, 2] = FINE_STRIDE * starts[k][::-1]
+        f = shift[1].T @ pair.f @ shift[0]
+        return (
+            views[0],
+            views[1],
+            CellPairs(*map(jnp.asarray, (*both, weight))),
+            f / np.linalg.norm(f),
+        )
+
+
+def posed_pairs(
+    weights: Weights,
+    images: Sequence[ImageFile],
+    poses: Poses,
+    intrinsics: Intrinsics,
+    *,
+    view: int,
+    batch: int,
+    seed: int,
+) -> PosedPairs:
+    """Match the photos that have a pose with their neighbours.
+
+    Args:
+      intrinsics: one pinhole camera for all of them.
+      view: side of the windows, pixels.
+      batch: windows a step.
+
+    Raises:
+      UserError: no pair with enough matches, a camera with distortion, photos of several sizes.
+    """
+    images = [image for image in images if image.name in poses]
+    check_fits(intrinsics, {image.name: image.size for image in images})
+    if len(images) < 2:
+        raise UserError(f"--reference: {len(images)} of the photos have a pose; 2 are needed")
+    by_name = {image.name: image for image in images}
+    config = preset("paper")
+    config = dataclasses.replace(config, max_size=MAX_SIZE)
+    features = extract(weights, images, config=config)
+    found = match(features, _neighbours(by_name, poses), config=config, seed=seed)
+    pairs = []
+    for (a, b), result in sorted(found.items()):
+        files = (by_name[a], by_name[b])
+        columns = [int(features[name].dense.fine_grid[1]) for name in (a, b)]
+        cells = [
+            np.stack(np.divmod(result.cells[:, k].astype(np.int64), columns[k]), axis=1)
+            for k in (0, 1)
+        ]
+        k0, k1 = (_camera_matrix(intrinsics, features[name].scale) for name in (a, b))
+        f = _fundamental(poses[a], poses[b], k0, k1)
+        centres = [(cell[:, ::-1] + 0.5) * FINE_STRIDE - 0.5 for cell in cells]
+        near = np.abs(sampson_error(f, *centres)) < MAX_ERROR_PX
+        if near.sum() >= MIN_MATCHES:
+            pairs.append(_Pair(images=files, f=f, cells=(cells[0][near], cells[1][near])))
+    if not pairs:
+        raise UserError(
+            f"--reference: no two photos have {MIN_MATCHES} matches near their epipolar lines"
+        )
+    return PosedPairs(pairs, view=view, batch=batch, seed=seed)
+
+
+def _working(image: ImageFile) -> np.ndarray:
+    return read_image(image, max_size=MAX_SIZE).rgb
+
+
+def _maps(weights: Weights, views: np.ndarray) -> tuple[jax.Array, ...]:
+    return _walked(weights.params, jnp.asarray(views), preprocessing=weights.preprocessing)
+
+
+_walked = jax.jit(walked_maps, static_argnames=("preprocessing",))
+
+
+def _neighbours(images: dict[str, ImageFile], poses: Poses) -> set[tuple[str, str]]:
+    chosen = set()
+    for a in images:
+        seen = [
+            b for b in images if b != a and poses[a].rotation[2] @ poses[b].rotation[2] > MIN_COSINE
+        ]
+        seen.sort(key=lambda b: (float(np.linalg.norm(poses[a].centre - poses[b].centre)), b))
+        chosen |= {(min(a, b), max(a, b)) for b in seen[:NEIGHBOURS]}
+    return chosen
+
+
+def _camera_matrix(intrinsics: Intrinsics, scale: tuple[float, float]) -> np.ndarray:
+    """Of the working image; centre of the top-left pixel (0, 0)."""
+    if intrinsics.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        raise UserError(f"--intrinsics: training needs a pinhole camera; got {intrinsics.model}")
+    *focal, cx, cy = intrinsics.params
+    fx, fy = focal[0], focal[-1]
+    sx, sy = scale
+    return np.asarray([[fx / sx, 0, cx / sx - 0.5], [0, fy / sy, cy / sy - 0.5], [0, 0, 1]])
+
+
+def _fundamental(a: CameraPose, b: CameraPose, k0: np.ndarray, k1: np.ndarray) -> np.ndarray:
+    rotation = b.rotation @ a.rotation.T
+    x, y, z = b.rotation @ (a.centre - b.centre)
+    cross = np.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    f = np.linalg.inv(k1).T @ cross @ rotation @ np.linalg.inv(k0)
+    return f / np.linalg.norm(f)
