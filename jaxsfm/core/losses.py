@@ -112,9 +112,7 @@ def agreement(
       squared: distances d^2 of their places, pixels squared.
       sigma: how far apart places agree, pixels.
     """
-    agree = jnp.exp(-0.5 * squared / sigma**2)
-    first = jnp.einsum("mij,mj->mi", agree, _flat(walks1), precision=HIGHEST)
-    return jnp.sum(first * _flat(walks0), axis=-1)
+    return _mean_over_ends(walks0, walks1, jnp.exp(-0.5 * squared / sigma**2))
 
 
 def mean_distance(
@@ -128,8 +126,7 @@ def mean_distance(
     near = squared < most**2
     # The root's gradient at 0 is infinite; half a thousandth of a pixel is not.
     apart = jnp.where(near, jnp.sqrt(jnp.where(near, squared, 1.0) + 1e-6), most)
-    first = jnp.einsum("mij,mj->mi", apart, _flat(walks1), precision=HIGHEST)
-    return jnp.sum(first * _flat(walks0), axis=-1)
+    return _mean_over_ends(walks0, walks1, apart)
 
 
 def peakiness(walks: WalkProbabilities) -> Float[Array, " m"]:
@@ -147,6 +144,13 @@ def weighted_mean(values: Float[Array, " m"], weight: Float[Array, " m"]) -> Flo
     total = jnp.sum(weight)
     mean = jnp.sum(jnp.where(weight > 0, values, 0.0) * weight) / jnp.where(total > 0, total, 1.0)
     return jnp.where(total > 0, mean, 0.0)
+
+
+def _mean_over_ends(
+    walks0: WalkProbabilities, walks1: WalkProbabilities, values: Float[Array, "m n n"]
+) -> Float[Array, " m"]:
+    first = jnp.einsum("mij,mj->mi", values, _flat(walks1), precision=HIGHEST)
+    return jnp.sum(first * _flat(walks0), axis=-1)
 
 
 def _flat(walks: WalkProbabilities) -> Float[Array, "m n"]:

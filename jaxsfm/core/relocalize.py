@@ -40,7 +40,11 @@ class WalkProbabilities(NamedTuple):
     """(x, y) of the window's first cell; it may lie outside the map, where p is 0."""
 
 
-def _check(scores: Sequence[Array], children: int) -> None:
+def _check(
+    scores: Sequence[Array], children: int, temperature: Float[Array, ""] | float = 1.0
+) -> None:
+    if isinstance(temperature, float) and not temperature > 0:
+        raise ValueError(f"relocalize: temperature must be positive; got {temperature}")
     if not scores:
         raise ValueError("relocalize: at least one level is required; got none")
     if children < 2 or children % 2:
@@ -140,7 +144,7 @@ def walk(
 ) -> WalkProbabilities:
     """Where a random walk ends that takes every child with a probability in the ratio of
     score^(1 / temperature) within its block; arguments as `relocalize`."""
-    _check(scores, children)
+    _check(scores, children, temperature)
     first = _first_child(children)
     p = jnp.ones((row.shape[0], 1, 1), scores[0].dtype)
     row0, col0 = row, col
@@ -173,7 +177,7 @@ def _child_probabilities(
     cols = FACTOR * col0[:, None] + window
     h, w = level.shape
     clipped = (jnp.clip(rows, 0, h - 1)[:, :, None], jnp.clip(cols, 0, w - 1)[:, None, :])
-    logit = jnp.log(level + LEAST_SCORE)[clipped] / temperature
+    logit = jnp.log(level + LEAST_SCORE)[clipped]
     inside = ((rows >= 0) & (rows < h))[:, :, None] & ((cols >= 0) & (cols < w))[:, None, :]
     last = 2 * size - 1
     blocks = [
@@ -185,6 +189,9 @@ def _child_probabilities(
     reached = jnp.stack([inside[block] for block in blocks], axis=-1)
     # A cell outside the map may have no child inside; its own probability is zero.
     reached |= ~jnp.any(reached, axis=-1, keepdims=True)
+    # The best is 0 before the division: any temperature is cold enough, none too cold.
+    best = jnp.max(jnp.where(reached, logits, -jnp.inf), axis=-1, keepdims=True)
+    logits = (logits - lax.stop_gradient(best)) / temperature
     return jax.nn.softmax(logits, axis=-1, where=reached)
 
 

@@ -48,8 +48,10 @@ class Preprocessing(NamedTuple):
     std: tuple[float, float, float]
 
 
-def preprocess(image: UInt8[Array, "*b h w 3"], p: Preprocessing) -> Float[Array, "*b h w 3"]:
-    """RGB bytes to the network's input."""
+def preprocess(
+    image: UInt8[Array, "*b h w 3"] | Float[Array, "*b h w 3"], p: Preprocessing
+) -> Float[Array, "*b h w 3"]:
+    """RGB, 0 .. 255, to the network's input."""
     x = image.astype(jnp.float32) / p.scale
     return (x - jnp.asarray(p.mean, jnp.float32)) / jnp.asarray(p.std, jnp.float32)
 

@@ -24,7 +24,7 @@ from jaxsfm.core.numerics import squared_norm
 from jaxsfm.core.relocalize import relocalize, walk
 from jaxsfm.core.scores import heads_of, score
 from jaxsfm.core.types import PRNGKey
-from jaxsfm.core.vgg import VGG16, Preprocessing
+from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 from jaxsfm.core.views import view_pair, warp_points
 
 MATCH_ERROR_PX = 3.0
@@ -81,9 +81,7 @@ def walked_maps(
     params: dict, views: Float[Array, "b v v 3"], *, preprocessing: Preprocessing
 ) -> tuple[Array, ...]:
     """The maps that keypoints of whole views (0 .. 255) walk through."""
-    # As `preprocess`, which takes bytes.
-    x = views / preprocessing.scale
-    x = (x - jnp.asarray(preprocessing.mean)) / jnp.asarray(preprocessing.std)
+    x = preprocess(views, preprocessing)
     size = jnp.broadcast_to(jnp.asarray(views.shape[1:3], jnp.int32), (views.shape[0], 2))
     return VGG16().apply(params, x, size, method="walked")  # pyright: ignore[reportReturnType]
 
