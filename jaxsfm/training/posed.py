@@ -17,7 +17,7 @@ from jaxsfm.config import preset
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.core.losses import CellPairs
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import ImageFile, read_image
+from jaxsfm.host.images import ImageFile, read_image, working_size
 from jaxsfm.host.intrinsics import Intrinsics, check_fits
 from jaxsfm.host.poses import CameraPose, Poses
 from jaxsfm.host.two_view import sampson_error
@@ -129,10 +129,17 @@ def posed_pairs(
     Raises:
       UserError: no pair with enough matches, a camera with distortion, photos of several sizes.
     """
-    images = [image for image in images if image.name in poses]
+    images = [
+        image
+        for image in images
+        if image.name in poses and min(working_size(image.size, MAX_SIZE)) >= view
+    ]
     check_fits(intrinsics, {image.name: image.size for image in images})
     if len(images) < 2:
-        raise UserError(f"--reference: {len(images)} of the photos have a pose; 2 are needed")
+        raise UserError(
+            f"--reference: {len(images)} of the photos have a pose and {view} pixels a side; "
+            "2 are needed"
+        )
     by_name = {image.name: image for image in images}
     config = preset("paper")
     config = dataclasses.replace(config, max_size=MAX_SIZE)
