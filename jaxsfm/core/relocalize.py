@@ -187,10 +187,8 @@ def _child_probabilities(
     ]
     logits = jnp.stack([logit[block] for block in blocks], axis=-1)
     reached = jnp.stack([inside[block] for block in blocks], axis=-1)
-    # A cell outside the map may have no child inside; its own probability is zero.
-    reached |= ~jnp.any(reached, axis=-1, keepdims=True)
     # The best is 0 before the division: any temperature is cold enough, none too cold.
-    best = jnp.max(jnp.where(reached, logits, -jnp.inf), axis=-1, keepdims=True)
+    best = jnp.max(logits, axis=-1, keepdims=True, where=reached, initial=-jnp.inf)
     logits = (logits - lax.stop_gradient(best)) / temperature
     return jax.nn.softmax(logits, axis=-1, where=reached)
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.losses import sampson_distances
@@ -35,13 +35,8 @@ def soft_mutual(
     """
     seen = jnp.any(a != 0, axis=1)[:, None] & jnp.any(b != 0, axis=1)
     logits = jnp.matmul(a, b.T, precision=HIGHEST) / temperature
-    return _softmax(logits, seen, 1) * _softmax(logits, seen, 0)
-
-
-def _softmax(x: Float[Array, "n m"], seen: Bool[Array, "n m"], axis: int) -> Float[Array, "n m"]:
-    """Softmax over what is seen; a row without any is zero, with a finite gradient."""
-    some = jnp.any(seen, axis=axis, keepdims=True)
-    return jnp.where(seen, jax.nn.softmax(x, axis=axis, where=seen | ~some), 0.0)
+    there, back = (jax.nn.softmax(logits, axis=axis, where=seen) for axis in (1, 0))
+    return there * back
 
 
 def fundamental_matrix(

@@ -161,6 +161,15 @@ def test_cells_under_a_homography_hold_the_mapped_centres(seed):
             assert cells.cell1[k].tolist() == [int(y), int(x)]
 
 
+def test_cells_that_a_homography_turns_over_are_not_seen():
+    """Points behind the camera, whose coordinates lie inside the other view all the same."""
+    h = jnp.asarray([[-1.0, 0, 0], [0, -1, 0], [-1 / 30, 0, 1]])
+    cells = cells_under_homography(h, jnp.zeros((81, 2)), rows=9, cols=9)
+    assert not cells.weight.any()
+    front = cells_under_homography(-h, jnp.zeros((81, 2)), rows=9, cols=9)
+    np.testing.assert_array_equal(front.weight, cells.weight)
+
+
 def test_means_of_nothing_are_zero_and_have_finite_gradients():
     values = jnp.asarray([jnp.nan, 3.0, 5.0])
     assert float(weighted_mean(values, jnp.asarray([0.0, 1.0, 3.0]))) == 4.5
