@@ -119,11 +119,10 @@ def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monke
     shutil.copy(night, room / "night" / "again.png")
     made = scenes.simple_scene(room)
     assert len(made.subsets) == 2
-    for make, method in (
-        (daynight._rootsift_models, "rootsift"),
-        (daynight._dense_models, "paper"),
+    for runs in (
+        daynight._rootsift_models(made, tmp_path, 0, 1),
+        daynight._dense_models(made, tmp_path, "paper", 0, 1),
     ):
-        runs = make(made, tmp_path, method, 0, 1)
         for (poses, matches), subset in zip(runs, made.subsets, strict=True):
             assert subset.night in poses and set(poses) <= {*subset.day, subset.night}
             assert (matches is None) == (subset.night not in made.truth)
