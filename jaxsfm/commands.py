@@ -285,7 +285,6 @@ def weights(*, relocalizer: Path | None = None) -> int:
     Args:
       relocalizer: File of learned scores; default: jaxsfm's own.
     """
-    from jaxsfm.host.relocalizer import shipped_relocalizer
     from jaxsfm.host.weights import default_path, load_weights
 
     loaded = load_weights(relocalizer=relocalizer)
@@ -295,7 +294,7 @@ def weights(*, relocalizer: Path | None = None) -> int:
     print(f"family           {loaded.family}")
     print(f"preprocessing    RGB / {p.scale:g}, minus {p.mean}, divided by {p.std}")
     print(f"sha256           {loaded.sha256} (checked)")
-    learned = loaded.relocalizer or shipped_relocalizer()
+    learned = loaded.learned
     print(f"relocalizer      {relocalizer or 'of jaxsfm'}, for learned keypoints")
     print(f"sha256           {learned.sha256}")
     for name, value in learned.about.items():

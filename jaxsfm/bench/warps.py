@@ -15,7 +15,6 @@ import jax
 
 from jaxsfm.bench.common import Keep, spread, versions
 from jaxsfm.errors import UserError
-from jaxsfm.host.relocalizer import shipped_relocalizer
 from jaxsfm.host.weights import load_weights
 from jaxsfm.pipeline import open_images
 from jaxsfm.training.objective import mean_shares, shares, warped_examples
@@ -47,7 +46,7 @@ def bench_warps(
     if not images:
         raise UserError(f"--root {root}: no usable images")
     weights = load_weights(relocalizer=relocalizer)
-    learned = (weights.relocalizer or shipped_relocalizer()).params
+    learned = weights.learned.params
     warp = functools.partial(
         warped_examples, weights.params, preprocessing=weights.preprocessing, size=VIEW
     )

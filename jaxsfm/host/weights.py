@@ -42,11 +42,14 @@ class Weights:
     relocalizer: Relocalizer | None = None
     """For keypoints "learned"; None: the one that comes with jaxsfm."""
 
+    @property
+    def learned(self) -> Relocalizer:
+        """The one that learned keypoints are made with."""
+        return self.relocalizer or shipped_relocalizer()
+
     def chosen_relocalizer(self, config: Config) -> Relocalizer | None:
         """The one that the config's keypoints are made with; None: by no learned one."""
-        if config.keypoints != "learned":
-            return None
-        return self.relocalizer or shipped_relocalizer()
+        return self.learned if config.keypoints == "learned" else None
 
     def scores(self, config: Config) -> dict[str, Any] | None:
         """Its parameters."""

@@ -77,6 +77,7 @@ DISTANCES: dict[str, Callable[..., Array]] = {
 }
 
 
+@functools.partial(jax.jit, static_argnames=("preprocessing",))
 def walked_maps(
     params: dict, views: Float[Array, "b v v 3"], *, preprocessing: Preprocessing
 ) -> tuple[Array, ...]:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxsfm.config import preset
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.core.losses import CellPairs
+from jaxsfm.core.soft_matching import fundamental_matrix
 from jaxsfm.errors import UserError
 from jaxsfm.host.images import ImageFile, read_image, working_size
 from jaxsfm.host.intrinsics import Intrinsics, check_fits
@@ -71,7 +72,12 @@ class PosedPairs:
         rng = np.random.default_rng([self._seed, step])
         windows = [self._window(rng) for _ in range(self._batch)]
         views0, views1, cells, known = (list(part) for part in zip(*windows, strict=True))
-        maps = [_maps(weights, np.stack(views)) for views in (views0, views1)]
+        maps = [
+            walked_maps(
+                weights.params, jnp.asarray(np.stack(views)), preprocessing=weights.preprocessing
+            )
+            for views in (views0, views1)
+        ]
         batch = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *cells)
         return Examples(maps[0], maps[1], batch, jnp.asarray(np.stack(known), jnp.float32))
 
@@ -170,13 +176,6 @@ def _working(image: ImageFile) -> np.ndarray:
     return read_image(image, max_size=MAX_SIZE).rgb
 
 
-def _maps(weights: Weights, views: np.ndarray) -> tuple[jax.Array, ...]:
-    return _walked(weights.params, jnp.asarray(views), preprocessing=weights.preprocessing)
-
-
-_walked = jax.jit(walked_maps, static_argnames=("preprocessing",))
-
-
 def _neighbours(images: dict[str, ImageFile], poses: Poses) -> set[tuple[str, str]]:
     chosen = set()
     for a in images:
@@ -199,8 +198,6 @@ def _camera_matrix(intrinsics: Intrinsics, scale: tuple[float, float]) -> np.nda
 
 
 def _fundamental(a: CameraPose, b: CameraPose, k0: np.ndarray, k1: np.ndarray) -> np.ndarray:
-    rotation = b.rotation @ a.rotation.T
-    x, y, z = b.rotation @ (a.centre - b.centre)
-    cross = np.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    f = np.linalg.inv(k1).T @ cross @ rotation @ np.linalg.inv(k0)
-    return f / np.linalg.norm(f)
+    pose = b.rotation @ a.rotation.T, b.rotation @ (a.centre - b.centre)
+    f = fundamental_matrix(*(jnp.asarray(x, jnp.float32) for x in (k0, k1, *pose)))
+    return np.asarray(f / jnp.linalg.norm(f), np.float64)

@@ -155,7 +155,7 @@ def train_relocalizer(
         save_checkpoint(kept, state, {"of": about, "history": history})
 
     every = max(1, options.steps // 10)
-    start, figures = time.monotonic(), {}
+    start = time.monotonic()
     try:
         with tqdm(
             total=options.steps, initial=int(state.step), unit="step", disable=not progress
@@ -164,16 +164,19 @@ def train_relocalizer(
                 interrupt.check()
                 examples = warp(jax.random.fold_in(root, step), crops.draw(step, options.batch))
                 real = None if posed is None else posed.draw(step, weights)
-                state, figures = train_step(state, examples, real, options=options)
+                new, figures = train_step(state, examples, real, options=options)
+                rows = history
                 bar.set_postfix({k: f"{float(v):.3f}" for k, v in figures.items()})
-                bar.update()
                 if (step + 1) % every == 0 or step + 1 == options.steps:
                     found = mean_shares(
-                        [jax.device_get(shares(state.scores, some)) for some in measured]
+                        [jax.device_get(shares(new.scores, some)) for some in measured]
                     )
                     values = {k: round(float(v), 5) for k, v in figures.items()}
-                    history.append({"step": step + 1, **values, **found})
+                    rows = [*history, {"step": step + 1, **values, **found}]
                     tell(f"step {step + 1:4d}: {_within(found)}, loss {values['loss']:.3f}")
+                # Together, so that an interruption never keeps a step without its measurement.
+                state, history = new, rows
+                bar.update()
                 if (step + 1) % KEPT_EVERY == 0:
                     keep()
     except KeyboardInterrupt:

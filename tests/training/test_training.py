@@ -61,12 +61,14 @@ def test_training_lowers_the_loss_on_the_views_it_sees(weights, images, tmp_path
     assert losses[-1] < 0.85 * losses[0]
 
 
+@pytest.mark.parametrize(("at", "reached"), [("train_step", 3), ("mean_shares", 2)])
 def test_an_interrupted_training_ends_with_the_same_parameters(
-    weights, images, tmp_path, monkeypatch, few_measurements
+    weights, images, tmp_path, monkeypatch, few_measurements, at, reached
 ):
+    """In its fourth step, or while the third one is measured (after the norm rule and two)."""
     whole, parts = tmp_path / "whole.safetensors", tmp_path / "parts.safetensors"
     train_relocalizer(weights, images, whole, options=SMALL)
-    real, done = relocalizer.train_step, []
+    real, done = getattr(relocalizer, at), []
 
     def step(*args, **kwargs):
         if len(done) == 3:
@@ -74,14 +76,14 @@ def test_an_interrupted_training_ends_with_the_same_parameters(
         done.append(1)
         return real(*args, **kwargs)
 
-    monkeypatch.setattr(relocalizer, "train_step", step)
+    monkeypatch.setattr(relocalizer, at, step)
     with pytest.raises(KeyboardInterrupt):
         train_relocalizer(weights, images, parts, options=SMALL)
     assert not parts.exists()
-    monkeypatch.setattr(relocalizer, "train_step", real)
+    monkeypatch.setattr(relocalizer, at, real)
     told = []
     train_relocalizer(weights, images, parts, options=SMALL, tell=told.append)
-    assert "going on from step 3" in told[0]
+    assert f"going on from step {reached}" in told[0]
     assert parts.read_bytes() == whole.read_bytes()
     assert not list(tmp_path.glob("*.checkpoint"))
 
