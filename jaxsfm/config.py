@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 Keypoints = Literal["relocalized", "learned", "grid"]
 Convolutions = Literal["float32", "bfloat16"]
+BackboneName = Literal["vgg16", "vgg19", "alexnet"]
 OneToOne = Literal["first", "similarity"]
 
 
@@ -125,6 +126,8 @@ class Config:
     """Sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
     """Subtract an image's mean descriptor from its descriptors."""
+    backbone: BackboneName = "vgg16"
+    """The network (`jaxsfm.core.backbones`)."""
     convolutions: Convolutions = "float32"
     """What the network multiplies; sums are float32, then rounded alike. Meant for accelerators
     (where no gain has been measured yet); CPUs round and gain nothing."""
@@ -149,7 +152,15 @@ class Config:
 
     def extraction(self) -> "Config":
         """The part that an image's features depend on; the rest at its defaults."""
-        names = ("max_size", "enlarge", "octaves", "centred", "convolutions", "keypoints")
+        names = (
+            "max_size",
+            "enlarge",
+            "octaves",
+            "centred",
+            "backbone",
+            "convolutions",
+            "keypoints",
+        )
         return Config(**{name: getattr(self, name) for name in names})
 
     def matching(self) -> dict[str, object]:
@@ -168,6 +179,14 @@ class Config:
         if not 0 <= self.aligned_octaves <= MAX_OCTAVES:
             raise ValueError(
                 f"aligned_octaves must lie in 0..{MAX_OCTAVES}; got {self.aligned_octaves}"
+            )
+        if self.backbone not in get_args(BackboneName):
+            raise ValueError(
+                f"backbone must be one of {get_args(BackboneName)}; got {self.backbone!r}"
+            )
+        if self.keypoints == "learned" and self.backbone != "vgg16":
+            raise ValueError(
+                f"keypoints 'learned' are scored from maps of vgg16; got backbone {self.backbone!r}"
             )
         if self.convolutions not in ("float32", "bfloat16"):
             raise ValueError(

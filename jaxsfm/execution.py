@@ -16,10 +16,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxsfm.config import Config
+from jaxsfm.core.backbones import BACKBONES
 from jaxsfm.core.octaves import join_octaves, octave_capacity
 from jaxsfm.core.sharded import device_mesh
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 from jaxsfm.host.features import total_memory
@@ -84,18 +84,19 @@ def _bytes(tree: Any) -> int:
     return sum(int(np.prod(x.shape)) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
-def joined_bytes(num_coarse: int, *, octaves: int) -> int:
-    """Of one image's joined features, about 98 per working pixel with four octaves, 24 with one."""
+def joined_bytes(num_coarse: int, *, octaves: int, backbone: str = "vgg16") -> int:
+    """Of one image's joined features, of VGG about 98 per working pixel with four octaves, 24 with
+    one."""
+    network = BACKBONES[backbone]
 
     def blank() -> DenseFeatures:
-        def octave(cells: int, layer: str) -> tuple[jax.Array, ...]:
+        def octave(cells: int, channels: int) -> tuple[jax.Array, ...]:
             rooms = (octave_capacity(cells, k) for k in range(octaves))
-            return tuple(jnp.zeros((room, LAYERS[layer][1])) for room in rooms)
+            return tuple(jnp.zeros((room, channels)) for room in rooms)
 
-        fine, grid = 4 * num_coarse, jnp.zeros(2, jnp.int32)
-        return DenseFeatures(
-            octave(num_coarse, "conv4_3"), octave(fine, "conv3_3"), jnp.zeros((fine, 2)), grid, grid
-        )
+        coarse, fine = octave(num_coarse, network.coarse), octave(4 * num_coarse, network.fine)
+        grid = jnp.zeros(2, jnp.int32)
+        return DenseFeatures(coarse, fine, jnp.zeros((4 * num_coarse, 2)), grid, grid)
 
     return _bytes(jax.eval_shape(lambda: join_octaves(blank())))
 
@@ -110,7 +111,9 @@ def resident_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config
     else:
         budget = min(HOST_BYTES, HOST_SHARE * (total_memory() or HOST_BYTES / HOST_SHARE))
         budget /= mesh.size
-    return max(2, int(budget / joined_bytes(num_coarse, octaves=config.octaves)))
+    return max(
+        2, int(budget / joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone))
+    )
 
 
 ACCELERATOR_BYTES_PER_PIXEL = 3000
@@ -151,7 +154,7 @@ def pairs_at_once(
     """Pairs matched side by side on each device, of `count`."""
     # A batch copies both sides of its pairs, in half of what the images at hand leave.
     share = (1 - DEVICE_SHARE) / 2
-    joined = joined_bytes(num_coarse, octaves=config.octaves)
+    joined = joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone)
     each = 2 * joined + PAIR_BYTES_PER_CELL * num_coarse
     return _at_once(execution.pairs_at_once, mesh, share, each, MAX_PAIRS, count)
 

@@ -52,6 +52,7 @@ def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Ex
     return Extraction(
         preprocessing=weights.preprocessing,
         num_coarse=num_coarse,
+        backbone=config.backbone,
         relocalized=config.keypoints != "grid",
         octaves=config.octaves,
         centred=config.centred,

@@ -39,6 +39,48 @@ def vgg(params: dict, image: np.ndarray) -> list[np.ndarray]:
     return maps
 
 
+def windows(x: np.ndarray, side: int, stride: int, before: int, count: tuple[int, int]):
+    """(row, column) -> the side x side window that starts at stride * (row, column) - before; zero
+    outside x."""
+    after = side + stride * max(count)
+    padded = np.pad(x.astype(np.float64), ((before, after), (before, after), (0, 0)))
+    for r in range(count[0]):
+        for c in range(count[1]):
+            yield (r, c), padded[stride * r :, stride * c :][:side, :side]
+
+
+def alexnet(params: dict, image: np.ndarray) -> dict[str, np.ndarray]:
+    """The maps of an image: conv1 at every pixel, rectified and pooled; conv2; conv5."""
+
+    def convolve(x, name, stride, before, count):
+        kernel, bias = (
+            np.asarray(params["params"][name][k], np.float64) for k in ("kernel", "bias")
+        )
+        out = np.zeros((*count, len(bias)))
+        for at, window in windows(x, kernel.shape[0], stride, before, count):
+            out[at] = np.tensordot(window, kernel, 3) + bias
+        return out
+
+    def largest(x, side, before, count):
+        out = np.zeros((*count, x.shape[2]))
+        for at, window in windows(x, side, 2, before, count):
+            out[at] = window.max((0, 1))
+        return out
+
+    h, w = image.shape[:2]
+    maps = {"conv1": convolve(image, "conv1", 1, 5, (h, w))}
+    for name, side in (("two", 2), ("four", 4)):
+        last = maps["conv1"] if side == 2 else maps["two"]
+        maps[name] = largest(np.maximum(last, 0), 2, 0, (h // side, w // side))
+    x = np.maximum(convolve(image, "conv1", 4, 5, (h // 4, w // 4)), 0)
+    x = largest(x, 3, 0, (h // 8, w // 8))
+    maps["conv2"] = x = np.maximum(convolve(x, "conv2", 1, 2, x.shape[:2]), 0)
+    x = largest(x, 3, 1, (h // 16, w // 16))
+    for name in ("conv3", "conv4", "conv5"):
+        x = np.maximum(convolve(x, name, 1, 1, x.shape[:2]), 0)
+    return maps | {"conv5": x}
+
+
 def children_of(shape, row: int, col: int, k: int) -> list[tuple[int, int]]:
     """The k x k cells around the 2 x 2 below a cell, in row order, as far as there are any."""
     first = -(k - 2) // 2

@@ -54,7 +54,7 @@ def _library(
     )
 
 
-def _rounded(x: Array, bfloat16: bool) -> Array:
+def rounded(x: Array, bfloat16: bool) -> Array:
     """As bfloat16 has it: CPUs multiply float32 and get what accelerators get."""
     return lax.reduce_precision(x, exponent_bits=8, mantissa_bits=7) if bfloat16 else x
 
@@ -71,10 +71,10 @@ def conv(
     small = channels < WINOGRAD_CHANNELS or height * width < WINOGRAD_PIXELS
 
     def on_cpu(x, kernel):
-        x, kernel = _rounded(x, bfloat16), _rounded(kernel, bfloat16)
+        x, kernel = rounded(x, bfloat16), rounded(kernel, bfloat16)
         if small:
-            return _rounded(_library(x, kernel), bfloat16)
-        return _rounded(lax.map(lambda image: conv3x3(image, kernel), x), bfloat16)
+            return rounded(_library(x, kernel), bfloat16)
+        return rounded(lax.map(lambda image: conv3x3(image, kernel), x), bfloat16)
 
     def elsewhere(x, kernel):
         if not bfloat16:
@@ -154,8 +154,8 @@ def _strips(
     def strip(start):
         y = lax.dynamic_slice_in_dim(padded, start, rows + 2 * depth)[None]
         for margin, layer in zip(reversed(range(depth)), layers, strict=True):
-            y = _rounded(nn.relu(y) if margin + 1 < depth else y, bfloat16)
-            y = _rounded(_library(y, _rounded(layer.kernel, bfloat16), rows=0), bfloat16)
+            y = rounded(nn.relu(y) if margin + 1 < depth else y, bfloat16)
+            y = rounded(_library(y, rounded(layer.kernel, bfloat16), rows=0), bfloat16)
             row = start - margin + jnp.arange(rows + 2 * margin, dtype=jnp.int32)
             inside = ((row >= 0) & (row < size[0]))[:, None] & columns
             y = jnp.where(inside[:, :, None], y + layer.bias, 0.0)

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
+from jaxsfm.core.backbones import BACKBONES
 from jaxsfm.core.grid import COARSE_STRIDE, FINE_STRIDE, cell_rows_cols, cell_to_px
 from jaxsfm.core.numerics import squared_norm, unit
 from jaxsfm.core.octaves import halve, octave_capacity
 from jaxsfm.core.relocalize import relocalize
 from jaxsfm.core.scores import heads_of
 from jaxsfm.core.types import DenseFeatures, Levels
-from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
+from jaxsfm.core.vgg import Preprocessing, preprocess
 
 LEAST_DIFFERENCE = 1e-3
 """Between a unit descriptor and its image's mean, for the descriptor to count."""
@@ -26,6 +27,8 @@ class Extraction(NamedTuple):
     preprocessing: Preprocessing
     num_coarse: int
     """Capacity of the first octave; there are four times as many fine cells."""
+    backbone: str = "vgg16"
+    """One of `jaxsfm.core.backbones.BACKBONES`."""
     relocalized: bool = True
     octaves: int = 1
     centred: bool = False
@@ -61,8 +64,6 @@ def dense_features(
     centred: bool = False,
 ) -> DenseFeatures:
     """Descriptors and keypoints of an image from its maps, each with batch axis 1.
-
-    Any backbone with maps of halving size can stand in for VGG here.
 
     Args:
       octaves: of the image, of the image at half its size, ...
@@ -119,11 +120,11 @@ def extract(
     Both padded sides must be multiples of 2^(octaves - 1).
 
     Args:
-      params: of `VGG16`.
+      params: of the backbone.
       scores: of `jaxsfm.core.scores.Scores`, for keypoints; None: the norm rule.
     """
     x = preprocess(image, settings.preprocessing)
-    network = VGG16(settings.bfloat16)
+    network = BACKBONES[settings.backbone].module(bfloat16=settings.bfloat16)
     levels: list[Levels] = []
     for k in range(settings.octaves):
         # Keypoints are the first octave's.

@@ -30,8 +30,10 @@ class Levels(NamedTuple):
     scores: tuple[Float[Array, "b h w"], Float[Array, "b h2 w2"], Float[Array, "b h4 w4"]]
     """What relocalization walks by: squared norms of the cells of conv1_2, pool1 and pool2, or
     learned scores."""
-    pool3: Float[Array, "b h8 w8 256"]
-    pool4: Float[Array, "b h16 w16 512"]
+    pool3: Float[Array, "b h8 w8 d"]
+    """Fine descriptors, not normalised; of another backbone than VGG its map of that stride."""
+    pool4: Float[Array, "b h16 w16 c"]
+    """Coarse ones."""
 
 
 class DenseFeatures(NamedTuple):

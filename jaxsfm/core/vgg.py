@@ -1,15 +1,15 @@
-"""VGG-16 up to the pooling of conv5, as a flax module with the canonical layer names.
+"""VGG-16 and VGG-19 up to the pooling of conv5, as flax modules with the canonical layer names.
 
 Images may be padded at the bottom and on the right: after every convolution the rows and columns
 past the valid size are set to zero again, so that the valid part equals what the unpadded image
 gives (zero padding is what the network's own borders use). Pooling floors, as MatConvNet and
 PyTorch do.
 
-Source: Simonyan and Zisserman 2015, configuration D.
+Source: Simonyan and Zisserman 2015, configurations D and E.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -20,21 +20,31 @@ from jaxsfm.core.blocks import Layer, clear_padding, convolve, pool, scores_and_
 from jaxsfm.core.scores import Head, score
 from jaxsfm.core.types import Levels, Pyramid
 
-BLOCKS: tuple[tuple[int, ...], ...] = (
+Blocks = tuple[tuple[int, ...], ...]
+BLOCKS: Blocks = (
     (64, 64),
     (128, 128),
     (256, 256, 256),
     (512, 512, 512),
     (512, 512, 512),
 )
-LAYERS: dict[str, tuple[int, int]] = {}
-"""Layer name -> (input channels, output channels)."""
-_channels = 3
-for _block, _widths in enumerate(BLOCKS, start=1):
-    for _conv, _width in enumerate(_widths, start=1):
-        LAYERS[f"conv{_block}_{_conv}"] = (_channels, _width)
-        _channels = _width
+"""Of VGG-16: the channels of every convolution of every block."""
+BLOCKS_19: Blocks = tuple((*block, block[-1]) if len(block) == 3 else block for block in BLOCKS)
+"""Of VGG-19: a convolution more in each of the last three."""
 
+
+def layers_of(blocks: Blocks) -> dict[str, tuple[int, int]]:
+    """Layer name -> (input channels, output channels)."""
+    layers, channels = {}, 3
+    for block, widths in enumerate(blocks, start=1):
+        for conv, width in enumerate(widths, start=1):
+            layers[f"conv{block}_{conv}"] = (channels, width)
+            channels = width
+    return layers
+
+
+LAYERS = layers_of(BLOCKS)
+"""Of VGG-16."""
 
 LARGE_BLOCKS = 2
 """Those whose maps CPUs compute strip by strip; the third gains nothing."""
@@ -71,22 +81,24 @@ class Parameters(nn.Module):
         return Layer(jnp.asarray(kernel), jnp.asarray(bias))
 
 
-class VGG16(nn.Module):
+class VGG(nn.Module):
     """`apply(params, images, size)` -> Pyramid, all maps up to pool5; pure.
 
     With `method="levels"` -> Levels: what features are made of, without the largest maps.
     """
 
+    blocks: ClassVar[Blocks]
     bfloat16: bool = False
     """Convolutions of bfloat16 (`jaxsfm.core.blocks.conv`)."""
 
     def setup(self) -> None:
-        """Thirteen layers with the canonical names."""
-        for name, shape in LAYERS.items():
+        """All layers, with the canonical names."""
+        for name, shape in layers_of(self.blocks).items():
             setattr(self, name, Parameters(*shape))
 
     def _layers(self, block: int) -> list[Layer]:
-        return [getattr(self, f"conv{block}_{k + 1}")() for k in range(len(BLOCKS[block - 1]))]
+        count = len(self.blocks[block - 1])
+        return [getattr(self, f"conv{block}_{k + 1}")() for k in range(count)]
 
     def __call__(self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]) -> Pyramid:
         """Feature maps of preprocessed images.
@@ -97,7 +109,7 @@ class VGG16(nn.Module):
         """
         x = clear_padding(images, size)
         maps: list[Array] = []
-        for block in range(1, len(BLOCKS) + 1):
+        for block in range(1, len(self.blocks) + 1):
             last = convolve(x, size, self._layers(block), bfloat16=self.bfloat16)
             if block == 1:
                 maps.append(last)
@@ -146,6 +158,18 @@ class VGG16(nn.Module):
         size = size // 2
         pool2 = pool(convolve(pool1, size, self._layers(2), bfloat16=self.bfloat16), size)
         return conv1_2, pool1, pool2
+
+
+class VGG16(VGG):
+    """Thirteen convolutions."""
+
+    blocks = BLOCKS
+
+
+class VGG19(VGG):
+    """Sixteen convolutions."""
+
+    blocks = BLOCKS_19
 
 
 def init_shapes() -> dict:
