@@ -7,7 +7,7 @@ comma := ,
 GPU := $(if $(shell command -v nvidia-smi 2>/dev/null),$(comma)cuda)
 WORKERS ?= 2
 
-.PHONY: demo test check lint clean
+.PHONY: demo test check lint docs clean
 
 demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the truth
 	$(BIN)/jaxsfm demo
@@ -20,6 +20,9 @@ lint: $(VENV)/.dev ## format, style, layers, types
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+docs: $(VENV)/.dev ## the documentation's site, in build/site
+	$(BIN)/zensical build --strict
 
 check: lint test ## what must pass before a commit
 
