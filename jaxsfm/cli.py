@@ -12,6 +12,7 @@ import tyro
 
 from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, wxbs
 from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
+from jaxsfm.data_commands import data
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
@@ -46,6 +47,7 @@ COMMANDS = {
     "demo": demo,
     "weights": weights,
     "train": train,
+    "data": data,
     "bench": bench,
 }
 

@@ -1,0 +1,86 @@
+"""`jaxsfm data`: public data sets for the benchmarks."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from jaxsfm.errors import UserError
+
+Positional = tyro.conf.Positional
+
+
+def list_all(*, to: Path | None = None) -> int:
+    """Which there are, their sizes and terms, and which are there.
+
+    Args:
+      to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
+    """
+    from jaxsfm import datasets
+
+    for name, data_set in datasets.DATA_SETS.items():
+        here = "there" if datasets.is_complete(name, to) else "not fetched"
+        hashed = all(file.known_hash for file in data_set.files)
+        print(f"{name:10s} {here}; {data_set.size}; for jaxsfm bench {data_set.bench}")
+        print(f"{'':10s} {data_set.title}")
+        print(f"{'':10s} {data_set.page}; terms: {data_set.terms}")
+        print(
+            f"{'':10s} {'hash known' if hashed else 'no published hash: that of what came is kept'}"
+        )
+    print(f"folder     {to or datasets.data_folder()}")
+    return 0
+
+
+def fetch(name: Positional[str], *, to: Path | None = None) -> int:
+    """Download a data set; an interrupted download goes on.
+
+    Args:
+      name: Of the data set (jaxsfm data list).
+      to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
+    """
+    from tqdm import tqdm
+
+    from jaxsfm import datasets
+
+    with tqdm(unit="B", unit_scale=True, unit_divisor=1000) as bar:
+
+        def on_file(file: datasets.RemoteFile, k: int, count: int):
+            bar.set_description(f"{Path(file.name).name} ({k + 1} of {count})")
+            bar.reset(total=None)
+
+            def on_bytes(done: int, total: int | None) -> None:
+                bar.total = total
+                bar.update(done - bar.n)
+
+            return on_bytes
+
+        path = datasets.fetch(name, to, on_file=on_file)
+    print(path)
+    return 0
+
+
+def path(name: Positional[str], *, to: Path | None = None) -> int:
+    """The folder to give to a benchmark's --root.
+
+    Args:
+      name: Of the data set (jaxsfm data list).
+      to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
+    """
+    from jaxsfm import datasets
+
+    print(datasets.path_of(name, to))
+    return 0
+
+
+_Data = (
+    Annotated[Any, tyro.conf.subcommand("list", constructor=list_all)]
+    | Annotated[Any, tyro.conf.subcommand("fetch", constructor=fetch)]
+    | Annotated[Any, tyro.conf.subcommand("path", constructor=path)]
+)
+
+
+def data(result: _Data) -> int:  # pyright: ignore[reportInvalidTypeForm]
+    """Public data sets for the benchmarks."""
+    if not isinstance(result, int):
+        raise UserError("data: list, fetch or path")
+    return result
