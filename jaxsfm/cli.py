@@ -4,12 +4,16 @@ import functools
 import logging
 import operator
 import os
+import platform
+import re
 import sys
 import threading
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import tyro
 
+from jaxsfm.bench.common import versions
 from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, wxbs
 from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
 from jaxsfm.data_commands import data
@@ -17,6 +21,16 @@ from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.train_commands import train
+
+_WRAPPED = re.compile(r"\n {8,}(?=[^\s$])")
+"""A line of an argument's description that goes on; examples start with $."""
+
+
+def _unwrapped(command: Callable[..., Any]) -> Callable[..., Any]:
+    """With every argument's description on one line: tyro wraps by itself and keeps our ends."""
+    command.__doc__ = _WRAPPED.sub(" ", command.__doc__ or "")
+    return command
+
 
 BENCHMARKS = {
     "strecha": strecha,
@@ -29,7 +43,7 @@ BENCHMARKS = {
 _Benchmark = functools.reduce(
     operator.or_,
     (
-        Annotated[Any, tyro.conf.subcommand(name, constructor=command)]
+        Annotated[Any, tyro.conf.subcommand(name, constructor=_unwrapped(command))]
         for name, command in BENCHMARKS.items()
     ),
 )
@@ -40,6 +54,14 @@ def bench(result: _Benchmark) -> int:  # pyright: ignore[reportInvalidTypeForm]
     return result
 
 
+DESCRIPTION = """Structure-from-Motion from dense VGG-16 features with relocalization.
+
+For example
+    $ jaxsfm demo
+    $ jaxsfm reconstruct PHOTOS --out OUT
+
+jaxsfm --version tells versions; jaxsfm --tyro-print-completion bash (or zsh, tcsh) prints a script
+that completes commands and options."""
 COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
@@ -52,8 +74,18 @@ COMMANDS = {
 }
 
 
+def version_lines() -> list[str]:
+    """jaxsfm's own version and those of what its results depend on."""
+    found = versions()
+    lines = [f"jaxsfm {found.pop('jaxsfm')}", f"  python {platform.python_version()}"]
+    return lines + [f"  {name} {version}" for name, version in found.items()]
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit status (2: what was given cannot be used)."""
+    if (sys.argv[1:] if argv is None else argv) == ["--version"]:
+        print("\n".join(version_lines()))
+        return 0
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("jaxsfm: %(message)s"))
     logger = logging.getLogger("jaxsfm")
@@ -63,9 +95,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with interrupt.noted():
             return tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
+                {name: _unwrapped(command) for name, command in COMMANDS.items()},
                 prog="jaxsfm",
-                description="Structure-from-Motion from dense VGG-16 features with relocalization.",
+                description=DESCRIPTION,
                 args=argv,
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
             )

@@ -1,6 +1,8 @@
 """Every option has an effect; bad input gets one sentence and no traceback."""
 
+import importlib.metadata
 import json
+import re
 import shutil
 import sqlite3
 from pathlib import Path
@@ -9,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxsfm.cli import main
+from jaxsfm.cli import BENCHMARKS, COMMANDS, main
 
 SIZE = (320, 240)
 
@@ -472,3 +474,20 @@ def test_names_too_long_for_the_system_are_one_sentence(scene, tmp_path, capsys,
     assert main(["reconstruct", str(scene / "images"), *flat]) == 2
     error = capsys.readouterr().err
     assert error.startswith("jaxsfm: ") and "x" * 300 in error and "Traceback" not in error
+
+
+def test_the_version_and_a_completion_script_are_printed(capsys):
+    assert main(["--version"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"jaxsfm {importlib.metadata.version('jaxsfm')}"
+    assert any(line.strip().startswith("jax ") for line in lines)
+    with pytest.raises(SystemExit) as ended:
+        main(["--tyro-print-completion", "bash"])
+    assert ended.value.code in (0, None) and "reconstruct" in capsys.readouterr().out
+
+
+def test_no_description_of_an_option_is_broken_where_the_source_wraps():
+    for command in (*COMMANDS.values(), *BENCHMARKS.values()):
+        arguments = (command.__doc__ or "").partition("Args:")[2]
+        assert not re.search(r"\n {8}", arguments), command.__name__
+    assert "Longer side of the working images, pixels.\n" in (COMMANDS["reconstruct"].__doc__ or "")

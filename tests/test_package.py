@@ -33,9 +33,7 @@ def built(tmp_path_factory) -> Path:
     """sdist, and the wheel made of it: what is not in the sdist is not in the wheel."""
     pytest.importorskip("build")
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
-    for name in ("git ls-files",):
-        tracked = run(*name.split(), cwd=ROOT).splitlines()
-    for name in tracked:
+    for name in run("git", "ls-files", cwd=ROOT).splitlines():
         if (ROOT / name).is_file() and not name.startswith("docs/"):
             (source / name).parent.mkdir(parents=True, exist_ok=True)
             (source / name).write_bytes((ROOT / name).read_bytes())
@@ -63,7 +61,7 @@ def test_a_wheel_works_in_an_environment_of_its_own(built, tmp_path):
     site = next((place / "lib").glob("python*/site-packages"))
     (wheel,) = built.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(site)
-    others = [p for p in (sysconfig.get_path("purelib"), sysconfig.get_path("platlib"))]
+    others = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
     (site / "others.pth").write_text("\n".join(dict.fromkeys(others)))
     where = run(python, "-c", "import jaxsfm; print(jaxsfm.__file__)", cwd=tmp_path)
     assert Path(where.strip()).is_relative_to(site.resolve()) or str(site) in where
