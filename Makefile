@@ -9,8 +9,9 @@ WORKERS ?= 2
 
 .PHONY: demo test check lint docs clean
 
-demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the truth
-	$(BIN)/jaxsfm demo
+demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the truth, in demo/
+	rm -rf demo
+	$(BIN)/jaxsfm demo --out demo
 
 test: $(VENV)/.dev ## all tests
 	$(BIN)/python -m pytest -n $(WORKERS)
