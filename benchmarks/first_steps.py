@@ -89,7 +89,8 @@ def main() -> None:
     head = [
         "# First steps, as they went",
         "",
-        f"Written by `python -m benchmarks.first_steps PHOTOS` on {os.cpu_count()} CPU cores, no GPU, "
+        "Written by `python -m benchmarks.first_steps PHOTOS PAGE` on "
+        f"{os.cpu_count()} CPU cores, no GPU, "
         f"Python {platform.python_version()}; the photos are those of "
         f"{args.photos.resolve().parent.name}.",
         "",
