@@ -21,7 +21,7 @@ from jaxsfm.host.formats.lens import (
     registered_images,
 )
 
-MAX_ERROR_PX = 0.5
+MAX_ERROR_PX = 1.0
 """Of the undistortion, anywhere in the image."""
 
 
@@ -29,14 +29,17 @@ def undistortion(lens: Lens) -> float:
     """The r that undoes k1 and k2 best over the image.
 
     Raises:
-      UserError: it leaves more than half a pixel.
+      UserError: it leaves more than a pixel at the corners.
     """
     k1, k2 = lens.radial[:2]
     if k1 == k2 == 0:
         return 0.0
     focal = min(lens.fx, lens.fy)
-    true = np.linspace(0, lens.corner_px / focal, 200)
+    corner = lens.corner_px / focal
+    true = np.linspace(0, 2 * corner, 1000)
     measured = true * (1 + k1 * true**2 + k2 * true**4)
+    end = int(np.argmax(measured >= corner)) or int(np.argmax(measured)) + 1
+    true, measured = true[:end], measured[:end]
     r = float((measured**3 @ (true - measured)) / (measured**3 @ measured**3))
     error = np.abs(measured * (1 + r * measured**2) - true).max() * focal
     if not error < MAX_ERROR_PX:
