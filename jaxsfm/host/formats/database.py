@@ -68,8 +68,11 @@ def read_database(path: Path, *, where: str) -> Tables:
     """
     if not path.is_file():
         raise UserError(f"{where}: no such file")
+    # COLMAP's databases keep a log beside them: sqlite3 would make one even to read, unless told
+    # that nobody writes. A log that is there already holds what is not in the file yet.
+    how = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
     try:
-        address = f"file:{quote(str(path.absolute()), errors='surrogateescape')}?mode=ro"
+        address = f"file:{quote(str(path.absolute()), errors='surrogateescape')}?{how}"
         with closing(sqlite3.connect(address, uri=True)) as db:
             return _read(db, where)
     except _DAMAGED as error:

@@ -28,6 +28,8 @@ from jaxsfm.host.images import shown_name
 from jaxsfm.host.pairs import Pair, describe
 
 FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
+MAX_COLUMNS = 16
+"""Of keypoints: a file that claims more is damaged."""
 # h5py raises whatever the damage leads to; SystemError where a read failed half-way.
 _DAMAGED = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, SystemError)
 
@@ -92,7 +94,8 @@ def _dataset(group: Any, key: str, where: str, max_rows: int) -> np.ndarray:
     found = group.get(key)
     if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu":
         raise UserError(f"{where}: no numbers {key!r}")
-    if not 1 <= found.ndim <= 2 or found.shape[0] > max_rows or found.shape[-1] > MAX_KEYPOINTS:
+    columns = found.shape[1] if found.ndim == 2 else 1
+    if not 1 <= found.ndim <= 2 or found.shape[0] > max_rows or columns > MAX_COLUMNS:
         raise UserError(f"{where}: {key} has the shape {found.shape}")
     return np.asarray(found)
 
