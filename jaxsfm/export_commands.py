@@ -158,20 +158,25 @@ def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -
 
 
 def _export_openmvg(run: Path, folder: Path, images: Path | None) -> None:
-    from jaxsfm.host.colmap import read_images
+    from jaxsfm.host.formats.lens import camera_of
     from jaxsfm.host.formats.openmvg import sfm_data, write_openmvg
+    from jaxsfm.host.poses import find_model, read_model
 
     tables = _tables(run)
-    cameras = {}
+    cameras, model = {}, None
     if tables is not None:
-        cameras = {name: camera for name, (_, camera) in read_images(run / "database.db").items()}
-    model = None
+        cameras = {
+            name: camera_of(row, tables.sizes[name], f"{run / 'database.db'}")
+            for name, row in tables.cameras.items()
+        }
     try:
-        model = _model(run)
-        cameras |= {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    except UserError:
+        found = find_model(run)
+    except UserError:  # views and matches are enough for OpenMVG to start from
         if tables is None:
             raise
+    else:
+        model = read_model(found)
+        cameras |= {image.name: model.camera(image.camera_id) for image in model.images.values()}
     root = None if images is None else images.absolute()
     write_openmvg(folder, sfm_data(cameras, model, root), tables)
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.host.formats.database import read_database
-from jaxsfm.host.formats.tables import Tables, one_to_one
+from jaxsfm.host.formats.tables import CameraRow, Tables, one_to_one
 from jaxsfm.host.images import ImageFile, shown_name
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, describe
@@ -90,8 +90,8 @@ def _checked(
                 f"{where}: {shown_name(name)} is {_by(tables.sizes[name])} pixels there, "
                 f"but the photo {_by(size)}"
             )
-        if intrinsics is not None and name in tables.focals:
-            _check_focal(tables.focals[name], intrinsics, where, name)
+        if intrinsics is not None and name in tables.cameras:
+            _check_focal(tables.cameras[name], intrinsics, where, name)
         inside = np.clip(
             tables.keypoints[name], -0.5, np.asarray(size, np.float32) - np.float32(0.5)
         )
@@ -128,8 +128,10 @@ def _by(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"
 
 
-def _check_focal(focal: float, intrinsics: Intrinsics, where: str, name: str) -> None:
-    ours = intrinsics.params[0]
+def _check_focal(camera: CameraRow, intrinsics: Intrinsics, where: str, name: str) -> None:
+    if not (camera.known and camera.params):
+        return
+    focal, ours = camera.params[0], intrinsics.params[0]
     if not ours / FOCAL_RATIO < focal < ours * FOCAL_RATIO:
         raise UserError(
             f"{where}: {shown_name(name)} has a focal length of {focal:g} pixels there, "

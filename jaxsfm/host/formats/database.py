@@ -14,7 +14,13 @@ from urllib.parse import quote
 import numpy as np
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.formats.tables import MAX_KEYPOINTS, Tables, checked_keypoints, checked_matches
+from jaxsfm.host.formats.tables import (
+    MAX_KEYPOINTS,
+    CameraRow,
+    Tables,
+    checked_keypoints,
+    checked_matches,
+)
 from jaxsfm.host.images import shown_name
 from jaxsfm.host.pairs import Pair
 
@@ -81,20 +87,20 @@ def read_database(path: Path, *, where: str) -> Tables:
 
 def _read(db: sqlite3.Connection, where: str) -> Tables:
     cameras = {
-        camera_id: ((width, height), np.frombuffer(params or b"", np.float64), known)
-        for camera_id, width, height, params, known in db.execute(
-            "SELECT camera_id, width, height, params, prior_focal_length FROM cameras"
+        camera_id: (
+            (int(width), int(height)),
+            CameraRow(int(model), tuple(np.frombuffer(params).tolist()), bool(known)),
+        )
+        for camera_id, model, width, height, params, known in db.execute(
+            "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras"
         )
     }
-    names, sizes, focals = {}, {}, {}
+    names, sizes, own_cameras = {}, {}, {}
     for image_id, name, camera_id in db.execute("SELECT image_id, name, camera_id FROM images"):
         if not isinstance(name, str) or name in sizes:
             raise UserError(f"{where}: damaged: two images {name!r}")
         names[image_id] = name
-        size, params, known = cameras[camera_id]
-        sizes[name] = (int(size[0]), int(size[1]))
-        if known and len(params):
-            focals[name] = float(params[0])
+        sizes[name], own_cameras[name] = cameras[camera_id]
     keypoints = {}
     for image_id, rows, columns, data in db.execute(
         "SELECT image_id, rows, cols, data FROM keypoints"
@@ -108,4 +114,4 @@ def _read(db: sqlite3.Connection, where: str) -> Tables:
         dict(_pairs(db, table, names, keypoints, where))
         for table in ("matches", "two_view_geometries")
     ]
-    return Tables(sizes, focals, keypoints, tables[0], tables[1])
+    return Tables(sizes, own_cameras, keypoints, tables[0], tables[1])

@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.formats.tables import CameraRow
 from jaxsfm.host.images import shown_name
 
 TOLERANCE_PX = 0.01
@@ -40,6 +41,25 @@ class Lens(NamedTuple):
         """From the principal point to the farthest corner."""
         width, height = self.size
         return float(np.hypot(max(self.cx, width - self.cx), max(self.cy, height - self.cy)))
+
+
+def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Camera:
+    """A database's camera.
+
+    Args:
+      where: how messages begin.
+
+    Raises:
+      UserError: no such model, or other parameters than it has.
+    """
+    try:
+        model = pycolmap.CameraModelId(row.model)
+        camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=row.params)
+        if camera.verify_params():
+            return camera
+    except (ValueError, TypeError):
+        pass
+    raise UserError(f"{where}: a camera of model {row.model} with {len(row.params)} parameters")
 
 
 def lens_of(camera: pycolmap.Camera, to: str) -> Lens:

@@ -12,13 +12,24 @@ MAX_KEYPOINTS = 10_000_000
 """Of one image; a file that claims more is damaged."""
 
 
+class CameraRow(NamedTuple):
+    """A camera as COLMAP's database has it."""
+
+    model: int
+    """COLMAP's number of the camera model."""
+    params: tuple[float, ...]
+    """COLMAP's pixels; the focal length in x comes first."""
+    known: bool
+    """The focal length was known before mapping."""
+
+
 class Tables(NamedTuple):
     """What was matched, whoever matched it."""
 
     sizes: dict[str, tuple[int, int]]
     """Image name -> (width, height), of the images whose size is told."""
-    focals: dict[str, float]
-    """Image name -> focal length in x, pixels, where it was known before mapping."""
+    cameras: dict[str, CameraRow]
+    """By image name; empty where the file has none."""
     keypoints: dict[str, np.ndarray]
     """float32 (n, 2): (x, y), original pixels, centre of the top-left pixel (0, 0)."""
     matches: dict[Pair, np.ndarray]
