@@ -105,8 +105,7 @@ def reconstruct(
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.
       pairs: exhaustive, or a file with two image names a line.
       best_pairs: Hand on only each image's N pairs with the most inliers.
-      view_graph: Whether to hand on only pairs whose rotations agree with stronger pairs (scenes
-        that repeat themselves).
+      view_graph: Hand on only pairs whose rotations agree with stronger ones (scenes that repeat).
       refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
       max_size: Longer side of the working images, pixels.
       keypoints: relocalized: by the largest norms, the paper's rule. learned: by learned scores.

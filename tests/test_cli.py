@@ -478,7 +478,7 @@ def test_names_too_long_for_the_system_are_one_sentence(scene, tmp_path, capsys,
 
 
 def test_given_matches_are_mapped_beside_ours_and_another_file_is_another_mapping(
-    scene, tmp_path, plain
+    scene, tmp_path, plain, capsys
 ):
     """The plain run's own matches, given to itself, are there twice: each keypoint of either."""
     out, report = plain
@@ -487,6 +487,7 @@ def test_given_matches_are_mapped_beside_ours_and_another_file_is_another_mappin
     theirs = tmp_path / "theirs.db"
     shutil.copyfile(out / "database.db", theirs)
     both = run(scene, tmp_path / "out", *given, "--with-database", theirs)
+    assert "matches in 3 pairs of 3 images, mapped beside" in capsys.readouterr().out
     assert both["given"]["images"] == 3 and both["given"]["pairs"] > 0
     assert both["models"][0]["registered"] == 3 and report["given"] is None
     mine = dict(rows(out, "select image_id, rows from keypoints"))

@@ -167,7 +167,7 @@ def test_what_is_there_is_not_overwritten_and_what_cannot_be_written_is_said(
     if to in FOLDERS:
         (tmp_path / "full").mkdir()
         (tmp_path / "full" / "mine.txt").write_text("mine")
-        assert "not empty" in refusal(capsys, run, to, tmp_path / "full")
+        assert "choose an empty or new folder" in refusal(capsys, run, to, tmp_path / "full")
         assert [p.name for p in (tmp_path / "full").iterdir()] == ["mine.txt"]
         (tmp_path / "file").write_text("mine")
         assert "is a file, not a folder" in refusal(capsys, run, to, tmp_path / "file")

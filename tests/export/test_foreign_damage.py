@@ -89,6 +89,17 @@ def test_an_inconsistent_database_is_refused(tmp_path, files, damage):
         read_database(path, where="--with-database d.db")
 
 
+def test_a_blob_of_another_size_is_named_with_its_image(tmp_path, files):
+    path = tmp_path / "d.db"
+    path.write_bytes((files / "database.db").read_bytes())
+    db = sqlite3.connect(path)
+    db.execute("UPDATE keypoints SET rows = 3 WHERE image_id = 2")
+    db.commit()
+    db.close()
+    with pytest.raises(UserError, match=r"d.db: sub/b.jpg: 3 x 2 values expected; got 40"):
+        read_database(path, where="d.db")
+
+
 def test_reading_a_database_does_not_change_it(tmp_path, files):
     path = tmp_path / "some folder" / "d#1?.db"
     path.parent.mkdir()
