@@ -172,14 +172,15 @@ def _joined(theirs: PairResult, ours: PairResult) -> PairResult:
 
 class Beside(Mapping[Pair, PairResult]):
     """Our matches and those given, as one: theirs first in every image's list of keypoints, our
-    cells counted on from there. Pairs are joined when they are asked for."""
+    cells counted on from there. Pairs are joined when they are asked for.
+
+    Args:
+      names: the images that are mapped.
+    """
 
     def __init__(
         self, ours: Mapping[Pair, PairResult], given: Given, names: Collection[str]
     ) -> None:
-        """Args:
-        names: the images that are mapped.
-        """
         self._ours, self._given = ours, given
         theirs = (pair for pair in given.matches if pair[0] in names and pair[1] in names)
         self._pairs = dict.fromkeys(sorted({*ours, *theirs}))

@@ -5,6 +5,7 @@ r = 1 + k1 |p|^2 + k2 |p|^4; the camera looks along -z, x points right, y up, an
 image is its centre: there is no principal point, and one focal length.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,8 @@ BUNDLE, LIST = "bundle.out", "list.txt"
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
-def _row(values: object) -> str:
-    return " ".join(repr(float(v)) for v in np.ravel(values))  # pyright: ignore[reportCallIssue, reportArgumentType]
+def _row(values: Iterable[float]) -> str:
+    return " ".join(repr(float(v)) for v in values)
 
 
 def write_bundler(folder: Path, model: pycolmap.Reconstruction) -> None:
