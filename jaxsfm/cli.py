@@ -18,6 +18,7 @@ from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, 
 from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
 from jaxsfm.data_commands import data
 from jaxsfm.errors import UserError
+from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.train_commands import train
@@ -66,6 +67,7 @@ COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
     "evaluate": evaluate,
+    "export": export,
     "demo": demo,
     "weights": weights,
     "train": train,

@@ -4,9 +4,9 @@ Heavy modules are imported inside the commands, so that --help is quick.
 """
 
 import dataclasses
-import json
 import os
 import sys
+from json import dumps
 from pathlib import Path
 from typing import Literal
 
@@ -85,6 +85,8 @@ def reconstruct(
     seed: int = 0,
     threads: int = -1,
     reference: Path | None = None,
+    with_database: Path | None = None,
+    with_hloc: tuple[Path, Path] | None = None,
     devices: int | None = None,
     images_at_once: int | None = None,
     pairs_at_once: int | None = None,
@@ -103,8 +105,7 @@ def reconstruct(
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.
       pairs: exhaustive, or a file with two image names a line.
       best_pairs: Hand on only each image's N pairs with the most inliers.
-      view_graph: Whether to hand on only pairs whose rotations agree with stronger pairs (scenes
-        that repeat themselves).
+      view_graph: Hand on only pairs whose rotations agree with stronger ones (scenes that repeat).
       refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
       max_size: Longer side of the working images, pixels.
       keypoints: relocalized: by the largest norms, the paper's rule. learned: by learned scores.
@@ -115,6 +116,8 @@ def reconstruct(
       seed: Of everything random.
       threads: Of COLMAP's part; 1 makes the model repeatable to the last byte; -1: all.
       reference: Reference poses (Strecha .camera files or a COLMAP model) to evaluate against.
+      with_database: COLMAP database of the same photos: its matches are mapped beside ours.
+      with_hloc: hloc's features.h5 and matches.h5 of the same photos, likewise.
       devices: How many of JAX's devices to use; default: all.
       images_at_once: Extracted side by side on each device; default: what fits, one on a CPU.
       pairs_at_once: Matched side by side on each device; default: what fits, one on a CPU.
@@ -145,6 +148,8 @@ def reconstruct(
         seed=seed,
         threads=threads,
         reference=reference,
+        with_database=with_database,
+        with_hloc=with_hloc,
         execution=execution,
         progress=True,
     )
@@ -271,12 +276,8 @@ def evaluate(
         print(f"{name!s:40s} not in the model")
     print("\n".join(evaluation_lines(result)))
     if json is not None:
-        write_atomic(json, _dump(result).encode())
+        write_atomic(json, dumps(result, indent=1).encode())
     return 0
-
-
-def _dump(value: object) -> str:
-    return json.dumps(value, indent=1)
 
 
 def weights(*, relocalizer: Path | None = None) -> int:

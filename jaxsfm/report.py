@@ -100,6 +100,11 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
         f"{pairs['handed_on']} handed to COLMAP"
         + (f", {pairs['trusted']} trusted" if pairs["trusted"] is not None else ""),
     ]
+    if given := report.get("given"):
+        lines.append(
+            f"given            {given['matches']} matches in {given['pairs']} pairs of "
+            f"{given['images']} images, mapped beside"
+        )
     models = report["models"]
     if models:
         best = models[0]

@@ -19,6 +19,7 @@ from jaxsfm.extraction import extracted, image_features
 from jaxsfm.host import interrupt
 from jaxsfm.host.colmap import write_models
 from jaxsfm.host.features import ImageFeatures, image_room
+from jaxsfm.host.given import Beside, read_given
 from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, Mapper
@@ -52,6 +53,10 @@ class RunOptions:
     """Learned scores for the config's keypoints "learned"; None: jaxsfm's own."""
     reference: Path | None = None
     """Reference poses to evaluate the model against."""
+    with_database: Path | None = None
+    """A COLMAP database of the same photos, whose matches are mapped beside ours."""
+    with_hloc: tuple[Path, Path] | None = None
+    """hloc's features and matches, likewise."""
     execution: Execution = dataclasses.field(default_factory=Execution)
     """Devices, batches, memory."""
     progress: bool = False
@@ -80,6 +85,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
+    given = read_given(options.with_database, options.with_hloc, usable, intrinsics)
     weights = load_weights(relocalizer=options.relocalizer)
     relocalizer = weights.chosen_relocalizer(config)
     identity = {
@@ -108,7 +114,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 results[result.pair] = result.counts
         with folder.publish() as fresh:
             chosen = _choose(results, options.best_pairs)
-            handed_on = SavedMatches(folder, sorted(chosen))
+            ours = SavedMatches(folder, sorted(chosen))
+            handed_on = Beside(ours, given, {image.name for image in good})
             made = _map(fresh, good, handed_on, intrinsics, config, options, seconds)
             models, verified = made.models, made.verified
             untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
@@ -131,13 +138,14 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                         for pair, counts in sorted(results.items())
                     ],
                 },
+                "given": given.about,
                 "models": figures,
                 "mapping": [dataclasses.asdict(attempt) for attempt in made.attempts],
                 "refinement": [each and dataclasses.asdict(each) for each in made.refinement],
                 "lost": lost_images(
                     [image.name for image in good],
                     figures[0]["images"] if figures else [],
-                    results,
+                    given.counts(results),
                     verified,
                     untrusted,
                 ),

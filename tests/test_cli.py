@@ -491,3 +491,42 @@ def test_no_description_of_an_option_is_broken_where_the_source_wraps():
         arguments = (command.__doc__ or "").partition("Args:")[2]
         assert not re.search(r"\n {8}", arguments), command.__name__
     assert "Longer side of the working images, pixels.\n" in (COMMANDS["reconstruct"].__doc__ or "")
+
+
+# -- matches that somebody else made ------------------------------------------------------------
+
+
+def test_given_matches_are_mapped_beside_ours_and_another_file_is_another_mapping(
+    scene, tmp_path, plain, capsys
+):
+    """The plain run's own matches, given to itself, are there twice: each keypoint of either."""
+    out, report = plain
+    shutil.copytree(out, tmp_path / "out")
+    given = ("--intrinsics", scene / "K.txt", "--threads", "1", "--refine", "0")
+    theirs = tmp_path / "theirs.db"
+    shutil.copyfile(out / "database.db", theirs)
+    both = run(scene, tmp_path / "out", *given, "--with-database", theirs)
+    assert "matches in 3 pairs of 3 images, mapped beside" in capsys.readouterr().out
+    assert both["given"]["images"] == 3 and both["given"]["pairs"] > 0
+    assert both["models"][0]["registered"] == 3 and report["given"] is None
+    mine = dict(rows(out, "select image_id, rows from keypoints"))
+    merged = dict(rows(tmp_path / "out", "select image_id, rows from keypoints"))
+    for image, count in mine.items():
+        assert count < merged[image] <= 2 * count
+    before = theirs.read_bytes()
+    assert both["given"]["sha256"] and theirs.read_bytes() == before
+    alone = run(scene, tmp_path / "out", *given)  # the same folder: matching does not depend on it
+    assert alone["given"] is None
+    assert dict(rows(tmp_path / "out", "select image_id, rows from keypoints")) == mine
+
+
+def test_given_files_that_cannot_be_used_are_refused_before_the_work(scene, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["reconstruct", str(scene / "images"), "--out", str(out)]
+    (tmp_path / "d.db").write_bytes(b"no database")
+    for option in (["--with-database", "d.db"], ["--with-hloc", "d.db", "d.db"]):
+        files = [str(tmp_path / part) if part == "d.db" else part for part in option]
+        assert main([*arguments, *files]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert option[0] in line and "d.db" in line
+    assert not out.exists()
