@@ -11,11 +11,12 @@ from typing import Annotated, Any
 import tyro
 
 from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, wxbs
-from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
+from jaxsfm.commands import demo, evaluate, match, reconstruct
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.train_commands import train
+from jaxsfm.weights_commands import weights, with_action
 
 BENCHMARKS = {
     "strecha": strecha,
@@ -64,7 +65,7 @@ def main(argv: list[str] | None = None) -> int:
                 COMMANDS,
                 prog="jaxsfm",
                 description="Structure-from-Motion from dense VGG-16 features with relocalization.",
-                args=argv,
+                args=with_action(sys.argv[1:] if argv is None else argv),
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
             )
     except UserError as error:
