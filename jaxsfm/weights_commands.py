@@ -94,8 +94,8 @@ def verify(
       kernels: See convert.
       size: Longer side of the image that both see, pixels.
     """
-    if not 32 <= size <= 2048:
-        raise UserError(f"--size must lie in 32 .. 2048; got {size}")
+    if not 40 <= size <= 2048:  # pool5 is 1/32 of four fifths of it
+        raise UserError(f"--size must lie in 40 .. 2048; got {size}")
     from weights_conversion.convert import read_source
     from weights_conversion.verify import agrees, compare, table_lines
 

@@ -8,13 +8,13 @@ convolves where others correlate (`keras.utils.conv_utils.convert_kernel`,
 `preprocess_weights_for_loading`): the public file *_th_dim_ordering_th_kernels is both.
 """
 
-import math
-import re
+import subprocess
+import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-import h5py
 import numpy as np
 
 from jaxsfm.core.vgg import LAYERS, Preprocessing
@@ -25,56 +25,46 @@ Kernels = Literal["auto", "tensorflow", "theano"]
 
 CAFFE_BGR = Preprocessing(scale=1.0, mean=(103.939, 116.779, 123.68), std=(1.0, 1.0, 1.0))
 """`preprocess_input` with mode="caffe": the channels of BGR."""
-MAX_VALUES = 1 << 22
-"""In a dataset that is read: the largest kernel has 2.4 million; the classifier's are left out."""
-_NAMED = re.compile(r"(?:^|/)(?:block)?(?:conv)?([1-5])_(?:conv)?([1-3])(?:/|$)")
-_COUNTED = re.compile(r"(?:^|/)layers/conv2d(?:_(\d+))?/vars/[01]$")
+CHILD = Path(__file__).with_name("hdf5_child.py")
+PATIENCE_S = 120.0
+"""For reading 60 MB, of any disk."""
 
 
-def _layer(name: str) -> str | None:
-    """The canonical layer that a dataset's path belongs to."""
-    if counted := _COUNTED.search(name):
-        index = int(counted[1] or 0)
-        return list(LAYERS)[index] if index < len(LAYERS) else None
-    if named := _NAMED.search(name):
-        return f"conv{named[1]}_{named[2]}"
-    return None
+def _read_apart(path: Path) -> dict[str, np.ndarray]:
+    """What `hdf5_child` finds in a file, in a process of its own."""
+    with tempfile.TemporaryDirectory() as scratch:
+        found = Path(scratch) / "found.npz"
+        command = [sys.executable, "-P", str(CHILD), str(path.absolute()), str(found)]
+        try:
+            child = subprocess.run(
+                command, capture_output=True, timeout=PATIENCE_S, check=False, text=True
+            )
+        except subprocess.TimeoutExpired:
+            raise UserError(
+                f"{path}: damaged (the HDF5 library was not done after {PATIENCE_S:g} s)"
+            ) from None
+        if child.returncode != 0:
+            reason = child.stderr.strip().splitlines() if child.returncode == 1 else []
+            raise UserError(
+                f"{path}: {reason[-1] if reason else 'damaged (the HDF5 library crashed)'}"
+            )
+        with np.load(found, allow_pickle=False) as arrays:
+            return dict(arrays)
 
 
-def _arrays(file: h5py.File, path: Path) -> dict[str, tuple[np.ndarray | None, np.ndarray | None]]:
-    """Kernel and bias of each layer; soft and external links are not followed."""
-    found: dict[str, dict[int, np.ndarray]] = {}
-
-    def visit(name: str, item: object) -> None:
-        layer = _layer(name)
-        if layer is None or not isinstance(item, h5py.Dataset) or item.ndim not in (1, 4):
-            return
-        if item.is_virtual or item.external:
-            raise UserError(f"{path}: {name} lies in another file, which is not followed")
-        if math.prod(item.shape) > MAX_VALUES or item.dtype.kind != "f":
-            raise UserError(f"{path}: {name} is no layer of VGG-16 ({item.dtype} {item.shape})")
-        if item.ndim in found.setdefault(layer, {}):
-            raise UserError(f"{path}: {layer} is in it more than once ({name})")
-        found[layer][item.ndim] = item[()]
-
-    file.visititems(visit)
-    return {layer: (arrays.get(4), arrays.get(1)) for layer, arrays in found.items()}
+def _by_layer(found: dict[str, np.ndarray]) -> dict[str, tuple[object, object]]:
+    """Kernel and bias of each layer; those that are only counted come in the network's order."""
+    counted = {str(k): layer for k, layer in enumerate(LAYERS)}
+    keys = {layer: layer for layer in LAYERS}
+    keys |= {layer: k for k, layer in counted.items() if f"{k}.kernel" in found}
+    return {layer: (found.get(f"{k}.kernel"), found.get(f"{k}.bias")) for layer, k in keys.items()}
 
 
-def _backend(file: h5py.File) -> str | None:
-    """What the weights ran on, where the file says so; Keras 1.0 did not."""
-    for group in (file, file.get("model_weights")):
-        if isinstance(group, h5py.Group) and "backend" in group.attrs:
-            value = group.attrs["backend"]
-            return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-    return None
-
-
-def _convolves(path: Path, layout: str, backend: str | None, kernels: Kernels) -> bool:
+def _convolves(path: Path, layout: str, backend: str, kernels: Kernels) -> bool:
     """Whether kernels are Theano's: as told, as the file says, as its public name says."""
     if kernels != "auto":
         return kernels == "theano"
-    if backend is not None:
+    if backend:
         return backend == "theano"
     for word, theano in (("th_kernels", True), ("tf_kernels", False)):
         if word in path.name:
@@ -103,16 +93,11 @@ def read_keras(
     Raises:
       UserError: it is damaged, not a VGG-16, or its kernels may be either.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            arrays, backend = _arrays(file, path), _backend(file)
-    except UserError:
-        raise
-    except Exception as error:  # a damaged file can raise almost anything
-        raise UserError(f"{path}: not a readable HDF5 file of Keras ({error})") from error
-    first, _ = arrays.get("conv1_1", (None, None))
-    layout = "OIHW" if first is not None and first.shape[2:] == (3, 3) else "HWIO"
-    convention = Convention(layout, True, _convolves(path, layout, backend, kernels))
+    found = _read_apart(path)
+    arrays = _by_layer(found)
+    first = arrays["conv1_1"][0]
+    layout = "OIHW" if isinstance(first, np.ndarray) and first.shape[2:] == (3, 3) else "HWIO"
+    convention = Convention(layout, True, _convolves(path, layout, str(found["backend"]), kernels))
     return Source(
         family="keras",
         path=path,

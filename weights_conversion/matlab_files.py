@@ -10,17 +10,16 @@ Source: matlab/simplenn/vl_simplenn_tidy.m and utils/import-caffe.py of MatConvN
 addPCA.m and computeRepresentation.m of NetVLAD.
 """
 
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 
 from jaxsfm.core.vgg import LAYERS, Preprocessing
 from jaxsfm.errors import UserError
 from jaxsfm.host.converted import EXTRAS
+from weights_conversion.mat5 import read_variables
 from weights_conversion.source import Convention, Source, check_layers
 
 CONVENTION = Convention(layout="HWIO", bgr=False, convolution=False)
@@ -32,14 +31,15 @@ EXPORT = (
 
 
 def _fields(value: Any) -> dict[str, Any]:
-    """A MATLAB struct's fields, {} for anything else."""
-    return dict(vars(value)) if isinstance(value, scipy.io.matlab.mat_struct) else {}
+    """A struct's fields, {} for anything else; a cell of one struct is that struct."""
+    while isinstance(value, list) and len(value) == 1:
+        (value,) = value
+    return value if isinstance(value, dict) else {}
 
 
 def _weights(layer: dict[str, Any]) -> list[Any]:
     if "weights" in layer:
-        cell = layer["weights"]
-        return list(cell.flat) if isinstance(cell, np.ndarray) and cell.dtype == object else []
+        return layer["weights"] if isinstance(layer["weights"], list) else []
     return [layer.get("filters"), layer.get("biases")]
 
 
@@ -55,14 +55,10 @@ def _kernel(array: Any) -> Any:
     return array
 
 
-def _name(layer: dict[str, Any]) -> str:
-    return str(np.squeeze(layer.get("name", ""))).strip()
-
-
 def _mean(top: dict[str, Any], path: Path) -> tuple[tuple[float, float, float], tuple[str, ...]]:
     """The mean colour, and a note where the file has a mean image that is not of one colour."""
-    holder = _fields(_item(top.get("meta"))) or top
-    image = _fields(_item(holder.get("normalization"))).get("averageImage")
+    holder = _fields(top.get("meta")) or top
+    image = _fields(holder.get("normalization")).get("averageImage")
     if not isinstance(image, np.ndarray) or image.dtype.kind not in "fiu" or image.size < 3:
         raise UserError(f"{path}: meta.normalization.averageImage, the mean colour, is missing")
     if image.size != 3 and (image.ndim != 3 or image.shape[2] != 3):
@@ -74,13 +70,6 @@ def _mean(top: dict[str, Any], path: Path) -> tuple[tuple[float, float, float], 
     varies = np.ptp(colours, axis=0).max() > 1e-3
     note = ("its mean image is not of one colour; the mean over its pixels is taken",)
     return (red, green, blue), note * bool(varies)
-
-
-def _item(value: Any) -> Any:
-    """What a 1 x 1 array of structs or cells holds."""
-    while isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
-        value = value.item()
-    return value
 
 
 def _head(layers: list[dict[str, Any]]) -> dict[str, np.ndarray]:
@@ -106,23 +95,20 @@ def read_matlab(
       UserError: it is damaged, of version 7.3, or not a VGG-16.
     """
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")  # of what is found, the checks below speak
-            top = scipy.io.loadmat(
-                path, variable_names=VARIABLES, struct_as_record=False, squeeze_me=False
-            )
+        top = read_variables(path, VARIABLES)
     except Exception as error:  # a damaged file can raise almost anything
         raise UserError(f"{path}: not a readable MATLAB file ({error})") from error
     if "net" in top:
-        top = _fields(_item(top["net"]))
+        top = _fields(top["net"])
     cell = top.get("layers")
-    if not isinstance(cell, np.ndarray) or cell.dtype != object:
+    if not isinstance(cell, list):
         raise UserError(f"{path}: no network of MatConvNet: it has no cell of layers")
-    layers = [_fields(_item(each)) for each in cell.flat]
+    layers = [_fields(each) for each in cell]
     pairs = {}
     for layer in layers:
-        if _name(layer) in shapes and len(arrays := _weights(layer)) >= 2:
-            pairs[_name(layer)] = (_kernel(arrays[0]), _vector(arrays[1]))
+        name = layer.get("name")
+        if isinstance(name, str) and name in shapes and len(arrays := _weights(layer)) >= 2:
+            pairs[name] = (_kernel(arrays[0]), _vector(arrays[1]))
     mean, notes = _mean(top, path)
     checked = check_layers(pairs, CONVENTION, path=path, shapes=shapes)
     extras = _head(layers)
