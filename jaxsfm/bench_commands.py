@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from jaxsfm.commands import check_writable
 from jaxsfm.errors import UserError
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 
 def _listed(values: tuple[str, ...] | None) -> list[str] | None:
@@ -57,7 +58,7 @@ def _of_pairs(
     methods: tuple[str, ...],
     seeds: int,
     max_size: int | None,
-    relocalizer: Path | None,
+    network: WeightsChoice,
     json: Path | None,
 ) -> dict[str, Any]:
     from jaxsfm.bench.matches import PAIR_METHODS
@@ -69,7 +70,7 @@ def _of_pairs(
         methods=_methods(methods, PAIR_METHODS),
         seeds=seeds,
         max_size=max_size,
-        relocalizer=relocalizer,
+        network=network,
         progress=True,
         keep=_keeper(json),
     )
@@ -83,7 +84,7 @@ def strecha(
     intrinsics: Literal["known", "unknown"] = "known",
     json: Path | None = None,
     out: Path | None = None,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     seed: int = 0,
     threads: int = -1,
 ) -> int:
@@ -98,7 +99,7 @@ def strecha(
       intrinsics: known: the sets' K, fixed. unknown: a camera per image, guessed and refined.
       json: Write all figures here.
       out: Keep databases and models here, and go on from what is there.
-      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
+      network: The network's parameters.
       seed: Of everything random.
       threads: Of COLMAP's part; -1: all.
     """
@@ -111,7 +112,7 @@ def strecha(
         methods=_methods(methods, bench.METHODS),
         known_intrinsics=intrinsics == "known",
         out=out,
-        relocalizer=relocalizer,
+        network=network,
         seed=seed,
         threads=threads,
         progress=True,
@@ -127,7 +128,7 @@ def wxbs(
     methods: tuple[str, ...] = ("rootsift,paper,default,robust",),
     seeds: int = 5,
     max_size: int | None = None,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     json: Path | None = None,
 ) -> int:
     """Pairs under changes of viewpoint, illumination and season (WxBS).
@@ -141,12 +142,12 @@ def wxbs(
         competition; robust-no-enlarging too), default-norm, default-learned.
       seeds: Runs of each method, with seeds 0, 1, ...
       max_size: Longer side of our working images, pixels; default: the preset's.
-      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
+      network: The network's parameters.
       json: Write all figures here.
     """
     from jaxsfm.bench import wxbs as bench
 
-    figures = _of_pairs(bench.bench_wxbs, root, sets, methods, seeds, max_size, relocalizer, json)
+    figures = _of_pairs(bench.bench_wxbs, root, sets, methods, seeds, max_size, network, json)
     return _finish(bench.table_lines(figures))
 
 
@@ -157,7 +158,7 @@ def homography(
     methods: tuple[str, ...] = ("rootsift,paper,default,robust",),
     seeds: int = 5,
     max_size: int | None = None,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     json: Path | None = None,
 ) -> int:
     """Sequences with known homographies (Oxford affine, HPatches).
@@ -168,14 +169,12 @@ def homography(
       methods: As in bench wxbs.
       seeds: Runs of each method, with seeds 0, 1, ...
       max_size: Longer side of our working images, pixels; default: the preset's.
-      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
+      network: The network's parameters.
       json: Write all figures here.
     """
     from jaxsfm.bench import homography as bench
 
-    figures = _of_pairs(
-        bench.bench_homography, root, sets, methods, seeds, max_size, relocalizer, json
-    )
+    figures = _of_pairs(bench.bench_homography, root, sets, methods, seeds, max_size, network, json)
     return _finish(bench.table_lines(figures))
 
 
@@ -219,7 +218,7 @@ def daynight(
     severity: float = 2.0,
     denoise: bool = True,
     jpeg: bool = True,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     json: Path | None = None,
     seed: int = 0,
     threads: int = -1,
@@ -236,7 +235,7 @@ def daynight(
       severity: Of the synthetic night: 0: day, 1: clean, 2: noisy, 3: dark, 5: noise.
       denoise: Whether the synthetic night's camera removes noise.
       jpeg: Whether it stores JPEG.
-      relocalizer: Learned scores, for methods that use them; default: jaxsfm's own.
+      network: The network's parameters.
       json: Write all figures here.
       seed: Of everything random.
       threads: Of COLMAP's part; -1: all.
@@ -251,7 +250,7 @@ def daynight(
         severity=severity,
         denoise=denoise,
         jpeg=jpeg,
-        relocalizer=relocalizer,
+        network=network,
         seed=seed,
         threads=threads,
         progress=True,
@@ -265,7 +264,7 @@ def warps(
     root: Path,
     methods: tuple[str, ...] = ("norm,learned",),
     seeds: int = 5,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     json: Path | None = None,
 ) -> int:
     """Relocalization rules on views made of photos, under known homographies (synthetic).
@@ -274,7 +273,7 @@ def warps(
       root: Folder of any photos; sub-folders are included.
       methods: By commas or blanks: norm (the paper's rule), learned.
       seeds: Sets of 64 pairs of views.
-      relocalizer: Learned scores; default: jaxsfm's own.
+      network: The network's parameters.
       json: Write all figures here.
     """
     _check(json, seeds)
@@ -284,7 +283,7 @@ def warps(
         root,
         methods=_methods(methods, bench.METHODS),
         seeds=seeds,
-        relocalizer=relocalizer,
+        network=network,
         progress=True,
         keep=_keeper(json),
     )

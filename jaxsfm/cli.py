@@ -15,13 +15,14 @@ import tyro
 
 from jaxsfm.bench.common import versions
 from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, wxbs
-from jaxsfm.commands import demo, evaluate, match, reconstruct, weights
+from jaxsfm.commands import demo, evaluate, match, reconstruct
 from jaxsfm.data_commands import data
 from jaxsfm.errors import UserError
 from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.train_commands import train
+from jaxsfm.weights_commands import weights, with_action
 
 _WRAPPED = re.compile(r"\n {8,}(?=[^\s$])")
 """A line of an argument's description that goes on; examples start with $."""
@@ -100,7 +101,7 @@ def main(argv: list[str] | None = None) -> int:
                 {name: _unwrapped(command) for name, command in COMMANDS.items()},
                 prog="jaxsfm",
                 description=DESCRIPTION,
-                args=argv,
+                args=with_action(sys.argv[1:] if argv is None else argv),
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
             )
     except UserError as error:

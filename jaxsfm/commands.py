@@ -14,6 +14,7 @@ import tyro
 
 from jaxsfm.config import Config, Convolutions, Keypoints, Refinement, preset
 from jaxsfm.errors import UserError
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 Positional = tyro.conf.Positional
 Preset = Literal["paper", "default", "robust"]
@@ -79,7 +80,7 @@ def reconstruct(
     refine: int | None = None,
     max_size: int = 1600,
     keypoints: ChosenKeypoints = "preset",
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     convolutions: Convolutions = "float32",
     mapper: Literal["incremental", "global"] = "incremental",
     seed: int = 0,
@@ -110,7 +111,7 @@ def reconstruct(
       max_size: Longer side of the working images, pixels.
       keypoints: relocalized: by the largest norms, the paper's rule. learned: by learned scores.
         grid: cell centres (for the ablation).
-      relocalizer: File of learned scores (jaxsfm train relocalizer); default: jaxsfm's own.
+      network: The network's parameters.
       convolutions: What the network multiplies; bfloat16 is meant for accelerators.
       mapper: COLMAP's incremental or global mapper.
       seed: Of everything random.
@@ -124,7 +125,9 @@ def reconstruct(
       memory_gb: For the features at hand, on each device; default: half of an accelerator, an
         eighth of a host, at most 1.6. Less makes photos come back more often.
     """
-    config = _config(preset, max_size, keypoints, view_graph, refine, convolutions, relocalizer)
+    config = _config(
+        preset, max_size, keypoints, view_graph, refine, convolutions, network.relocalizer
+    )
     from jaxsfm.execution import Execution
     from jaxsfm.report import summary_lines
     from jaxsfm.run import RunOptions, run_folder
@@ -142,7 +145,7 @@ def reconstruct(
         pairs=pairs,
         best_pairs=best_pairs,
         intrinsics=intrinsics,
-        relocalizer=relocalizer,
+        network=network,
         refine_intrinsics=refine_intrinsics,
         mapper=mapper,
         seed=seed,
@@ -173,7 +176,7 @@ def match(
     preset: Preset = "default",
     max_size: int = 1600,
     keypoints: ChosenKeypoints = "preset",
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     convolutions: Convolutions = "float32",
     seed: int = 0,
 ) -> int:
@@ -189,12 +192,12 @@ def match(
       preset: See reconstruct.
       max_size: Longer side of the working images, pixels.
       keypoints: See reconstruct.
-      relocalizer: See reconstruct.
+      network: The network's parameters.
       convolutions: See reconstruct.
       seed: Of the RANSAC draws.
     """
     config = _config(
-        preset, max_size, keypoints, convolutions=convolutions, relocalizer=relocalizer
+        preset, max_size, keypoints, convolutions=convolutions, relocalizer=network.relocalizer
     )
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
@@ -202,7 +205,7 @@ def match(
 
     from jaxsfm.extraction import image_features
     from jaxsfm.host.images import inspect_image, read_image
-    from jaxsfm.host.weights import load_weights
+    from jaxsfm.host.weights import chosen_weights
     from jaxsfm.host.workfolder import atomic_file
     from jaxsfm.matching import match_features
     from jaxsfm.pair_alignment import align
@@ -210,7 +213,7 @@ def match(
 
     check_seed(seed)
     files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
-    weights = load_weights(relocalizer=relocalizer)
+    weights = chosen_weights(network)
     features = [image_features(weights, file, config=config) for file in files]
     result = match_features(features[0], features[1], config=config, seed=seed)
     keypoints1, aligned = align(result, files[0], files[1], config=config)
@@ -277,30 +280,6 @@ def evaluate(
     print("\n".join(evaluation_lines(result)))
     if json is not None:
         write_atomic(json, dumps(result, indent=1).encode())
-    return 0
-
-
-def weights(*, relocalizer: Path | None = None) -> int:
-    """Show which weights are in use, and check them.
-
-    Args:
-      relocalizer: File of learned scores; default: jaxsfm's own.
-    """
-    from jaxsfm.host.weights import default_path, load_weights
-
-    loaded = load_weights(relocalizer=relocalizer)
-    p = loaded.preprocessing
-    print(f"weights          ImageNet VGG-16, {loaded.source}")
-    print(f"file             {default_path()}")
-    print(f"family           {loaded.family}")
-    print(f"preprocessing    RGB / {p.scale:g}, minus {p.mean}, divided by {p.std}")
-    print(f"sha256           {loaded.sha256} (checked)")
-    learned = loaded.learned
-    print(f"relocalizer      {relocalizer or 'of jaxsfm'}, for learned keypoints")
-    print(f"sha256           {learned.sha256}")
-    for name, value in learned.about.items():
-        if name != "history":
-            print(f"  {name:14s} {value}")
     return 0
 
 

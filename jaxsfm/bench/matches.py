@@ -16,9 +16,10 @@ from jaxsfm.host.colmap import read_matches
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import write_rootsift_database
-from jaxsfm.host.weights import Weights, load_weights
+from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.matching import match_features
 from jaxsfm.pair_alignment import align
+from jaxsfm.weights_choice import WeightsChoice
 
 PAIR_METHODS = (
     "rootsift",
@@ -47,9 +48,8 @@ class Matcher:
     """Matches pairs; an image's features are computed once for all pairs and methods that share
     them."""
 
-    def __init__(self, *, relocalizer: Path | None = None) -> None:
-        """With learned scores from a file; None: jaxsfm's own."""
-        self._relocalizer = relocalizer
+    def __init__(self, network: WeightsChoice) -> None:
+        self._network = network
         self._weights: Weights | None = None
         self._extract = functools.lru_cache(maxsize=FEATURES)(self._timed_features)
 
@@ -91,7 +91,7 @@ class Matcher:
 
     def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
         if self._weights is None:
-            self._weights = load_weights(relocalizer=self._relocalizer)
+            self._weights = chosen_weights(self._network)
         start = time.monotonic()
         features = image_features(self._weights, image, config=config)
         return features, time.monotonic() - start

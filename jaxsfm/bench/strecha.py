@@ -32,6 +32,7 @@ from jaxsfm.host.workfolder import write_atomic
 from jaxsfm.pipeline import open_images
 from jaxsfm.report import model_figures
 from jaxsfm.run import RunOptions, run_folder
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 METHODS = ("rootsift", "grid", "reloc", "learned", "default", "robust", *RUN_ABLATED)
 USUAL = ("rootsift", "grid", "reloc", "default")
@@ -120,12 +121,12 @@ def run_method(
     seed: int,
     threads: int,
     progress: bool,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
 ) -> dict[str, Any]:
     """One of our methods on one set, in the work folder `out`."""
     options = RunOptions(
         intrinsics=intrinsics,
-        relocalizer=relocalizer,
+        network=network,
         seed=seed,
         threads=threads,
         progress=progress,
@@ -171,7 +172,7 @@ def bench_strecha(
     out: Path | None = None,
     seed: int = 0,
     threads: int = -1,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -185,7 +186,7 @@ def bench_strecha(
       known_intrinsics: False: focal lengths are guessed and refined, one camera per image.
       out: keeps the work folders here, the models of methods that share one beside them; runs in
         it are gone on with.
-      relocalizer: learned scores; None: jaxsfm's own.
+      network: the files of its parameters.
     """
     folders = find_sets(root, sets)
     # All inputs are read before the first long run.
@@ -211,7 +212,7 @@ def bench_strecha(
                         seed=seed,
                         threads=threads,
                         progress=progress,
-                        relocalizer=relocalizer,
+                        network=network,
                     )
                 if "stages" in row:
                     row["stages"] |= _matching_seconds(work, row["stages"])

@@ -15,10 +15,11 @@ import jax
 
 from jaxsfm.bench.common import Keep, spread, versions
 from jaxsfm.errors import UserError
-from jaxsfm.host.weights import load_weights
+from jaxsfm.host.weights import chosen_weights
 from jaxsfm.pipeline import open_images
 from jaxsfm.training.objective import mean_shares, shares, warped_examples
 from jaxsfm.training.photos import Crops
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 METHODS = ("norm", "learned")
 VIEW, CROP, BATCH = 192, 400, 8
@@ -30,7 +31,7 @@ def bench_warps(
     methods: Sequence[str] = METHODS,
     seeds: int = 5,
     batches: int = 8,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -40,12 +41,12 @@ def bench_warps(
       root: folder of photos.
       seeds: sets of views.
       batches: of eight pairs of views, in a set.
-      relocalizer: learned scores; None: jaxsfm's own.
+      network: the files of its parameters.
     """
     images, _ = open_images(root)
     if not images:
         raise UserError(f"--root {root}: no usable images")
-    weights = load_weights(relocalizer=relocalizer)
+    weights = chosen_weights(network)
     learned = weights.learned.params
     warp = functools.partial(
         warped_examples, weights.params, preprocessing=weights.preprocessing, size=VIEW

@@ -22,6 +22,7 @@ from jaxsfm.bench.matches import Matcher, pair_figures
 from jaxsfm.errors import UserError
 from jaxsfm.host.images import SUFFIXES, ImageFile
 from jaxsfm.host.two_view import epipolar_residuals, fundamental_matrix
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 THRESHOLDS_PX = np.arange(1, 21)
 
@@ -61,7 +62,7 @@ def bench_wxbs(
     methods: Sequence[str],
     seeds: int = 5,
     max_size: int | None = None,
-    relocalizer: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
     progress: bool = False,
     keep: Keep = lambda _: None,
 ) -> dict[str, Any]:
@@ -73,7 +74,7 @@ def bench_wxbs(
       seeds: runs of each method with seeds 0, 1, ..; of RANSAC in matching and of the fundamental
         matrix.
       max_size: longer side of our working images; None: the preset's.
-      relocalizer: learned scores; None: jaxsfm's own.
+      network: the files of its parameters.
     """
     check_root(root)
     found = {
@@ -95,7 +96,7 @@ def bench_wxbs(
         )
         for folder in folders
     }
-    matcher = Matcher(relocalizer=relocalizer)
+    matcher = Matcher(network)
     rows = []
     for folder, (image0, image1, marked) in inputs.items():
         for method in methods:

