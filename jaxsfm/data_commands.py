@@ -38,24 +38,9 @@ def fetch(name: Positional[str], *, to: Path | None = None) -> int:
       name: Of the data set (jaxsfm data list).
       to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
     """
-    from tqdm import tqdm
-
     from jaxsfm import datasets
 
-    with tqdm(unit="B", unit_scale=True, unit_divisor=1000) as bar:
-
-        def on_file(file: datasets.RemoteFile, k: int, count: int):
-            bar.set_description(f"{Path(file.name).name} ({k + 1} of {count})")
-            bar.reset(total=None)
-
-            def on_bytes(done: int, total: int | None) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
-            return on_bytes
-
-        path = datasets.fetch(name, to, on_file=on_file)
-    print(path)
+    print(datasets.fetch(name, to, progress=True))
     return 0
 
 

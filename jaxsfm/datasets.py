@@ -3,13 +3,12 @@
 import dataclasses
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path, PurePosixPath
 
 import platformdirs
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.download import OnBytes, download, sha256_of, unpack
+from jaxsfm.host.download import download, progress_bar, sha256_of, unpack
 from jaxsfm.host.workfolder import write_atomic
 
 _STRECHA = (
@@ -179,18 +178,9 @@ def path_of(name: str, folder: Path | None = None) -> Path:
     return home / PurePosixPath(find(name).root)
 
 
-def fetch(
-    name: str,
-    folder: Path | None = None,
-    *,
-    on_file: Callable[[RemoteFile, int, int], OnBytes] = lambda *_: lambda *_: None,
-) -> Path:
+def fetch(name: str, folder: Path | None = None, *, progress: bool = False) -> Path:
     """Download what is missing; returns what to give to `--root`. Interrupted, it goes on from
     there; what is there already is not asked for.
-
-    Args:
-      on_file: told each file that is downloaded, its place and their number; what it gives back is
-        told the bytes.
 
     Raises:
       UserError: something cannot be had, written or unpacked, or has another hash than published.
@@ -207,8 +197,9 @@ def fetch(
     for k, file in enumerate(files):
         if file.name in fetched:
             continue
-        on_bytes = on_file(file, k, len(files))
-        path = download(file.url, home / file.name, known_hash=file.known_hash, on_bytes=on_bytes)
+        path = home / file.name
+        with progress_bar(f"{path.name} ({k + 1} of {len(files)})", shown=progress) as on_bytes:
+            download(file.url, path, known_hash=file.known_hash, on_bytes=on_bytes)
         fetched[file.name] = sha256_of(path)
         if file.archive:
             unpack(path, home)

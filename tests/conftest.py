@@ -1,6 +1,7 @@
 """Strict numerics for every test, and the inputs that several tests share."""
 
 import os
+import threading
 from pathlib import Path
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # two workers, one GPU
@@ -60,3 +61,16 @@ def scene(tmp_path_factory) -> Path:
 
     write_scene(folder, num_views=3, size=(320, 240))
     return folder
+
+
+@pytest.fixture
+def server(monkeypatch):
+    """See `local_server`."""
+    from local_server import CONTENT, Handler, Server
+
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    with Server(("127.0.0.1", 0), Handler) as made:
+        made.files, made.asked = {"/file": CONTENT}, []
+        threading.Thread(target=made.serve_forever, daemon=True).start()
+        yield made
+        made.shutdown()

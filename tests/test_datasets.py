@@ -2,72 +2,21 @@
 
 import dataclasses
 import hashlib
-import http.server
 import io
 import json
+import socket
 import tarfile
-import threading
 import zipfile
 
 import pytest
+from local_server import CONTENT, url
 
 from jaxsfm import datasets
 from jaxsfm.cli import main
 from jaxsfm.datasets import DATA_SETS, DataSet, RemoteFile
 from jaxsfm.errors import UserError
+from jaxsfm.host import download as downloads
 from jaxsfm.host.download import download
-
-CONTENT = bytes(range(256)) * 2000
-
-
-class Server(http.server.ThreadingHTTPServer):
-    """Serves `files`; breaks off after `break_after` bytes of an answer."""
-
-    files: dict[str, bytes]
-    break_after: int | None = None
-    ranges = True
-    asked: list[tuple[str, str | None]]
-
-
-class Handler(http.server.BaseHTTPRequestHandler):
-    def do_GET(self):
-        server = self.server
-        assert isinstance(server, Server)
-        asked = self.headers.get("Range")
-        server.asked.append((self.path, asked))
-        content = server.files.get(self.path)
-        if content is None:
-            self.send_error(404)
-            return
-        etag = f'"{hashlib.md5(content).hexdigest()}"'
-        start = 0
-        if asked and server.ranges and self.headers.get("If-Range", etag) == etag:
-            start = int(asked.removeprefix("bytes=").removesuffix("-"))
-            if start >= len(content):
-                self.send_error(416)
-                return
-        self.send_response(206 if start else 200)
-        self.send_header("ETag", etag)
-        self.send_header("Content-Length", str(len(content) - start))
-        self.end_headers()
-        body = content[start:]
-        self.wfile.write(body if server.break_after is None else body[: server.break_after])
-
-    def log_message(self, *args):
-        pass
-
-
-@pytest.fixture
-def server():
-    with Server(("127.0.0.1", 0), Handler) as made:
-        made.files, made.asked = {"/file": CONTENT}, []
-        threading.Thread(target=made.serve_forever, daemon=True).start()
-        yield made
-        made.shutdown()
-
-
-def url(server, path="/file"):
-    return f"http://127.0.0.1:{server.server_address[1]}{path}"
 
 
 def sha(content):
@@ -142,6 +91,16 @@ def test_no_server_no_file_no_folder_are_one_sentence(server, tmp_path):
     server.server_close()
     with pytest.raises(UserError, match="no connection"):
         download(address, tmp_path / "file", known_hash=None)
+
+
+def test_a_server_that_says_nothing_is_not_waited_for_forever(tmp_path, monkeypatch):
+    monkeypatch.setattr(downloads, "TIMEOUT", (0.2, 0.2))
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        with pytest.raises(UserError, match="no answer in time"):
+            address = f"http://127.0.0.1:{silent.getsockname()[1]}/file"
+            download(address, tmp_path / "file", known_hash=None)
 
 
 def archive(kind, files):

@@ -7,16 +7,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import platformdirs
-import pooch
-import requests
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.download import download, progress_bar
 from weights_conversion.convert import read_source, write_converted
 from weights_conversion.source import Family
-
-TIMEOUT_S = 30.0
-"""For the server to say anything."""
-CHUNK = 1 << 20
 
 
 class Public(NamedTuple):
@@ -84,7 +79,8 @@ def default_folder() -> Path:
 def fetch_weights(name: str, *, out: Path | None = None, progress: bool = False) -> Path:
     """Download one of `PUBLIC`, unless it is there already, and convert it.
 
-    The download is kept in the user's cache folder, so that a conversion can be verified.
+    The download is kept in the user's cache folder, so that a conversion can be verified; one that
+    broke off goes on.
 
     Args:
       out: the converted file; None: NAME.safetensors in `default_folder`.
@@ -94,63 +90,14 @@ def fetch_weights(name: str, *, out: Path | None = None, progress: bool = False)
     """
     if name not in PUBLIC:
         raise UserError(f"no public weights {name!r}; there are {', '.join(PUBLIC)}")
-    target = out or default_folder() / f"{name}.safetensors"
-    downloaded = download(
-        PUBLIC[name], platformdirs.user_cache_path("jaxsfm") / "downloads", progress=progress
-    )
-    source = read_source(downloaded, family=PUBLIC[name].family)
-    _make(target.parent)
+    file, target = PUBLIC[name], out or default_folder() / f"{name}.safetensors"
+    place = platformdirs.user_cache_path("jaxsfm") / "downloads" / file.url.rpartition("/")[2]
+    with progress_bar(place.name, shown=progress) as on_bytes:
+        download(file.url, place, known_hash=file.known_hash, on_bytes=on_bytes)
+    source = read_source(place, family=file.family)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{target.parent}: cannot be made ({error.strerror})") from error
     write_converted(source, target)
     return target
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be made ({error.strerror})") from error
-
-
-def download(file: Public, folder: Path, *, progress: bool = False) -> Path:
-    """A public file in a folder, whole and with the known hash; kept from an earlier time if so.
-
-    Raises:
-      UserError: it cannot be had or written, or is not the known file.
-    """
-    _make(folder)
-    name = file.url.rpartition("/")[2]
-    loader = pooch.HTTPDownloader(progressbar=progress, chunk_size=CHUNK, timeout=TIMEOUT_S)
-    pooch.get_logger().setLevel("WARNING")
-    try:
-        return Path(
-            pooch.retrieve(
-                file.url,
-                known_hash=file.known_hash,
-                fname=name,
-                path=folder,
-                downloader=loader,  # pyright: ignore[reportArgumentType]  pooch's own
-            )
-        )
-    except requests.exceptions.RequestException as error:
-        raise UserError(
-            f"{file.url}: cannot be downloaded ({_reason(error)}); 'jaxsfm weights convert' takes "
-            "a file that was fetched elsewhere"
-        ) from error
-    except ValueError as error:  # pooch's, with what was expected
-        raise UserError(
-            f"{file.url}: what came is not the known file (wrong hash, {file.known_hash} is "
-            "expected); nothing of it was kept"
-        ) from error
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written ({error.strerror})") from error
-
-
-def _reason(error: requests.exceptions.RequestException) -> str:
-    """In a few words: the innermost cause says most."""
-    if error.response is not None:
-        return f"the server answers {error.response.status_code} {error.response.reason}"
-    if isinstance(error, requests.exceptions.Timeout):
-        return "the server does not answer"
-    if isinstance(error, requests.exceptions.ConnectionError):
-        return "no connection"
-    return "the connection broke"

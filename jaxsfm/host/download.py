@@ -1,5 +1,6 @@
 """Files from the network: resumed where they stopped, compared with their hash, unpacked safely."""
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -7,12 +8,13 @@ import tarfile
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pooch
 import requests
+from tqdm import tqdm
 
 from jaxsfm.errors import UserError
 
@@ -98,6 +100,18 @@ def download(
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror or error})") from error
     return path
+
+
+@contextlib.contextmanager
+def progress_bar(label: str, *, shown: bool) -> Iterator[OnBytes]:
+    """What `download` tells, as a bar."""
+    with tqdm(desc=label, unit="B", unit_scale=True, disable=not shown) as bar:
+
+        def on_bytes(done: int, total: int | None) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield on_bytes
 
 
 def _reason(error: requests.RequestException) -> str:
