@@ -12,7 +12,7 @@ from typing import Literal
 
 import tyro
 
-from jaxsfm.config import Config, Convolutions, Keypoints, Refinement, preset
+from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
 from jaxsfm.errors import UserError
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
@@ -30,9 +30,12 @@ def _config(
     refine: int | None = None,
     convolutions: Convolutions = "float32",
     relocalizer: Path | None = None,
+    backbone: BackboneName = "vgg16",
 ) -> Config:
     try:
-        config = dataclasses.replace(preset(name), max_size=max_size, convolutions=convolutions)
+        config = dataclasses.replace(
+            preset(name), max_size=max_size, convolutions=convolutions, backbone=backbone
+        )
         if relocalizer is not None:
             if keypoints not in ("preset", "learned"):
                 raise ValueError(
@@ -81,6 +84,7 @@ def reconstruct(
     max_size: int = 1600,
     keypoints: ChosenKeypoints = "preset",
     network: WeightsChoice = USUAL_WEIGHTS,
+    backbone: BackboneName = "vgg16",
     convolutions: Convolutions = "float32",
     mapper: Literal["incremental", "global"] = "incremental",
     seed: int = 0,
@@ -112,6 +116,7 @@ def reconstruct(
       keypoints: relocalized: by the largest norms, the paper's rule. learned: by learned scores.
         grid: cell centres (for the ablation).
       network: The network's parameters.
+      backbone: The network: vgg16, the paper's; alexnet; vgg19 (with --weights).
       convolutions: What the network multiplies; bfloat16 is meant for accelerators.
       mapper: COLMAP's incremental or global mapper.
       seed: Of everything random.
@@ -126,7 +131,14 @@ def reconstruct(
         eighth of a host, at most 1.6. Less makes photos come back more often.
     """
     config = _config(
-        preset, max_size, keypoints, view_graph, refine, convolutions, network.relocalizer
+        preset,
+        max_size,
+        keypoints,
+        view_graph,
+        refine,
+        convolutions,
+        network.relocalizer,
+        backbone,
     )
     from jaxsfm.execution import Execution
     from jaxsfm.report import summary_lines
@@ -177,6 +189,7 @@ def match(
     max_size: int = 1600,
     keypoints: ChosenKeypoints = "preset",
     network: WeightsChoice = USUAL_WEIGHTS,
+    backbone: BackboneName = "vgg16",
     convolutions: Convolutions = "float32",
     seed: int = 0,
 ) -> int:
@@ -193,11 +206,17 @@ def match(
       max_size: Longer side of the working images, pixels.
       keypoints: See reconstruct.
       network: The network's parameters.
+      backbone: See reconstruct.
       convolutions: See reconstruct.
       seed: Of the RANSAC draws.
     """
     config = _config(
-        preset, max_size, keypoints, convolutions=convolutions, relocalizer=network.relocalizer
+        preset,
+        max_size,
+        keypoints,
+        convolutions=convolutions,
+        relocalizer=network.relocalizer,
+        backbone=backbone,
     )
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
@@ -213,7 +232,7 @@ def match(
 
     check_seed(seed)
     files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
-    weights = chosen_weights(network)
+    weights = chosen_weights(network, backbone)
     features = [image_features(weights, file, config=config) for file in files]
     result = match_features(features[0], features[1], config=config, seed=seed)
     keypoints1, aligned = align(result, files[0], files[1], config=config)

@@ -48,7 +48,13 @@ def _start(
 
 
 def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Extraction:
-    """The config's part of the extraction's program."""
+    """The config's part of the extraction's program.
+
+    Raises:
+      ValueError: the weights are of another network.
+    """
+    if weights.backbone != config.backbone:
+        raise ValueError(f"weights must be of {config.backbone}; got {weights.backbone}")
     return Extraction(
         preprocessing=weights.preprocessing,
         num_coarse=num_coarse,

@@ -87,7 +87,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
     given = read_given(options.with_database, options.with_hloc, usable, intrinsics)
-    weights = chosen_weights(options.network)
+    weights = chosen_weights(options.network, config.backbone)
     relocalizer = weights.chosen_relocalizer(config)
     identity = {
         "version": importlib.metadata.version("jaxsfm"),

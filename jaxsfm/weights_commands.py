@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from jaxsfm.commands import check_writable
+from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
@@ -16,17 +17,18 @@ Family = Literal["auto", "torchvision", "keras", "caffe", "netvlad"]
 Kernels = Literal["auto", "tensorflow", "theano"]
 
 
-def show(*, network: WeightsChoice = USUAL_WEIGHTS) -> int:
+def show(*, backbone: BackboneName = "vgg16", network: WeightsChoice = USUAL_WEIGHTS) -> int:
     """Show which weights are in use, and check them.
 
     Args:
+      backbone: The network.
       network: The network's parameters.
     """
     from jaxsfm.host.weights import chosen_weights
 
-    loaded = chosen_weights(network)
+    loaded = chosen_weights(network, backbone)
     p = loaded.preprocessing
-    print(f"weights          VGG-16, {loaded.source}")
+    print(f"weights          {loaded.backbone}, {loaded.source}")
     print(f"file             {loaded.path}")
     print(f"family           {loaded.family}")
     print(f"preprocessing    RGB / {p.scale:g}, minus {p.mean}, divided by {p.std}")

@@ -103,6 +103,7 @@ def write_converted(source: Source, out: Path) -> None:
         out,
         canonical_layers(source),
         extras=source.extras,
+        architecture=source.architecture,
         family=source.family,
         preprocessing=canonical_preprocessing(source),
         about={

@@ -11,8 +11,6 @@ import numpy as np
 
 from weights_conversion.source import Source
 
-POOLED_AFTER = ("conv1_2", "conv2_2", "conv3_3", "conv4_3", "conv5_3")
-
 
 def _input(source: Source, rgb: np.ndarray) -> np.ndarray:
     """What the framework's own preprocessing makes of an image, in its order of axes."""
@@ -72,10 +70,11 @@ def layer_maps(source: Source, rgb: np.ndarray) -> Iterator[tuple[str, np.ndarra
     """
     last = source.convention.layout == "HWIO"
     x = _input(source, rgb)
-    for name, (kernel, bias) in source.layers.items():
+    names = [*source.layers, "end"]
+    for (name, (kernel, bias)), following in zip(source.layers.items(), names[1:], strict=True):
         x = _layer(x, kernel, bias, source)
         yield name, x if last else np.moveaxis(x, 0, -1)
         x = np.maximum(x, 0.0)
-        if name in POOLED_AFTER:
+        if following[:5] != name[:5]:  # the last of its block
             x = _pool(x, last)
             yield f"pool{name[4]}", x if last else np.moveaxis(x, 0, -1)

@@ -7,16 +7,26 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jaxsfm.core.vgg import LAYERS, Preprocessing
+from jaxsfm.core.vgg import BLOCKS, Blocks, Preprocessing
 from jaxsfm.errors import UserError
 
 Family = Literal["torchvision", "keras", "caffe", "netvlad"]
 
-NUMBERED = {
-    f"features.{index}": layer
-    for index, layer in zip((0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), LAYERS, strict=True)
-}
-"""torchvision's modules: convolutions, rectifiers and poolings are numbered together."""
+
+def numbered(blocks: Blocks) -> dict[str, str]:
+    """torchvision's modules -> layers: convolutions, rectifiers and poolings are numbered
+    together."""
+    modules, index = {}, 0
+    for block, widths in enumerate(blocks, start=1):
+        for conv in range(1, len(widths) + 1):
+            modules[f"features.{index}"] = f"conv{block}_{conv}"
+            index += 2
+        index += 1
+    return modules
+
+
+NUMBERED = numbered(BLOCKS)
+"""VGG-16's."""
 
 
 class Convention(NamedTuple):
@@ -32,8 +42,10 @@ class Convention(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Source:
-    """A file's thirteen convolutions, as they are in it."""
+    """A file's convolutions, as they are in it."""
 
+    architecture: str = "vgg16"
+    """One of `jaxsfm.host.converted.ARCHITECTURES`."""
     family: Family
     path: Path
     sha256: str

@@ -1,4 +1,4 @@
-"""torchvision's vgg16: RGB in [0, 1], ImageNet statistics, OIHW kernels."""
+"""torchvision's vgg16 and vgg19: RGB in [0, 1], ImageNet statistics, OIHW kernels."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -6,14 +6,19 @@ from pathlib import Path
 import numpy as np
 import safetensors
 
-from jaxsfm.core.vgg import LAYERS
+from jaxsfm.core.vgg import BLOCKS_19, LAYERS, layers_of
 from jaxsfm.errors import UserError
 from jaxsfm.host.weights import TORCHVISION
-from weights_conversion.source import NUMBERED, Convention, Source, check_layers
+from weights_conversion.source import NUMBERED, Convention, Source, check_layers, numbered
 from weights_conversion.torch_files import read_tensors
 
 CONVENTION = Convention(layout="OIHW", bgr=False, convolution=False)
-NAMES = [f"{module}.{part}" for module in NUMBERED for part in ("weight", "bias")]
+NUMBERED_19 = numbered(BLOCKS_19)
+NAMES = [
+    f"{module}.{part}" for module in {**NUMBERED, **NUMBERED_19} for part in ("weight", "bias")
+]
+LAST_19 = f"{list(NUMBERED_19)[-1]}.weight"
+"""What only VGG-19 has."""
 
 
 def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
@@ -33,14 +38,18 @@ def read_torchvision(
       safe: a safetensors file, not one of PyTorch's.
 
     Raises:
-      UserError: it is damaged, or not a VGG-16.
+      UserError: it is damaged, or neither a VGG-16 nor a VGG-19.
     """
     found = _read_safetensors(path) if safe else read_tensors(path, NAMES)
+    deeper = LAST_19 in found
+    if deeper and shapes is LAYERS:
+        shapes = layers_of(BLOCKS_19)
     layers = {
         layer: (found.get(f"{module}.weight"), found.get(f"{module}.bias"))
-        for module, layer in NUMBERED.items()
+        for module, layer in (NUMBERED_19 if deeper else NUMBERED).items()
     }
     return Source(
+        architecture="vgg19" if deeper else "vgg16",
         family="torchvision",
         path=path,
         sha256=sha256,

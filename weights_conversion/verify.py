@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsfm.core.blocks import Layer, convolve, pool
-from jaxsfm.core.vgg import BLOCKS, LAYERS, preprocess
+from jaxsfm.core.vgg import preprocess
 from jaxsfm.host.converted import Converted, read_converted, read_extras
 from weights_conversion.forward import layer_maps
 from weights_conversion.source import Source
@@ -49,11 +49,11 @@ def converted_maps(found: Converted, rgb: np.ndarray) -> dict[str, np.ndarray]:
     size = jnp.asarray([rgb.shape[:2]], jnp.int32)
     x = preprocess(jnp.asarray(rgb), found.preprocessing)[None]
     maps = {}
-    for block, widths in enumerate(BLOCKS, start=1):
-        for k in range(1, len(widths) + 1):
-            name = f"conv{block}_{k}"
+    for block in range(1, 6):
+        names = [name for name in found.layers if name.startswith(f"conv{block}_")]
+        for k, name in enumerate(names):
             kernel, bias = (jnp.asarray(found.layers[name][part]) for part in ("kernel", "bias"))
-            x = convolve(nn.relu(x) if k > 1 else x, size, [Layer(kernel, bias)])
+            x = convolve(nn.relu(x) if k else x, size, [Layer(kernel, bias)])
             maps[name] = x
         x = pool(x, size)
         size = size // 2
@@ -75,7 +75,7 @@ def compare(
     converted: Path,
     *,
     size: tuple[int, int] = SIZE,
-    shapes: Mapping[str, tuple[int, int]] = LAYERS,
+    shapes: Mapping[str, tuple[int, int]] | None = None,
 ) -> list[Compared]:
     """Every map of an image, and every extra array, of the source and of the converted file.
 

@@ -31,6 +31,7 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
     "no-alignment": lambda c: dataclasses.replace(c, aligned_octaves=0),
     "norm": lambda c: dataclasses.replace(c, keypoints="relocalized"),
     "learned": lambda c: dataclasses.replace(c, keypoints="learned"),
+    "alexnet": lambda c: dataclasses.replace(c, backbone="alexnet"),
     "bfloat16": lambda c: dataclasses.replace(c, convolutions="bfloat16"),
     "no-placing": lambda c: dataclasses.replace(
         c, refinement=c.refinement and dataclasses.replace(c.refinement, weak_octaves=0)

@@ -93,7 +93,7 @@ def _dense_models(
 ) -> list[Made]:
     """Per subset; a photo's features and a pair's matches are computed once."""
     config = method_config(method)
-    weights = chosen_weights(network)
+    weights = chosen_weights(network, config.backbone)
     largest = max(len(subset.day) + 1 for subset in scene.subsets)
 
     @functools.lru_cache(maxsize=max(FEATURES, largest))

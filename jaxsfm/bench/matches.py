@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsfm.bench.common import KEYPOINTS, PAIR_ABLATED, method_config, versions
-from jaxsfm.config import Config
+from jaxsfm.config import BackboneName, Config
 from jaxsfm.extraction import image_features
 from jaxsfm.host.colmap import read_matches
 from jaxsfm.host.features import ImageFeatures
@@ -50,7 +50,7 @@ class Matcher:
 
     def __init__(self, network: WeightsChoice) -> None:
         self._network = network
-        self._weights: Weights | None = None
+        self._weights: dict[BackboneName, Weights] = {}
         self._extract = functools.lru_cache(maxsize=FEATURES)(self._timed_features)
 
     def match(
@@ -90,10 +90,10 @@ class Matcher:
         return results
 
     def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
-        if self._weights is None:
-            self._weights = chosen_weights(self._network)
+        if config.backbone not in self._weights:
+            self._weights[config.backbone] = chosen_weights(self._network, config.backbone)
         start = time.monotonic()
-        features = image_features(self._weights, image, config=config)
+        features = image_features(self._weights[config.backbone], image, config=config)
         return features, time.monotonic() - start
 
 

@@ -1,4 +1,4 @@
-"""Converted weights: a VGG-16 of any family in one safetensors format.
+"""Converted weights: a VGG-16 or VGG-19 of any family in one safetensors format.
 
 `weights_conversion` writes them. Channels are RGB whatever the source had, kernels HWIO, and the
 metadata says what they expect of an image and where they come from.
@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.core.vgg import LAYERS, Preprocessing
+from jaxsfm.core.vgg import BLOCKS_19, LAYERS, Preprocessing, layers_of
 from jaxsfm.errors import UserError
 from jaxsfm.host.tensors import Tensors, has_marker, open_tensors, save_tensors
 
 FORMAT = "jaxsfm weights 1"
 """Of converted weights: arrays LAYER.kernel and LAYER.bias, of NetVLAD also `EXTRAS`."""
-ARCHITECTURE = "vgg16"
+ARCHITECTURES = {"vgg16": LAYERS, "vgg19": layers_of(BLOCKS_19)}
+"""Backbone -> its layers' input and output channels."""
 FAMILIES = ("torchvision", "keras", "caffe", "netvlad")
 EXTRAS = {
     "netvlad.assignment": (512, 64),
@@ -34,6 +35,8 @@ Shapes = Mapping[str, tuple[int, int]]
 class Converted(NamedTuple):
     """What such a file holds, without its extras."""
 
+    architecture: str
+    """One of `ARCHITECTURES`."""
     layers: dict[str, dict[str, np.ndarray]]
     """{layer: {'kernel': float32 HWIO, 'bias': float32 O}}."""
     family: str
@@ -52,6 +55,7 @@ def save_weights(
     layers: Mapping[str, Mapping[str, np.ndarray]],
     *,
     extras: Mapping[str, np.ndarray],
+    architecture: str,
     family: str,
     preprocessing: Preprocessing,
     about: Mapping[str, Any],
@@ -68,7 +72,7 @@ def save_weights(
     """
     tensors = {f"{name}.{part}": each[part] for name, each in layers.items() for part in each}
     described = {
-        "architecture": ARCHITECTURE,
+        "architecture": architecture,
         "family": family,
         "preprocessing": preprocessing._asdict(),
     }
@@ -80,18 +84,23 @@ def is_converted(path: Path) -> bool:
     return has_marker(path, FORMAT)
 
 
-def read_converted(path: Path, *, shapes: Shapes = LAYERS) -> Converted:
+def read_converted(path: Path, *, shapes: Shapes | None = None) -> Converted:
     """Read and check converted weights; the extras' shapes are checked, not their values.
+
+    Args:
+      shapes: of the layers; None: the architecture's.
 
     Raises:
       UserError: no such file, or something in it is not as it must be.
     """
     with _open(path) as file:
-        for name, known in (("architecture", (ARCHITECTURE,)), ("family", FAMILIES)):
+        for name, known in (("architecture", (*ARCHITECTURES,)), ("family", FAMILIES)):
             if file.about.get(name) not in known:
                 raise UserError(
                     f"{path}: its {name} must be {' or '.join(known)}; got {file.about.get(name)!r}"
                 )
+        architecture, family = file.about["architecture"], file.about["family"]
+        shapes = shapes or ARCHITECTURES[architecture]
         own = {f"{name}.{part}" for name in shapes for part in ("kernel", "bias")}
         for name in sorted(file.shapes.keys() - own):
             if name not in EXTRAS:
@@ -105,7 +114,7 @@ def read_converted(path: Path, *, shapes: Shapes = LAYERS) -> Converted:
             for name, (inputs, outputs) in shapes.items()
         }
         preprocessing = _preprocessing(file)
-        return Converted(layers, file.about["family"], preprocessing, file.about, file.sha256)
+        return Converted(architecture, layers, family, preprocessing, file.about, file.sha256)
 
 
 def read_extras(path: Path) -> dict[str, np.ndarray]:

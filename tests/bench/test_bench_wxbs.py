@@ -152,7 +152,7 @@ def test_an_ablation_leaves_out_or_exchanges_one_idea():
     assert method_config("robust-no-octaves") == dataclasses.replace(preset("robust"), octaves=1)
     changed = method_config("default-no-consensus")
     assert changed.pair.consensus == 0 and changed != preset("default")
-    assert len(set(map(method_config, ABLATED))) == len(ABLATED) == 17
+    assert len(set(map(method_config, ABLATED))) == len(ABLATED) == 19
     low = method_config("default-bfloat16")
     assert low == dataclasses.replace(preset("default"), convolutions="bfloat16")
     with pytest.raises(ValueError, match="default-no-enlarging"):

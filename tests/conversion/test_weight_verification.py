@@ -113,7 +113,7 @@ def test_the_independent_network_is_what_scipy_computes(layout, convolution, bgr
         convention=Convention(layout, bgr, convolution),
         preprocessing=TORCHVISION,
     )
-    ((_, found),) = layer_maps(source, rgb)
+    (_, found), *_ = layer_maps(source, rgb)
     image = rgb[..., ::-1] if bgr else rgb
     x = (image / 255.0 - np.asarray(TORCHVISION.mean)) / np.asarray(TORCHVISION.std)
     apply = convolve2d if convolution else correlate2d

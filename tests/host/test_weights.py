@@ -52,7 +52,7 @@ def test_a_truncated_wrong_or_missing_file_is_refused_by_its_path(tmp_path):
 
 
 def test_a_damaged_distribution_names_the_command_that_repairs_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "default_path", lambda: tmp_path / "vgg16.ckpt")
+    monkeypatch.setattr(weights, "default_path", lambda _: tmp_path / "vgg16.ckpt")
     for content in (None, b"damaged"):
         if content is not None:
             (tmp_path / "vgg16.ckpt").write_bytes(content)
