@@ -47,7 +47,7 @@ def bench_warps(
     if not images:
         raise UserError(f"--root {root}: no usable images")
     weights = chosen_weights(network)
-    learned = weights.learned.params
+    learned = weights.learned.params if "learned" in methods else None
     warp = functools.partial(
         warped_examples, weights.params, preprocessing=weights.preprocessing, size=VIEW
     )

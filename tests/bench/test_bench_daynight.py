@@ -257,6 +257,7 @@ def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
     ("args", "word"),
     [
         (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}", "--methods", "paper", "--weights", "/nowhere"], "/nowhere: cannot"),
         (["--root", "{root}/room/day"], "no scenes"),
         (["--root", "{root}", "--seed", "-1"], "--seed"),
         (["--root", "{root}", "--seed", "3000000000"], "--seed"),

@@ -133,6 +133,7 @@ def test_a_warped_photograph_is_matched(root, tmp_path, capsys):
     ("args", "word"),
     [
         (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}", "--methods", "paper", "--weights", "/nowhere"], "/nowhere: cannot"),
         (["--root", "{root}/wall"], "no sequences"),
         (["--root", "{root}", "--sets", "floor"], "no set 'floor'"),
     ],

@@ -89,6 +89,7 @@ def test_ratios_are_means_of_the_sets_ratios():
     ("args", "word"),
     [
         (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}", "--methods", "reloc", "--weights", "/nowhere"], "/nowhere: cannot"),
         (["--root", "{root}", "--sets", "cathedral"], "no set 'cathedral'"),
         (["--root", "{root}/room"], "no Strecha sets"),
         (["--root", "{root}", "--methods", "default,orb"], "no method 'orb'"),

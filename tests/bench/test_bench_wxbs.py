@@ -112,6 +112,7 @@ def test_categories_and_pairs_are_chosen_by_name(root, tmp_path, capsys):
     ("args", "word"),
     [
         (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}", "--methods", "paper", "--weights", "/nowhere"], "/nowhere: cannot"),
         (["--root", "{root}/WG"], "no pairs"),
         (["--root", "{root}", "--sets", "WL"], "no set 'WL'"),
         (["--root", "{root}", "--methods", "orb"], "no method 'orb'"),

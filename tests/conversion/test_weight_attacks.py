@@ -122,7 +122,7 @@ def test_a_tensor_never_reaches_past_its_storage(tmp_path, data):
     path = in_zip(tmp_path / "lie.pth", data)
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("archive/data/0", bytes(4 * 108))
-    with pytest.raises(UserError, match="lie.pth"):
+    with pytest.raises(UserError, match="lie.pth: not a readable PyTorch"):
         read_source(path, shapes=SMALL)
 
 

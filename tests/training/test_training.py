@@ -170,6 +170,7 @@ def test_a_trained_file_is_used_by_reconstruct_and_match(
     assert "within 1 px" in text and "step    1" in text
     about = load_relocalizer(out).about
     assert about["options"]["steps"] == 1 and about["photos"]["trained_on"] == 4
+    assert about["walked"] == load_weights().walked
     images = sorted((scene / "images").iterdir())
     run = tmp_path / "run"
     reconstruct = ["reconstruct", str(scene / "images"), "--out", str(run), "--refine", "0"]
@@ -210,3 +211,10 @@ def test_misuse_gets_one_sentence(folder, scene, tmp_path, capsys):
         assert main(arguments) == 2
         error = capsys.readouterr().err
         assert words in error and "Traceback" not in error and len(error.splitlines()) == 1
+
+
+def test_training_on_weights_that_are_not_there_names_them(folder, tmp_path, capsys):
+    out, nowhere = str(tmp_path / "a.safetensors"), str(tmp_path / "nowhere.safetensors")
+    command = ["train", "relocalizer", "--images", str(folder), "--out", out]
+    assert main([*command, "--weights", nowhere]) == 2
+    assert f"{nowhere}: cannot read the weights" in capsys.readouterr().err
