@@ -16,6 +16,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.train_commands import train
+from jaxsfm.view_commands import report, view
 
 BENCHMARKS = {
     "strecha": strecha,
@@ -43,6 +44,8 @@ COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
     "evaluate": evaluate,
+    "report": report,
+    "view": view,
     "demo": demo,
     "weights": weights,
     "train": train,

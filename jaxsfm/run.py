@@ -3,9 +3,11 @@
 import dataclasses
 import importlib.metadata
 import json
+import logging
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -24,13 +26,15 @@ from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, Mapper
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
+from jaxsfm.host.versions import versions
 from jaxsfm.host.weights import Weights, load_weights
-from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
+from jaxsfm.host.workfolder import PAGE, SavedMatches, WorkFolder, open_folder, write_atomic
 from jaxsfm.matching import matched
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures, pair_figures
 
 T = TypeVar("T")
+logger = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,11 +119,18 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             figures = [model_figures(model) for model in models]
             report: dict[str, Any] = {
                 "version": identity["version"],
+                "versions": versions(),
+                "finished": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
                 "options": {
                     "config": dataclasses.asdict(config),
                     **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
                 },
-                "images": {"found": len(names), "usable": len(good), "skipped": skipped},
+                "images": {
+                    "folder": str(images.absolute()),
+                    "found": len(names),
+                    "usable": len(good),
+                    "skipped": skipped,
+                },
                 "pairs": {
                     "tried": len(results),
                     "verified": sum(r.num_inliers > 0 for r in results.values()),
@@ -151,7 +162,18 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             text = json.dumps(report, indent=1, default=str)
             write_atomic(fresh / "report.json", text.encode())
         folder.drop_features()
-        return report
+    _show(out if models or not (out / "sparse").exists() else out / "failed")
+    return report
+
+
+def _show(results: Path) -> None:
+    """Write the page; the run is done, and no fault here may undo it."""
+    try:
+        from jaxsfm.page import write_page
+
+        write_page(results)
+    except Exception as error:
+        logger.warning("%s was not written: %s", results / PAGE, error)
 
 
 def _map(

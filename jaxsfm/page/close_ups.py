@@ -1,0 +1,153 @@
+"""Close-ups of tracks: the cell that matched, the pixel it walked to, its place in the model."""
+
+import functools
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsfm.core.grid import FINE_STRIDE, rescale
+from jaxsfm.host.images import WorkingImage
+from jaxsfm.host.pairs import make_pair
+from jaxsfm.kept import KeptRun, Model
+from jaxsfm.page.embedded import data_uri
+
+TRACKS, PHOTOS = 5, 6
+"""Tracks shown, and photos of each."""
+SIDE = 40
+"""Side of a patch, working pixels."""
+NEAR_PX = 6.0
+"""Working pixels between a keypoint and the observation that the refinement made of it."""
+LEAST = 4
+"""Photos that see a shown point, where there are such points."""
+
+
+class Patch(NamedTuple):
+    """A piece of one photo; places in pixels of the patch, its top-left corner (0, 0)."""
+
+    name: str
+    uri: str
+    cell: tuple[float, float] | None
+    """Top-left corner of the cell of FINE_STRIDE pixels; None: the refinement added this view."""
+    walked: tuple[float, float] | None
+    final: tuple[float, float]
+
+
+class ShownTrack(NamedTuple):
+    """One 3-D point in some of the photos that see it."""
+
+    length: int
+    error: float
+    """Mean reprojection error, original pixels."""
+    patches: list[Patch]
+
+
+def _candidates(model: Model) -> list[int]:
+    """Points that many photos see, from all over the model."""
+    lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
+    least = min(LEAST, int(lengths.max(initial=0)))
+    long = np.flatnonzero((lengths >= least) & (lengths > 0))
+    # Points next to each other in the model's order are next to each other in space.
+    return long[np.linspace(0, len(long) - 1, 4 * TRACKS).astype(int)].tolist() if len(long) else []
+
+
+def _cells(run: KeptRun, load, names: list[str], xy: np.ndarray, radius: np.ndarray) -> dict:
+    """View index -> (cell, keypoint) of the matches that made a track's observations.
+
+    Args:
+      xy: (n, 2), original pixels of the observations in the images `names`.
+      radius: (n,), original pixels: how far off a keypoint may lie.
+    """
+    found = []
+    for i, j in itertools.combinations(range(len(names)), 2):
+        pair = make_pair(names[i], names[j])
+        result = load(pair)
+        if result is None or not result.num_inliers:
+            continue
+        first, second = (i, j) if pair[0] == names[i] else (j, i)
+        off = np.maximum(
+            np.linalg.norm(result.keypoints0 - xy[first], axis=1) / radius[first],
+            np.linalg.norm(result.keypoints1 - xy[second], axis=1) / radius[second],
+        )
+        k = int(np.argmin(off))
+        if off[k] < 1:
+            ends = zip((first, second), (result.keypoints0[k], result.keypoints1[k]), strict=True)
+            found += [
+                (float(off[k]), v, int(result.cells[k, s]), p) for s, (v, p) in enumerate(ends)
+            ]
+    cells: dict[int, tuple[int, np.ndarray]] = {}
+    for _, view, cell, place in sorted(found, key=lambda f: f[:2]):
+        cells.setdefault(view, (cell, place))
+    return cells
+
+
+def _patch(
+    name: str, image: WorkingImage, final: np.ndarray, own: tuple[int, np.ndarray] | None
+) -> Patch:
+    """
+    Args:
+      final: (2,), original pixels.
+      own: cell index and its keypoint, original pixels.
+    """
+    height, width = image.rgb.shape[:2]
+    to_working = 1 / np.asarray(image.scale)
+    aligned = rescale(final, to_working)
+    corner, walked = None, None
+    if own is not None:
+        row, column = divmod(own[0], width // FINE_STRIDE)
+        corner = np.asarray([column, row]) * float(FINE_STRIDE)
+        walked = rescale(np.asarray(own[1], np.float64), to_working)
+    middle = aligned if corner is None else corner + (FINE_STRIDE - 1) / 2
+    x, y = np.round(middle - (SIDE - 1) / 2).astype(int)
+    rows = np.clip(np.arange(y, y + SIDE), 0, height - 1)
+    columns = np.clip(np.arange(x, x + SIDE), 0, width - 1)
+    origin = np.asarray([x, y])
+
+    def at(place: np.ndarray, half: float) -> tuple[float, float]:
+        return tuple((place - origin + half).round(2).tolist())
+
+    return Patch(
+        name=name,
+        uri=data_uri(np.ascontiguousarray(image.rgb[np.ix_(rows, columns)]), ".png"),
+        cell=None if corner is None else at(corner, 0.0),
+        walked=None if walked is None else at(walked, 0.5),
+        final=at(aligned, 0.5),
+    )
+
+
+def _track(run: KeptRun, model: Model, load, point: int) -> ShownTrack | None:
+    rows = np.flatnonzero(model.tracks.point == point)
+    images, places, errors = [], [], []
+    for row in rows:
+        name = model.views[model.tracks.view[row]].name
+        image = run.photos.read(name) if len(images) < PHOTOS else None
+        errors.append(model.errors[row])
+        if image is not None:
+            images.append((name, image))
+            places.append(model.tracks.xy[row])
+    if len(images) < 2:
+        return None
+    names = [name for name, _ in images]
+    radius = NEAR_PX * np.asarray([max(image.scale) for _, image in images])
+    cells = _cells(run, load, names, np.asarray(places), radius)
+    if len(cells) < 2:
+        return None
+    patches = [
+        _patch(name, image, places[k], cells.get(k)) for k, (name, image) in enumerate(images)
+    ]
+    return ShownTrack(len(rows), float(np.mean(errors)), patches)
+
+
+def close_ups(run: KeptRun) -> list[ShownTrack]:
+    """A few tracks; none without a model, photos or matches."""
+    if run.model is None:
+        return []
+    load = functools.lru_cache(maxsize=None)(run.load_matches)
+    shown: list[ShownTrack] = []
+    for point in _candidates(run.model):
+        track = _track(run, run.model, load, point)
+        if track is not None:
+            shown.append(track)
+        if len(shown) == TRACKS:
+            break
+    return shown
