@@ -3,7 +3,6 @@
 import dataclasses
 import importlib.metadata
 import json
-import logging
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -28,13 +27,13 @@ from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhausti
 from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.versions import versions
 from jaxsfm.host.weights import Weights, load_weights
-from jaxsfm.host.workfolder import PAGE, SavedMatches, WorkFolder, open_folder, write_atomic
+from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
 from jaxsfm.matching import matched
+from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures, pair_figures
 
 T = TypeVar("T")
-logger = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -162,18 +161,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             text = json.dumps(report, indent=1, default=str)
             write_atomic(fresh / "report.json", text.encode())
         folder.drop_features()
-    _show(out if models or not (out / "sparse").exists() else out / "failed")
+    page_after_run(out if models or not (out / "sparse").exists() else out / "failed")
     return report
-
-
-def _show(results: Path) -> None:
-    """Write the page; the run is done, and no fault here may undo it."""
-    try:
-        from jaxsfm.page import write_page
-
-        write_page(results)
-    except Exception as error:
-        logger.warning("%s was not written: %s", results / PAGE, error)
 
 
 def _map(

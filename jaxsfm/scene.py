@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jaxsfm.evaluation import Similarity
 from jaxsfm.host.poses import CameraPose
@@ -83,7 +83,7 @@ def _depth(centres: np.ndarray, extent: float) -> float:
     """A frustum's depth: cameras should neither touch each other nor vanish."""
     nearest = extent
     if len(centres) > 1:
-        nearest = float(np.median(cKDTree(centres).query(centres, k=2)[0][:, 1]))
+        nearest = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
     return float(np.clip(0.5 * nearest, 0.01 * extent, 0.08 * extent))
 
 

@@ -22,7 +22,7 @@ def report(
       out: File.html; default: report.html in the run's folder.
     """
     check_writable(out, "--out", (".html",))
-    from jaxsfm.page import write_page
+    from jaxsfm.page.write import write_page
 
     print(write_page(run, images=images, reference=reference, out=out))
     return 0

@@ -91,12 +91,12 @@ def _patch(
     """
     height, width = image.rgb.shape[:2]
     to_working = 1 / np.asarray(image.scale)
-    aligned = rescale(final, to_working)
+    aligned = np.asarray(rescale(final, to_working))
     corner, walked = None, None
     if own is not None:
         row, column = divmod(own[0], width // FINE_STRIDE)
         corner = np.asarray([column, row]) * float(FINE_STRIDE)
-        walked = rescale(np.asarray(own[1], np.float64), to_working)
+        walked = np.asarray(rescale(np.asarray(own[1], np.float64), to_working))
     middle = aligned if corner is None else corner + (FINE_STRIDE - 1) / 2
     x, y = np.round(middle - (SIDE - 1) / 2).astype(int)
     rows = np.clip(np.arange(y, y + SIDE), 0, height - 1)

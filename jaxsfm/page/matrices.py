@@ -123,11 +123,11 @@ def matrix_figures(names: list[str], rows: Sequence[Any]) -> list[Figure]:
 
 
 def _counts_bar(most: int) -> dict[str, Any]:
-    powers = range(int(np.log10(max(most, 1))) + 1)
-    return _bar(powers, [count(10**p) for p in powers])
+    ticks = [k * 10**p for p in range(7) for k in (1, 2, 5) if k * 10**p <= most]
+    return _bar(np.log10(ticks).tolist(), [count(k) for k in ticks])
 
 
-def _bar(at: Sequence[int], labels: list[str]) -> dict[str, Any]:
+def _bar(at: Sequence[float], labels: list[str]) -> dict[str, Any]:
     """The colours' key, above the squares: narrow screens have no room beside them."""
     return {
         "orientation": "h",

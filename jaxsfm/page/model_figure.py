@@ -104,7 +104,13 @@ def model_figure(scene: Scene, unit: str) -> Figure:
                 "zaxis": axis,
             },
             "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-            "legend": {"itemsizing": "constant", "y": 1, "yanchor": "top"},
+            "legend": {
+                "itemsizing": "constant",
+                "orientation": "h",
+                "x": 0,
+                "y": 1,
+                "yanchor": "top",
+            },
         },
         tall=True,
     )

@@ -22,7 +22,7 @@ class Plane(NamedTuple):
     """The matches on one homography, as paths."""
 
     colour: str
-    count: int
+    matches: int
     lines: str
     dots: str
 
@@ -39,7 +39,7 @@ class PairPicture(NamedTuple):
     width: int
     height: int
     planes: list[Plane]
-    count: int
+    matches: int
 
 
 def _chosen(rows: Sequence[Any]) -> list[tuple[str, Any]]:
@@ -114,7 +114,7 @@ def _picture(run: KeptRun, heading: str, row: Any, seen: dict[str, Embedded]) ->
             photo0.place(result.keypoints0),
             photo1.place(result.keypoints1) + np.asarray([shift, 0]),
         ),
-        count=result.num_inliers,
+        matches=result.num_inliers,
     )
 
 

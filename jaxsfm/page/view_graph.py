@@ -50,7 +50,7 @@ def view_graph(names: list[str], rows: Sequence[Any], registered: Collection[str
     xy = np.stack([np.sin(angle), np.cos(angle)], axis=1)
     at = dict(zip(names, xy, strict=True))
 
-    def lines(some: list[Any], name: str, colour: str, width: float, opacity: float, dash: str):
+    def lines(some: list[Any], name: str, colour: str, width: float, opacity: float):
         gap = np.full(2, np.nan)
         path = [p for row in some for p in (at[row["pair"][0]], at[row["pair"][1]], gap)]
         points = np.asarray(path, np.float32).reshape(-1, 2)
@@ -59,16 +59,16 @@ def view_graph(names: list[str], rows: Sequence[Any], registered: Collection[str
             y=points[:, 1],
             mode="lines",
             name=f"{name} ({len(some)})",
-            line={"color": colour, "width": width, "dash": dash},
+            line={"color": colour, "width": width},
             opacity=opacity,
             hoverinfo="skip",
         )
 
-    data = [lines(odd, "not trusted", ORANGE, 1.2, 0.8, "dot")] if odd else []
+    data = [lines(odd, "not trusted", ORANGE, 0.8, 0.35)] if odd else []
     for (low, high, width, opacity), name in zip(BINS, ("weak", "middling", "strong"), strict=True):
         some = [row for row in used if low <= strength(row, most) < high]
         if some:
-            data.append(lines(some, name, BLUE, width, opacity, "solid"))
+            data.append(lines(some, name, BLUE, width, opacity))
     labels = [text(name) for name in short(names)]
     partners = dict.fromkeys(names, 0)
     for row in by_state[USED]:
@@ -98,7 +98,7 @@ def view_graph(names: list[str], rows: Sequence[Any], registered: Collection[str
         "Which photos see the same thing",
         "Each dot is a photo, each blue line a pair that the model rests on, thicker the stronger "
         "it is (1: as many matches as the best pair of both photos, all over the image); orange "
-        f"dots mark pairs that stronger ones contradict.{note}",
+        f"lines are pairs that stronger ones contradict.{note}",
         alt=f"Graph of {len(names)} photos with {len(used)} used and {len(odd)} untrusted pairs",
         data=data,
         layout={

@@ -7,6 +7,7 @@ from typing import Any
 
 import jinja2
 import plotly.offline
+from markupsafe import Markup
 
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.host.images import shown_name
@@ -44,7 +45,7 @@ def _in_script(json: str) -> str:
     return re.sub("[<>&]", lambda m: f"\\u{ord(m[0]):04x}", json)
 
 
-_ENVIRONMENT.filters["in_script"] = lambda json: jinja2.utils.markupsafe.Markup(_in_script(json))
+_ENVIRONMENT.filters["in_script"] = lambda json: Markup(_in_script(json))
 
 
 def image_names(report: dict[str, Any]) -> list[str]:
@@ -77,9 +78,9 @@ def page(run: KeptRun) -> str:
     # A page that is written early in a run's life has no later keys: older runs lack some.
     return _ENVIRONMENT.get_template("page.html").render(
         title=shown_name(run.folder.absolute().name),
-        style=jinja2.utils.markupsafe.Markup(_text("page.css")),
-        script=jinja2.utils.markupsafe.Markup(_text("page.js")),
-        plotly=jinja2.utils.markupsafe.Markup(plotly.offline.get_plotlyjs()),
+        style=Markup(_text("page.css")),
+        script=Markup(_text("page.js")),
+        plotly=Markup(plotly.offline.get_plotlyjs()),
         verdict=tables.verdict(report),
         figures={figure.id: figure for figure in _figures(run, names)},
         pictures=pictures,
