@@ -20,13 +20,6 @@ def run(scene, out, *args, images=None) -> dict:
     return json.loads((out / "report.json").read_text())
 
 
-@pytest.fixture(scope="session")
-def plain(scene, tmp_path_factory) -> tuple[Path, dict]:
-    """One run with known intrinsics, for comparison; tests do not write to it."""
-    out = tmp_path_factory.mktemp("plain") / "out"
-    return out, run(scene, out, "--intrinsics", scene / "K.txt", "--threads", "1")
-
-
 def rows(out: Path, query: str) -> list[tuple]:
     with sqlite3.connect(out / "database.db") as db:
         result = db.execute(query).fetchall()

@@ -2,18 +2,21 @@
 
 import functools
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxsfm.core.grid import FINE_STRIDE, rescale
 from jaxsfm.host.images import WorkingImage
-from jaxsfm.host.pairs import make_pair
+from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.kept import KeptRun, Model
 from jaxsfm.page.embedded import data_uri
 
 TRACKS, PHOTOS = 5, 6
 """Tracks shown, and photos of each."""
+MATCHED = 12
+"""Photos of a track whose matches with each other are looked at."""
 SIDE = 40
 """Side of a patch, working pixels."""
 NEAR_PX = 6.0
@@ -28,7 +31,7 @@ class Patch(NamedTuple):
     name: str
     uri: str
     cell: tuple[float, float] | None
-    """Top-left corner of the cell of FINE_STRIDE pixels; None: the refinement added this view."""
+    """Top-left corner of the cell of FINE_STRIDE pixels; None: none matched."""
     walked: tuple[float, float] | None
     final: tuple[float, float]
 
@@ -51,12 +54,14 @@ def _candidates(model: Model) -> list[int]:
     return long[np.linspace(0, len(long) - 1, 4 * TRACKS).astype(int)].tolist() if len(long) else []
 
 
-def _cells(run: KeptRun, load, names: list[str], xy: np.ndarray, radius: np.ndarray) -> dict:
-    """View index -> (cell, keypoint) of the matches that made a track's observations.
+def _cells(
+    load: Callable[[Pair], PairResult | None], names: list[str], xy: np.ndarray, radius: float
+) -> dict[int, tuple[int, np.ndarray]]:
+    """Place in `names` -> (cell, keypoint) of the matches that made a track's observations.
 
     Args:
       xy: (n, 2), original pixels of the observations in the images `names`.
-      radius: (n,), original pixels: how far off a keypoint may lie.
+      radius: original pixels: how far off a keypoint may lie.
     """
     found = []
     for i, j in itertools.combinations(range(len(names)), 2):
@@ -66,11 +71,11 @@ def _cells(run: KeptRun, load, names: list[str], xy: np.ndarray, radius: np.ndar
             continue
         first, second = (i, j) if pair[0] == names[i] else (j, i)
         off = np.maximum(
-            np.linalg.norm(result.keypoints0 - xy[first], axis=1) / radius[first],
-            np.linalg.norm(result.keypoints1 - xy[second], axis=1) / radius[second],
+            np.linalg.norm(result.keypoints0 - xy[first], axis=1),
+            np.linalg.norm(result.keypoints1 - xy[second], axis=1),
         )
         k = int(np.argmin(off))
-        if off[k] < 1:
+        if off[k] < radius:
             ends = zip((first, second), (result.keypoints0[k], result.keypoints1[k]), strict=True)
             found += [
                 (float(off[k]), v, int(result.cells[k, s]), p) for s, (v, p) in enumerate(ends)
@@ -84,7 +89,8 @@ def _cells(run: KeptRun, load, names: list[str], xy: np.ndarray, radius: np.ndar
 def _patch(
     name: str, image: WorkingImage, final: np.ndarray, own: tuple[int, np.ndarray] | None
 ) -> Patch:
-    """
+    """A patch around the cell, or around the place in the model.
+
     Args:
       final: (2,), original pixels.
       own: cell index and its keypoint, original pixels.
@@ -115,27 +121,25 @@ def _patch(
     )
 
 
-def _track(run: KeptRun, model: Model, load, point: int) -> ShownTrack | None:
+def _track(
+    run: KeptRun, model: Model, load: Callable[[Pair], PairResult | None], point: int
+) -> ShownTrack | None:
     rows = np.flatnonzero(model.tracks.point == point)
-    images, places, errors = [], [], []
-    for row in rows:
-        name = model.views[model.tracks.view[row]].name
-        image = run.photos.read(name) if len(images) < PHOTOS else None
-        errors.append(model.errors[row])
-        if image is not None:
-            images.append((name, image))
-            places.append(model.tracks.xy[row])
-    if len(images) < 2:
-        return None
-    names = [name for name, _ in images]
-    radius = NEAR_PX * np.asarray([max(image.scale) for _, image in images])
-    cells = _cells(run, load, names, np.asarray(places), radius)
-    if len(cells) < 2:
-        return None
-    patches = [
-        _patch(name, image, places[k], cells.get(k)) for k, (name, image) in enumerate(images)
+    names = [model.views[model.tracks.view[row]].name for row in rows]
+    shown = [
+        (k, image) for k, name in enumerate(names[:PHOTOS]) if (image := run.photos.read(name))
     ]
-    return ShownTrack(len(rows), float(np.mean(errors)), patches)
+    if len(shown) < 2:
+        return None
+    names, some = names[:MATCHED], rows[:MATCHED]
+    scale = max(max(image.scale) for _, image in shown)
+    cells = _cells(load, names, model.tracks.xy[some], NEAR_PX * scale)
+    patches = [
+        _patch(names[k], image, model.tracks.xy[rows[k]], cells.get(k)) for k, image in shown
+    ]
+    if sum(patch.cell is not None for patch in patches) < 2:
+        return None
+    return ShownTrack(len(rows), float(np.mean(model.errors[rows])), patches)
 
 
 def close_ups(run: KeptRun) -> list[ShownTrack]:

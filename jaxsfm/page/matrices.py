@@ -52,11 +52,13 @@ def matrix_figures(names: list[str], rows: Sequence[Any]) -> list[Figure]:
         else ""
     )
     side = np.arange(len(labels))
+    ticks = [text(g[0]) for g in groups]
     every = max(1, -(-len(labels) // MAX_LABELS))
     axis = {
+        "type": "category",
         "tickmode": "array",
         "tickvals": side[::every],
-        "ticktext": labels[::every],
+        "ticktext": ticks[::every],
         "showgrid": False,
         "zeroline": False,
         "automargin": True,
@@ -73,10 +75,8 @@ def matrix_figures(names: list[str], rows: Sequence[Any]) -> list[Figure]:
     colours = [
         [edge / len(there), STATES[s].colour] for k, s in enumerate(there) for edge in (k, k + 1)
     ]
-    # Texts for all of 200 x 200 squares would be megabytes.
-    hover = [[f"{a}<br>{b}" for b in labels] for a in labels] if len(labels) <= 60 else None
-    common = {"x": side, "y": side, "text": hover, "hoverongaps": False}
-    where = "%{text}" if hover else "%{x}, %{y}"
+    common = {"x": labels, "y": labels, "hoverongaps": False}
+    where = "%{x}<br>%{y}"
     return [
         figure(
             "inliers",

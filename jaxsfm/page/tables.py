@@ -152,10 +152,11 @@ def photo_table(run: KeptRun, names: Sequence[str]) -> dict[str, Any]:
 
     def worst_first(name: str) -> tuple[bool, float, float]:
         error = evaluation.get(name, {}).get("position", 0.0)
-        return name in seen, -error, -seen.get(name, (0, 0.0))[1]
+        return name not in lost, -error, -seen.get(name, (0, 0.0))[1]
 
     rows = []
-    for name in sorted(names, key=worst_first)[:MAX_PHOTOS]:
+    ordered = sorted(names, key=worst_first)
+    for name in ordered[:MAX_PHOTOS]:
         image = run.photos.read(name)
         observed = seen.get(name)
         rows.append(
@@ -174,7 +175,8 @@ def photo_table(run: KeptRun, names: Sequence[str]) -> dict[str, Any]:
         rows.sort(key=lambda row: (row["lost"] is None, row["name"]))
     return {
         "rows": rows,
-        "left_out": len(names) - len(rows),
+        "left_out": sum(name not in lost for name in ordered[MAX_PHOTOS:]),
+        "more_lost": [lost[name] for name in ordered[MAX_PHOTOS:] if name in lost],
         "evaluated": bool(evaluation),
         "skipped": report["images"]["skipped"],
     }
