@@ -1,6 +1,7 @@
 """The page and the viewer in a real browser."""
 
 import contextlib
+import time
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def test_the_page_draws_every_figure_without_a_fault_or_a_network(opened):
 
 
 def test_the_model_has_points_and_cameras_in_colours(opened):
-    model = picture(opened, "#model .gl-container")
+    model = picture(opened, "#model")[60:]  # below the legend
     ground = np.median(model.reshape(-1, 3), axis=0)
     drawn = (np.abs(model.astype(int) - ground).max(2) > 30).mean()
     assert colours(model) > 60 and drawn > 0.01
@@ -104,17 +105,17 @@ def test_the_viewer_shows_the_model_and_looks_through_a_clicked_camera(browser, 
         for control in ("Point size", "Show cameras", "Show reference", "Size of cameras"):
             assert control in text
         client = next(iter(viewer.server.get_clients().values()))
-        camera = viewer.scene.cameras[0]
-        click(
-            browser,
-            element(browser, "canvas"),
-            client,
-            camera.frustum(viewer.scene.frustum_depth)[:2].mean(0),
-        )
-        wait_for(lambda: viewer.through.value != "")
+        for k in range(20):  # the first ones may come before the page is ready for them
+            camera = viewer.scene.cameras[k % 3]
+            ahead = viewer.scene.frustum_depth * camera.pose.rotation[2]
+            click(browser, element(browser, "canvas"), client, camera.pose.centre + ahead)
+            time.sleep(0.3)
+            if viewer.through.value:
+                break
         assert viewer.through.value in {c.name for c in viewer.scene.cameras}
         chosen = next(c for c in viewer.scene.cameras if c.name == viewer.through.value)
-        wait_for(lambda: np.allclose(client.camera.position, chosen.pose.centre, atol=1e-3))
+        near = 0.05 * viewer.scene.frustum_depth
+        wait_for(lambda: np.abs(client.camera.position - chosen.pose.centre).max() < near)
         assert faults(browser) == []
 
 
@@ -126,7 +127,8 @@ def click(browser, canvas, client, at: np.ndarray) -> None:
     assert local[2] > 0
     half = canvas.size["height"] / 2 / np.tan(client.camera.fov / 2)
     x, y = (round(float(v)) for v in half * local[:2] / local[2])
-    ActionChains(browser).move_to_element_with_offset(canvas, x, y).pause(0.3).click().perform()
+    moves = ActionChains(browser, duration=50).move_to_element_with_offset(canvas, x - 3, y)
+    moves.pause(0.2).move_by_offset(3, 0).pause(0.2).click().perform()
 
 
 def test_the_viewer_says_what_it_lacks(plain, capsys, monkeypatch):
