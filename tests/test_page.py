@@ -18,6 +18,7 @@ from jaxsfm.host.poses import read_poses
 from jaxsfm.kept import read_run
 from jaxsfm.page import write
 from jaxsfm.page.close_ups import close_ups
+from jaxsfm.page.figures import figures3
 from jaxsfm.page.matrices import _reduced, pair_matrices
 from jaxsfm.page.pair_states import NOT_TRUSTED, STATES, USED, state
 from jaxsfm.page.view_graph import BEST_OF_EACH, chosen_edges
@@ -340,3 +341,8 @@ def test_a_scene_far_from_its_origin_is_shown_around_zero(plain, scene):
     moved = Similarity(1.0, np.eye(3), np.asarray([4.5e5, 5.2e6, 300.0]))
     far = dataclasses.replace(run, reference=run.reference._replace(similarity=moved))
     assert np.abs(shown_scene(far).points).max() < 1e3
+
+
+def test_small_and_large_errors_are_written_out():
+    values = (5.2345e-05, 0.02312, 0.0, 1.0, 12345.6)
+    assert [figures3(v) for v in values] == ["0.0000523", "0.0231", "0", "1", "12300"]

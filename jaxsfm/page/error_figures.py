@@ -95,7 +95,7 @@ def cumulative_figures(evaluation: Mapping[str, Any]) -> list[Figure]:
                     )
                 ],
                 layout={
-                    "xaxis": _axis(unit, rangemode="tozero"),
+                    "xaxis": _axis(unit, rangemode="tozero", exponentformat="none"),
                     "yaxis": _axis("photos, %", range=[0, 104]),
                 },
             )

@@ -3,6 +3,7 @@
 import html
 from typing import Any, NamedTuple
 
+import numpy as np
 import plotly.graph_objects as go
 
 from jaxsfm.host.images import shown_name
@@ -20,7 +21,8 @@ class Figure(NamedTuple):
     """One sentence: what it shows and how to read it."""
     alt: str
     spec: str
-    """JSON of data and layout; numbers in base64."""
+    """JSON of data and layout, numbers in base64; plotly escapes < and > in it, so that no name can
+    end the <script> that holds it."""
     tall: bool = False
 
 
@@ -32,6 +34,11 @@ def text(name: str) -> str:
 def count(n: int) -> str:
     """With thin spaces between thousands."""
     return f"{n:,}".replace(",", "\u202f")
+
+
+def figures3(value: float) -> str:
+    """Three significant figures, never as a power of ten."""
+    return np.format_float_positional(value, precision=3, fractional=False, trim="-")
 
 
 def short(names: list[str]) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsfm.kept import KeptRun
 from jaxsfm.page.embedded import embed
-from jaxsfm.page.figures import count
+from jaxsfm.page.figures import count, figures3
 from jaxsfm.page.pair_states import NOT_TRUSTED, NOT_VERIFIED, STATES, USED, state
 
 MAX_PHOTOS, MAX_PAIRS = 60, 15
@@ -78,14 +78,16 @@ def verdict(report: Mapping[str, Any]) -> Verdict:
     evaluation = report.get("evaluation")
     if evaluation:
         position, rotation = evaluation["position"], evaluation["rotation_deg"]
+        mean, most = (
+            f"{figures3(position[k])} of its units and {figures3(rotation[k])} deg"
+            for k in ("mean", "max")
+        )
         sentences.append(
-            f"Against the reference the cameras are off by {position['mean']:.3g} of its units and "
-            f"{rotation['mean']:.3g} deg on average, {position['max']:.3g} and "
-            f"{rotation['max']:.3g} deg at most."
+            f"Against the reference the cameras are off by {mean} on average, {most} at most."
         )
         figures += [
-            Fact("position error", f"{position['mean']:.3g}", "mean, units of the reference"),
-            Fact("rotation error", f"{rotation['mean']:.3g}\u00b0", "mean"),
+            Fact("position error", figures3(position["mean"]), "mean, units of the reference"),
+            Fact("rotation error", f"{figures3(rotation['mean'])}\u00b0", "mean"),
         ]
     else:
         sentences.append(

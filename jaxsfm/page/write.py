@@ -1,6 +1,5 @@
 """Everything of the page put together and written."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from jaxsfm.host.workfolder import PAGE, write_atomic
 from jaxsfm.kept import KeptRun, read_run
 from jaxsfm.page import close_ups, tables
 from jaxsfm.page.error_figures import cumulative_figures, reprojection_figure, track_figure
-from jaxsfm.page.figures import Figure, count
+from jaxsfm.page.figures import Figure, count, figures3
 from jaxsfm.page.matrices import matrix_figures
 from jaxsfm.page.model_figure import model_figure
 from jaxsfm.page.pair_pictures import pair_pictures
@@ -31,6 +30,7 @@ _ENVIRONMENT = jinja2.Environment(
 )
 _ENVIRONMENT.filters["name"] = shown_name
 _ENVIRONMENT.filters["count"] = count
+_ENVIRONMENT.filters["figures3"] = figures3
 
 
 def _text(file: str) -> str:
@@ -38,14 +38,6 @@ def _text(file: str) -> str:
     found = _ENVIRONMENT.loader
     assert found is not None
     return found.get_source(_ENVIRONMENT, file)[0]
-
-
-def _in_script(json: str) -> str:
-    """JSON that no name in it can end the <script> around."""
-    return re.sub("[<>&]", lambda m: f"\\u{ord(m[0]):04x}", json)
-
-
-_ENVIRONMENT.filters["in_script"] = lambda json: Markup(_in_script(json))
 
 
 def image_names(report: dict[str, Any]) -> list[str]:
