@@ -399,6 +399,8 @@ def test_remapping_without_success_keeps_the_earlier_model(scene, tmp_path, caps
     assert {p: p.read_bytes() for p in (out / "sparse").rglob("*.bin")} == before
     assert (out / "report.json").read_bytes() == report
     assert json.loads((out / "failed" / "report.json").read_text())["models"] == []
+    pages = [(folder / "report.html").read_text() for folder in (out, out / "failed")]
+    assert ["No model could be built." in page for page in pages] == [False, True]
 
 
 def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(

@@ -13,6 +13,6 @@ def page_after_run(results: Path) -> None:
     try:
         from jaxsfm.page.write import write_page
 
-        write_page(results)
+        logger.info("what it did, to look at: %s", write_page(results))
     except Exception as error:
         logger.warning("%s was not written (%s)", results / PAGE, error)
