@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from jaxsfm.pipeline import match as match
     from jaxsfm.pipeline import open_images as open_images
     from jaxsfm.pipeline import reconstruct as reconstruct
-    from jaxsfm.run import RunOptions as RunOptions
     from jaxsfm.run import run_folder as run_folder
+    from jaxsfm.run_options import RunOptions as RunOptions
 
 _HOME = {
     "Config": "config",
@@ -54,7 +54,7 @@ _HOME = {
     "match": "pipeline",
     "open_images": "pipeline",
     "reconstruct": "pipeline",
-    "RunOptions": "run",
+    "RunOptions": "run_options",
     "run_folder": "run",
 }
 

@@ -40,7 +40,7 @@ def _check(
     threads: int = -1,
 ) -> None:
     from jaxsfm.config import MIN_SIDE
-    from jaxsfm.run import check_seed, check_threads
+    from jaxsfm.run_options import check_seed, check_threads
 
     check_seed(seed)
     check_threads(threads)

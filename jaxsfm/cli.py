@@ -4,7 +4,6 @@ import functools
 import logging
 import operator
 import os
-import platform
 import re
 import sys
 import threading
@@ -13,7 +12,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxsfm.bench.common import versions
 from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, wxbs
 from jaxsfm.commands import demo, evaluate, match, reconstruct
 from jaxsfm.data_commands import data
@@ -21,7 +19,9 @@ from jaxsfm.errors import UserError
 from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
+from jaxsfm.host.versions import package_versions
 from jaxsfm.train_commands import train
+from jaxsfm.view_commands import report, view
 from jaxsfm.weights_commands import weights, with_action
 
 _WRAPPED = re.compile(r"\n {8,}(?=[^\s$])")
@@ -68,6 +68,8 @@ COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
     "evaluate": evaluate,
+    "report": report,
+    "view": view,
     "export": export,
     "demo": demo,
     "weights": weights,
@@ -79,8 +81,8 @@ COMMANDS = {
 
 def version_lines() -> list[str]:
     """jaxsfm's own version and those of what its results depend on."""
-    found = versions()
-    lines = [f"jaxsfm {found.pop('jaxsfm')}", f"  python {platform.python_version()}"]
+    found = package_versions()
+    lines = [f"jaxsfm {found.pop('jaxsfm')}"]
     return lines + [f"  {name} {version}" for name, version in found.items()]
 
 

@@ -142,7 +142,8 @@ def reconstruct(
     )
     from jaxsfm.execution import Execution
     from jaxsfm.report import summary_lines
-    from jaxsfm.run import RunOptions, run_folder
+    from jaxsfm.run import run_folder
+    from jaxsfm.run_options import RunOptions
 
     try:
         execution = Execution(
@@ -228,7 +229,7 @@ def match(
     from jaxsfm.host.workfolder import atomic_file
     from jaxsfm.matching import match_features
     from jaxsfm.pair_alignment import align
-    from jaxsfm.run import check_seed
+    from jaxsfm.run_options import check_seed
 
     check_seed(seed)
     files = [inspect_image(path, name=str(path)) for path in (image0, image1)]

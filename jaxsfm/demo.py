@@ -6,7 +6,8 @@ from pathlib import Path
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.report import summary_lines
-from jaxsfm.run import RunOptions, run_folder
+from jaxsfm.run import run_folder
+from jaxsfm.run_options import RunOptions
 from jaxsfm.synthetic import write_scene
 
 MAX_POSITION = 0.002

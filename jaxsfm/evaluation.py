@@ -164,6 +164,31 @@ def align(ours: np.ndarray, reference: np.ndarray) -> Similarity:
     return umeyama(ours, reference)
 
 
+def common_alignment(
+    model: Poses, reference: Poses, *, align_on: Collection[str] | None = None
+) -> tuple[dict[str, str], list[str], Similarity]:
+    """Our name -> the reference's of the common images, those aligned on, and the similarity that
+    takes the model to the reference; arguments and errors as `evaluate`."""
+    names = pair_names(model, reference)
+    if not names:
+        raise UserError(
+            f"--reference: no common images (the model has e.g. {min(model, default='none')!r}, "
+            f"the reference {min(reference, default='none')!r})"
+        )
+    chosen = sorted(names)
+    if align_on is not None:
+        known = set(names) | set(model) | set(reference)
+        if unknown := [name for name in align_on if name not in known]:
+            raise UserError(f"--align-on: no image named {unknown[0]!r}")
+        wanted = set(align_on)
+        chosen = [n for n in chosen if n in wanted or names[n] in wanted]
+    similarity = align(
+        np.asarray([model[n].centre for n in chosen]).reshape(-1, 3),
+        np.asarray([reference[names[n]].centre for n in chosen]).reshape(-1, 3),
+    )
+    return names, chosen, similarity
+
+
 def evaluate(
     model: Poses, reference: Poses, *, align_on: Collection[str] | None = None
 ) -> Evaluation:
@@ -178,23 +203,7 @@ def evaluate(
     Raises:
       UserError: no common images, unknown names, or centres that determine no similarity.
     """
-    names = pair_names(model, reference)
-    if not names:
-        raise UserError(
-            f"--reference: no common images (the model has e.g. {min(model, default='none')!r}, "
-            f"the reference {min(reference, default='none')!r})"
-        )
-    chosen = sorted(names)
-    if align_on is not None:
-        known = set(names) | set(model) | set(reference)
-        if unknown := [name for name in align_on if name not in known]:
-            raise UserError(f"--align-on: no image named {unknown[0]!r}")
-        wanted = set(align_on)
-        chosen = [n for n in chosen if n in wanted or names[n] in wanted]
-    sim = align(
-        np.asarray([model[n].centre for n in chosen]).reshape(-1, 3),
-        np.asarray([reference[names[n]].centre for n in chosen]).reshape(-1, 3),
-    )
+    names, chosen, sim = common_alignment(model, reference, align_on=align_on)
     errors = {}
     for name, other in sorted(names.items()):
         ours, truth = model[name], reference[other]

@@ -6,15 +6,15 @@ import json
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.execution import Execution
 from jaxsfm.extraction import extracted, image_features
 from jaxsfm.host import interrupt
 from jaxsfm.host.colmap import write_models
@@ -22,46 +22,19 @@ from jaxsfm.host.features import ImageFeatures, image_room
 from jaxsfm.host.given import Beside, read_given
 from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
-from jaxsfm.host.mapping import MapOptions, Mapper
+from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
+from jaxsfm.host.versions import versions
 from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
 from jaxsfm.matching import matched
+from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures, pair_figures
-from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.run_options import RunOptions, check_options
 
 T = TypeVar("T")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """What to do, beyond the matching `Config`."""
-
-    pairs: str = "exhaustive"
-    """`exhaustive`, or a file with two image names a line."""
-    best_pairs: int | None = None
-    """Hand on only each image's N pairs with the most inliers (a union); None: all."""
-    intrinsics: str | None = None
-    """K.txt or MODEL:p1,p2,..; None: one camera per photo."""
-    refine_intrinsics: Literal["auto", "yes", "no"] = "auto"
-    """`auto` refines them unless they are given."""
-    mapper: Mapper = "incremental"
-    seed: int = 0
-    threads: int = -1
-    network: WeightsChoice = USUAL_WEIGHTS
-    """The files of its parameters."""
-    reference: Path | None = None
-    """Reference poses to evaluate the model against."""
-    with_database: Path | None = None
-    """A COLMAP database of the same photos, whose matches are mapped beside ours."""
-    with_hloc: tuple[Path, Path] | None = None
-    """hloc's features and matches, likewise."""
-    execution: Execution = dataclasses.field(default_factory=Execution)
-    """Devices, batches, memory."""
-    progress: bool = False
-    """Progress bars on standard error."""
 
 
 def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) -> dict[str, Any]:
@@ -73,7 +46,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     Raises:
       UserError: what was given cannot be used. Nothing already computed is lost.
     """
-    _check_options(options)
+    check_options(options)
     reference = read_poses(options.reference) if options.reference else None
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, skipped = open_images(images, progress=options.progress)
@@ -123,12 +96,19 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             figures = [model_figures(model) for model in models]
             report: dict[str, Any] = {
                 "version": identity["version"],
+                "versions": versions(),
+                "finished": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
                 "weights": weights.described(config),
                 "options": {
                     "config": dataclasses.asdict(config),
                     **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
                 },
-                "images": {"found": len(names), "usable": len(good), "skipped": skipped},
+                "images": {
+                    "folder": str(images.absolute()),
+                    "found": len(names),
+                    "usable": len(good),
+                    "skipped": skipped,
+                },
                 "pairs": {
                     "tried": len(results),
                     "verified": sum(r.num_inliers > 0 for r in results.values()),
@@ -161,7 +141,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             text = json.dumps(report, indent=1, default=str)
             write_atomic(fresh / "report.json", text.encode())
         folder.drop_features()
-        return report
+    page_after_run(out if models or not (out / "sparse").exists() else out / "failed")
+    return report
 
 
 def _map(
@@ -200,7 +181,7 @@ def _map(
             intrinsics=intrinsics,
             options=MapOptions(
                 mapper=options.mapper,
-                refine_intrinsics=_refines(options),
+                refine_intrinsics=options.refines,
                 seed=options.seed,
                 threads=options.threads,
             ),
@@ -218,35 +199,10 @@ def _map(
     return made
 
 
-def _check_options(options: RunOptions) -> None:
-    if options.best_pairs is not None and options.best_pairs < 1:
-        raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
-    check_seed(options.seed)
-    check_threads(options.threads)
-
-
-def check_seed(seed: int) -> None:
-    """Raises UserError unless COLMAP takes it."""
-    if not 0 <= seed < 2**31:
-        raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
-
-
-def check_threads(threads: int) -> None:
-    """Raises UserError unless COLMAP takes it."""
-    if threads == 0 or threads < -1:
-        raise UserError(f"--threads must be positive, or -1 for all; got {threads}")
-
-
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:
     if len(images) < 2:
         why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
         raise UserError(f"{folder}: {len(images)} usable images, at least 2 are needed{why}")
-
-
-def _refines(options: RunOptions) -> bool:
-    if options.refine_intrinsics == "auto":
-        return options.intrinsics is None
-    return options.refine_intrinsics == "yes"
 
 
 @contextmanager

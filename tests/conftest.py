@@ -1,5 +1,6 @@
 """Strict numerics for every test, and the inputs that several tests share."""
 
+import json
 import os
 import threading
 from pathlib import Path
@@ -74,3 +75,23 @@ def server(monkeypatch):
         threading.Thread(target=made.serve_forever, daemon=True).start()
         yield made
         made.shutdown()
+
+
+@pytest.fixture(scope="session")
+def plain(scene, tmp_path_factory) -> tuple[Path, dict]:
+    """A run of the scene with known intrinsics and its report; tests do not write to it."""
+    from jaxsfm.cli import main
+
+    out = tmp_path_factory.mktemp("plain") / "out"
+    args = [str(scene / "images"), "--out", str(out), "--intrinsics", str(scene / "K.txt")]
+    assert main(["reconstruct", *args, "--threads", "1"]) == 0
+    return out, json.loads((out / "report.json").read_text())
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A headless Chromium without a network beyond this machine."""
+    from chromium import started
+
+    with started() as driver:
+        yield driver

@@ -22,13 +22,6 @@ def run(scene, out, *args, images=None) -> dict:
     return json.loads((out / "report.json").read_text())
 
 
-@pytest.fixture(scope="session")
-def plain(scene, tmp_path_factory) -> tuple[Path, dict]:
-    """One run with known intrinsics, for comparison; tests do not write to it."""
-    out = tmp_path_factory.mktemp("plain") / "out"
-    return out, run(scene, out, "--intrinsics", scene / "K.txt", "--threads", "1")
-
-
 def rows(out: Path, query: str) -> list[tuple]:
     with sqlite3.connect(out / "database.db") as db:
         result = db.execute(query).fetchall()
@@ -447,6 +440,8 @@ def test_remapping_without_success_keeps_the_earlier_model(scene, tmp_path, caps
     assert {p: p.read_bytes() for p in (out / "sparse").rglob("*.bin")} == before
     assert (out / "report.json").read_bytes() == report
     assert json.loads((out / "failed" / "report.json").read_text())["models"] == []
+    pages = [(folder / "report.html").read_text() for folder in (out, out / "failed")]
+    assert ["No model could be built." in page for page in pages] == [False, True]
 
 
 def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(

@@ -1,7 +1,6 @@
 """What the benchmarks share: methods, figures, tables, JSON."""
 
 import dataclasses
-import importlib.metadata
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -139,14 +138,6 @@ def usable_image(path: Path, *, name: str | None = None) -> ImageFile:
       UserError: it cannot be used; names the whole path.
     """
     return dataclasses.replace(inspect_image(path, name=str(path)), name=name or path.name)
-
-
-def versions() -> dict[str, str]:
-    """Of what the figures depend on."""
-    return {
-        name: importlib.metadata.version(name)
-        for name in ("jaxsfm", "jax", "pycolmap", "opencv-python-headless")
-    }
 
 
 def spread(values: Iterable[float]) -> dict[str, float]:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.common import RUN_ABLATED, Keep, method_config, versions
+from jaxsfm.bench.common import RUN_ABLATED, Keep, method_config
 from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.errors import UserError
@@ -27,6 +27,7 @@ from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.host.poses import Poses, model_poses
 from jaxsfm.host.rootsift import write_rootsift_database
+from jaxsfm.host.versions import package_versions
 from jaxsfm.host.weights import chosen_weights
 from jaxsfm.matching import matched
 from jaxsfm.pipeline import reconstruct
@@ -259,7 +260,7 @@ def _result(rows: list[dict[str, Any]], setting: dict[str, Any]) -> dict[str, An
     }
     return {
         "benchmark": "daynight",
-        "versions": versions(),
+        "versions": package_versions(),
         **setting,
         "rows": rows,
         "totals": totals,

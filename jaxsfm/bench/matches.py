@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.common import KEYPOINTS, PAIR_ABLATED, method_config, versions
+from jaxsfm.bench.common import KEYPOINTS, PAIR_ABLATED, method_config
 from jaxsfm.config import BackboneName, Config
 from jaxsfm.extraction import image_features
 from jaxsfm.host.colmap import read_matches
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.rootsift import write_rootsift_database
+from jaxsfm.host.versions import package_versions
 from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.matching import match_features
 from jaxsfm.pair_alignment import align
@@ -123,7 +124,7 @@ def pair_figures(
     """The plain JSON of a benchmark of pairs."""
     return {
         "benchmark": benchmark,
-        "versions": versions(),
+        "versions": package_versions(),
         "seeds": seeds,
         "max_size": max_size,
         "rows": rows,

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxsfm.bench.common import Keep, check_root, choose_sets, read_rows, spread, versions
+from jaxsfm.bench.common import Keep, check_root, choose_sets, read_rows, spread
 from jaxsfm.config import Config, preset
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.errors import UserError
+from jaxsfm.host.versions import package_versions
 from jaxsfm.matching import thresholds
 
 SUFFIX = "_pts.txt"
@@ -133,7 +134,7 @@ def bench_planes(
 
 
 def _result(rows: list[dict[str, Any]], seeds: int) -> dict[str, Any]:
-    return {"benchmark": "planes", "versions": versions(), "seeds": seeds, "rows": rows}
+    return {"benchmark": "planes", "versions": package_versions(), "seeds": seeds, "rows": rows}
 
 
 def row_line(row: dict[str, Any]) -> str:

@@ -18,7 +18,6 @@ from jaxsfm.bench.common import (
     choose_sets,
     method_config,
     read_rows,
-    versions,
 )
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
@@ -28,10 +27,12 @@ from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.host.rootsift import write_rootsift_database
+from jaxsfm.host.versions import package_versions
 from jaxsfm.host.workfolder import write_atomic
 from jaxsfm.pipeline import open_images
 from jaxsfm.report import model_figures
-from jaxsfm.run import RunOptions, run_folder
+from jaxsfm.run import run_folder
+from jaxsfm.run_options import RunOptions
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 METHODS = ("rootsift", "grid", "reloc", "learned", "default", "robust", *RUN_ABLATED)
@@ -232,7 +233,7 @@ def bench_strecha(
 def _result(rows: list[dict[str, Any]], known_intrinsics: bool, seed: int) -> dict[str, Any]:
     return {
         "benchmark": "strecha",
-        "versions": versions(),
+        "versions": package_versions(),
         "intrinsics": "known" if known_intrinsics else "refined from a guess",
         "seed": seed,
         "rows": rows,

@@ -13,8 +13,9 @@ from typing import Any
 
 import jax
 
-from jaxsfm.bench.common import Keep, spread, versions
+from jaxsfm.bench.common import Keep, spread
 from jaxsfm.errors import UserError
+from jaxsfm.host.versions import package_versions
 from jaxsfm.host.weights import chosen_weights
 from jaxsfm.pipeline import open_images
 from jaxsfm.training.objective import mean_shares, shares, warped_examples
@@ -82,7 +83,7 @@ def _result(
     return {
         "benchmark": "warps",
         "synthetic": True,
-        "versions": versions(),
+        "versions": package_versions(),
         "photos": photos,
         "seeds": seeds,
         "pairs_of_views": batches * BATCH,

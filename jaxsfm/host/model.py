@@ -111,6 +111,12 @@ def read_model_arrays(
     return views, Tracks(points, rows[:, 0], rows[:, 1], xy)
 
 
+def point_colours(model: pycolmap.Reconstruction) -> np.ndarray:
+    """uint8 (n, 3), RGB, of the points in the order of `read_model_arrays`."""
+    ids = sorted(model.point3D_ids())
+    return np.asarray([model.point3D(i).color for i in ids], np.uint8).reshape(-1, 3)
+
+
 def errors_px(views: list[View], tracks: Tracks) -> np.ndarray:
     """Reprojection error of every observation, working pixels; infinite behind the camera."""
     errors = np.empty(len(tracks.xy))

@@ -29,7 +29,9 @@ logger = logging.getLogger(__name__)
 
 _OCTAVES = ("coarse", "fine")
 """Fields of DenseFeatures that hold an array per octave."""
-RESULTS = ("report.json", "sparse", "database.db")
+PAGE = "report.html"
+"""Written after the other results, from them (`jaxsfm.page`)."""
+RESULTS = (PAGE, "report.json", "sparse", "database.db")
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile)
 
 

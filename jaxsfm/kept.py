@@ -1,0 +1,154 @@
+"""A finished run, read again from what its folder keeps: for looking at it, never for going on."""
+
+import dataclasses
+import functools
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsfm.errors import UserError
+from jaxsfm.evaluation import Similarity, common_alignment, evaluate
+from jaxsfm.host.images import ImageError, WorkingImage, inspect_image, read_image
+from jaxsfm.host.model import Tracks, View, errors_px, point_colours, read_model_arrays
+from jaxsfm.host.pairs import Pair, PairResult
+from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.host.workfolder import WorkFolder
+
+logger = logging.getLogger(__name__)
+
+
+class Model(NamedTuple):
+    """The best model, in original pixels (`View.scale` is 1)."""
+
+    views: list[View]
+    tracks: Tracks
+    colours: np.ndarray
+    """uint8 (n, 3), RGB of the points."""
+    errors: np.ndarray
+    """float64 (m,): reprojection error of every observation, original pixels."""
+
+
+class Reference(NamedTuple):
+    """Reference poses and how the model is moved onto them."""
+
+    poses: Poses
+    similarity: Similarity
+    """Model to reference."""
+
+
+class Photos:
+    """The run's photos, as long as they are where they were and what they were."""
+
+    def __init__(self, folder: Path | None, hashes: Mapping[str, str], report: Mapping) -> None:
+        config = report["options"]["config"]
+        self.folder = folder
+        self._hashes = hashes
+        self._sizes = {"max_size": config["max_size"], "enlarge": config["enlarge"]}
+        self.read = functools.lru_cache(maxsize=16)(self._read)
+
+    def _read(self, name: str) -> WorkingImage | None:
+        """A photo at working size; None if it is gone, changed or cannot be decoded."""
+        if self.folder is None:
+            return None
+        try:
+            image = inspect_image(self.folder / name, name=name)
+            if image.sha256 != self._hashes.get(name):
+                return None
+            return read_image(image, **self._sizes)
+        except ImageError:
+            return None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KeptRun:
+    """What is left of a run."""
+
+    folder: Path
+    """Where its results lie."""
+    report: dict[str, Any]
+    """The content of report.json; `evaluation` is against `reference`."""
+    photos: Photos
+    model: Model | None
+    reference: Reference | None
+    matches: WorkFolder
+
+    def load_matches(self, pair: Pair) -> PairResult | None:
+        """Of one pair, original pixels; None if there are none or the file is gone."""
+        return self.matches.load_matches(pair)
+
+
+def _json(path: Path) -> dict[str, Any] | None:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _model(folder: Path) -> tuple[Model, Poses] | None:
+    if not (folder / "sparse" / "0").is_dir():
+        return None
+    model = read_model(folder / "sparse" / "0")
+    cameras = {model.image(i).name: model.camera(model.image(i).camera_id) for i in model.images}
+    sizes = {name: ((c.width, c.height), (1.0, 1.0)) for name, c in cameras.items()}
+    views, tracks = read_model_arrays(model, sizes)
+    errors = errors_px(views, tracks)
+    return Model(views, tracks, point_colours(model), errors), model_poses(model)
+
+
+def _reference(report: dict[str, Any], poses: Poses, given: Path | None) -> Reference | None:
+    """Reference poses, and in `report` the errors against them.
+
+    Those that the run was given may be gone by now; those that are given now must be readable.
+    """
+    recorded = report["options"].get("reference")
+    if given is None and recorded is None:
+        return None
+    try:
+        reference = read_poses(given or Path(recorded))
+        _, _, similarity = common_alignment(poses, reference)
+        report["evaluation"] = evaluate(poses, reference).as_dict()
+    except UserError as error:
+        if given is not None:
+            raise
+        logger.warning("the reference poses of the run are not shown: %s", error)
+        return None
+    return Reference(reference, similarity)
+
+
+def read_run(folder: Path, *, images: Path | None = None, reference: Path | None = None) -> KeptRun:
+    """Read a run's results.
+
+    Args:
+      folder: a run's OUT, or OUT/failed.
+      images: folder of the photos; default: where the run found them.
+      reference: reference poses to compare with; default: the run's.
+
+    Raises:
+      UserError: no finished run, or what was named cannot be used.
+    """
+    report = _json(folder / "report.json")
+    if report is None or not {"options", "images", "pairs", "models"} <= report.keys():
+        raise UserError(f"{folder}: no finished run here (report.json is missing or damaged)")
+    if images is not None and not images.is_dir():
+        raise UserError(f"--images {images}: no such folder")
+    home = folder if (folder / "run.json").exists() else folder.parent
+    hashes = (_json(home / "run.json") or {}).get("images", {})
+    recorded = report["images"].get("folder")
+    where = images or (Path(recorded) if recorded else None)
+    found = _model(folder) if report["models"] else None
+    model, poses = found if found else (None, {})
+    if reference is not None and not poses:
+        raise UserError(f"--reference {reference}: {folder} has no model to compare with it")
+    return KeptRun(
+        folder=folder,
+        report=report,
+        photos=Photos(where, hashes, report),
+        model=model,
+        reference=_reference(report, poses, reference) if poses else None,
+        matches=WorkFolder(home),
+    )

@@ -1,0 +1,49 @@
+"""Copies of a finished run, changed."""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pycolmap
+
+from jaxsfm.host.workfolder import WorkFolder
+
+HOSTILE = "<img src=x onerror=document.title='owned'><b>&amp;.png"
+"""A file name that would do harm, or look wrong, if it were not escaped."""
+
+
+def change_report(out: Path, change) -> Path:
+    """Rewrite report.json by a function that changes it in place."""
+    path = out / "report.json"
+    report = json.loads(path.read_text())
+    change(report)
+    path.write_text(json.dumps(report))
+    return out
+
+
+def renamed(out: Path, images: Path, to: Path, old: str, new: str) -> tuple[Path, Path]:
+    """The run and its photos with one image under another name, in all places."""
+    run, photos = to / "run", to / "images"
+    shutil.copytree(out, run)
+    shutil.copytree(images, photos)
+    (photos / old).rename(photos / new)
+    quoted = {json.dumps(old): json.dumps(new)}
+    for name in ("report.json", "run.json"):
+        text = (run / name).read_text()
+        for before, after in quoted.items():
+            text = text.replace(before, after)
+        (run / name).write_text(text)
+    model = pycolmap.Reconstruction(run / "sparse" / "0")
+    for image_id in list(model.images):
+        if model.image(image_id).name == old:
+            model.image(image_id).name = new
+    model.write(run / "sparse" / "0")
+    folder, report = WorkFolder(run), json.loads((out / "report.json").read_text())
+    for row in report["pairs"]["each"]:
+        result = folder.load_matches(tuple(row["pair"]))
+        if old in row["pair"] and result is not None:
+            pair = tuple(new if name == old else name for name in row["pair"])
+            folder.save_matches(dataclasses.replace(result, pair=pair))
+    change_report(run, lambda report: report["images"].update(folder=str(photos)))
+    return run, photos
