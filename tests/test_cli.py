@@ -564,3 +564,21 @@ def test_given_files_that_cannot_be_used_are_refused_before_the_work(scene, tmp_
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert option[0] in line and "d.db" in line
     assert not out.exists()
+
+
+def test_another_backbone_goes_through_the_whole_pipeline(scene, tmp_path):
+    report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt", "--backbone", "alexnet")
+    assert report["weights"]["backbone"] == "alexnet"
+    assert report["options"]["config"]["backbone"] == "alexnet"
+    assert report["pairs"]["verified"] > 0 and report["models"][0]["registered"] >= 2
+
+
+def test_a_backbone_that_cannot_be_used_is_one_sentence(scene, tmp_path, capsys):
+    arguments = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
+    for more, word in (
+        (["--backbone", "vgg19"], "--weights"),
+        (["--backbone", "alexnet", "--keypoints", "learned"], "vgg16"),
+    ):
+        assert main([*arguments, *more]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert "backbone" in line and word in line

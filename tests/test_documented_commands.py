@@ -28,7 +28,11 @@ LONG = (
     "jaxsfm.run.run_folder",
     "jaxsfm.demo.run_demo",
     "jaxsfm.training.relocalizer.train_relocalizer",
+    "jaxsfm.extraction.image_features",
     "jaxsfm.datasets.fetch",
+    "jaxsfm.view.serve",
+    "weights_conversion.convert.read_source",
+    "weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
         for name in ("strecha", "daynight", "wxbs", "homography", "planes", "warps")
@@ -59,22 +63,13 @@ class Reached(Exception):
     """A long function was called with arguments that it takes."""
 
 
-@pytest.fixture(scope="module")
-def finished(scene, tmp_path_factory) -> Path:
-    """A short run's folder."""
-    out = tmp_path_factory.mktemp("finished") / "OUT"
-    args = ["--intrinsics", str(scene / "K.txt"), "--preset", "paper", "--threads", "1"]
-    assert main(["reconstruct", str(scene / "images"), "--out", str(out), *args]) == 0
-    return out
-
-
 @pytest.fixture
-def home(finished, scene, tmp_path, monkeypatch):
+def home(plain, scene, tmp_path, monkeypatch):
     """A folder in which all the names exist that the documentation uses."""
     photos = sorted((scene / "images").iterdir())
-    for name in ("PHOTOS", "OTHER_PHOTOS", "FOLDER", "SETS", "SCENES", "OXFORD", "DIR"):
+    for name in ("PHOTOS", "OTHER_PHOTOS", "FOLDER", "SETS", "SCENES", "OXFORD", "DIR", "images"):
         shutil.copytree(scene / "images", tmp_path / name)
-    shutil.copytree(finished, tmp_path / "OUT")
+    shutil.copytree(plain[0], tmp_path / "OUT")
     for name in ("POSES", "SET"):
         shutil.copytree(scene / "reference", tmp_path / name)
     for name in ("SET/images", "sacre_coeur/mapping"):
@@ -82,7 +77,8 @@ def home(finished, scene, tmp_path, monkeypatch):
     shutil.copy(scene / "K.txt", tmp_path / "SET/images")
     for name, photo in (("A.jpg", photos[0]), ("B.jpg", photos[1])):
         shutil.copy(photo, tmp_path / name)
-    shutil.copy(scene / "K.txt", tmp_path)
+    for folder in (tmp_path, tmp_path / "images"):
+        shutil.copy(scene / "K.txt", folder)
     (tmp_path / "pairs.txt").write_text(f"{photos[0].name} {photos[1].name}\n")
     shutil.copy(ROOT / "jaxsfm/relocalizer.safetensors", tmp_path / "mine.safetensors")
     monkeypatch.chdir(tmp_path)

@@ -15,15 +15,20 @@ from imitations import (
     keras_theano,
     matconvnet,
     netvlad,
+    random_layers,
     torch_zip,
     torchvision_names,
 )
 
+from jaxsfm.core.vgg import BLOCKS_19, layers_of
 from jaxsfm.errors import UserError
 from jaxsfm.host.converted import read_converted, read_extras
 from jaxsfm.host.weights import TORCHVISION
 from weights_conversion.convert import read_source, write_converted
+from weights_conversion.source import numbered
+from weights_conversion.verify import agrees, compare
 
+DEEP = layers_of(BLOCKS_19)
 CAFFE = (1.0, (123.68, 116.779, 103.939), (1.0, 1.0, 1.0))
 
 
@@ -246,3 +251,27 @@ def test_a_converted_file_is_no_source_and_no_source_is_overwritten(files, sourc
     with pytest.raises(UserError, match="is the file to convert"):
         write_converted(source, files["keras_1"])
     assert files["keras_1"].read_bytes() == before
+
+
+def test_vgg19_of_torchvision_is_known_by_its_last_layer(tmp_path):
+    """Its modules are numbered past three more convolutions; the halves of a VGG-16 are none."""
+    layers = random_layers({n: (3 if i == 3 else i // 16, o // 16) for n, (i, o) in DEEP.items()})
+    tensors = {}
+    for module, layer in numbered(BLOCKS_19).items():
+        kernel, bias = layers[layer]
+        tensors[f"{module}.weight"] = np.ascontiguousarray(kernel.transpose(3, 2, 0, 1))
+        tensors[f"{module}.bias"] = bias
+    assert "features.34.weight" in tensors and "features.16.weight" in tensors
+    safetensors.numpy.save_file(tensors, tmp_path / "vgg19.safetensors")
+    small = {name: (kernel.shape[2], kernel.shape[3]) for name, (kernel, _) in layers.items()}
+    source = read_source(tmp_path / "vgg19.safetensors", shapes=small)
+    assert source.architecture == "vgg19"
+    write_converted(source, tmp_path / "out")
+    found = read_converted(tmp_path / "out", shapes=small)
+    assert found.architecture == "vgg19" and same(found.layers, layers)
+    rows = compare(source, tmp_path / "out", size=(32, 32), shapes=small)
+    assert agrees(rows) and len(rows) == 16 + 5
+    del tensors["features.34.weight"]
+    safetensors.numpy.save_file(tensors, tmp_path / "cut.safetensors")
+    with pytest.raises(UserError, match="missing|must be"):
+        read_source(tmp_path / "cut.safetensors", shapes=SMALL)

@@ -7,9 +7,13 @@ import pickle
 import numpy as np
 import pytest
 
+from jaxsfm.config import Config
+from jaxsfm.core.alexnet import KERNELS
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
+from jaxsfm.extraction import extraction_settings
 from jaxsfm.host import weights
+from jaxsfm.host.converted import save_weights
 from jaxsfm.host.weights import default_path, load_weights, read_arrays
 
 
@@ -23,6 +27,37 @@ def test_the_default_weights_are_the_thirteen_known_layers():
         assert all(array.dtype == np.float32 for array in layers[name].values())
     assert layers["conv1_1"]["kernel"][0, 0, 0, 0] == pytest.approx(-0.5537306, abs=1e-6)
     assert loaded.sha256 == weights.SHA256 and loaded.preprocessing.scale == 255.0
+
+
+def test_alexnets_weights_come_with_the_same_distribution(tmp_path):
+    loaded = load_weights(backbone="alexnet")
+    layers = loaded.params["params"]
+    assert {n: layer["kernel"].shape for n, layer in layers.items()} == KERNELS
+    assert loaded.backbone == "alexnet" and loaded.sha256 != weights.SHA256
+    with pytest.raises(UserError, match="damaged"):
+        load_weights(default_path("alexnet"))  # of another network than asked for
+    with pytest.raises(UserError, match="--backbone vgg19.*--weights"):
+        load_weights(backbone="vgg19")
+
+
+def test_converted_weights_of_another_network_are_refused(tmp_path):
+    loaded = load_weights()
+    path = tmp_path / "vgg16.safetensors"
+    save_weights(
+        path,
+        loaded.params["params"],
+        extras={},
+        architecture="vgg16",
+        family="torchvision",
+        preprocessing=loaded.preprocessing,
+        about={"source": "a test"},
+    )
+    assert load_weights(path).backbone == "vgg16"
+    with pytest.raises(UserError, match="weights of vgg16; those of alexnet are needed"):
+        load_weights(path, backbone="alexnet")
+    config = Config(backbone="alexnet")
+    with pytest.raises(ValueError, match="weights must be of alexnet; got vgg16"):
+        extraction_settings(loaded, config, 12)
 
 
 def test_a_copy_of_the_file_loads_from_anywhere(tmp_path):
