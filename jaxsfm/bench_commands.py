@@ -90,6 +90,9 @@ def strecha(
 ) -> int:
     """Whole reconstructions of the Strecha sets, beside COLMAP's RootSIFT.
 
+    For example
+        $ jaxsfm bench strecha --root SETS --methods rootsift,default --json figures.json
+
     Args:
       root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
       sets: Which of them, by commas or blanks; default: all.
@@ -133,6 +136,9 @@ def wxbs(
 ) -> int:
     """Pairs under changes of viewpoint, illumination and season (WxBS).
 
+    For example
+        $ jaxsfm bench wxbs --root PAIRS --methods rootsift,default
+
     Args:
       root: Folder of the categories: CATEGORY/NAME/{01,02}.png, corrs.txt.
       sets: CATEGORY or CATEGORY/NAME, by commas or blanks; default: all.
@@ -163,6 +169,9 @@ def homography(
 ) -> int:
     """Sequences with known homographies (Oxford affine, HPatches).
 
+    For example
+        $ jaxsfm bench homography --root SEQUENCES --methods rootsift,default
+
     Args:
       root: Folder of the sequences: SEQUENCE/img1.png, H1to2p (or .xml); or SEQUENCE/1.ppm, H_1_2.
       sets: Which of them, by commas or blanks; default: all.
@@ -187,6 +196,9 @@ def planes(
     json: Path | None = None,
 ) -> int:
     """Several homographies fitted to given points (AdelaideRMF).
+
+    For example
+        $ jaxsfm bench planes --root POINTS
 
     Args:
       root: Folder of the points: NAME_pts.txt, rows of x1 y1 1 x2 y2 1 label.
@@ -224,6 +236,9 @@ def daynight(
     threads: int = -1,
 ) -> int:
     """The paper's night protocol: day photos and one night photo, judged after a Sim3 from the day.
+
+    For example
+        $ jaxsfm bench daynight --root SETS --severity 3.25 --methods rootsift,default
 
     Args:
       root: Folder of scenes (SCENE/{day,night,reference}), of Strecha sets (whose images are turned
@@ -268,6 +283,9 @@ def warps(
     json: Path | None = None,
 ) -> int:
     """Relocalization rules on views made of photos, under known homographies (synthetic).
+
+    For example
+        $ jaxsfm bench warps --root PHOTOS --seeds 3
 
     Args:
       root: Folder of any photos; sub-folders are included.

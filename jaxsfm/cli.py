@@ -13,9 +13,10 @@ from typing import Annotated, Any
 import tyro
 
 from jaxsfm.bench_commands import daynight, homography, planes, strecha, warps, wxbs
-from jaxsfm.commands import demo, evaluate, match, reconstruct
+from jaxsfm.commands import match, reconstruct
 from jaxsfm.data_commands import data
 from jaxsfm.errors import UserError
+from jaxsfm.evaluate_commands import demo, evaluate
 from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled

@@ -6,7 +6,6 @@ Heavy modules are imported inside the commands, so that --help is quick.
 import dataclasses
 import os
 import sys
-from json import dumps
 from pathlib import Path
 from typing import Literal
 
@@ -98,6 +97,10 @@ def reconstruct(
     memory_gb: float | None = None,
 ) -> int:
     """A folder of photos to a COLMAP model.
+
+    For example
+        $ jaxsfm reconstruct PHOTOS --out OUT
+        $ jaxsfm reconstruct PHOTOS --out OUT --intrinsics K.txt --preset robust
 
     Args:
       images: Folder with the photos; sub-folders are included.
@@ -196,6 +199,9 @@ def match(
 ) -> int:
     """Match two images; writes keypoints, planes and homographies.
 
+    For example
+        $ jaxsfm match A.jpg B.jpg --out m.npz --plot m.png
+
     Args:
       image0: The first image.
       image1: The second image.
@@ -266,54 +272,3 @@ def match(
         f"({result.num_tentative} tentative, {aligned.sum()} aligned): {out}"
     )
     return 0
-
-
-def evaluate(
-    out: Positional[Path],
-    *,
-    reference: Path,
-    align_on: Path | None = None,
-    json: Path | None = None,
-) -> int:
-    """Compare a model's cameras with reference poses.
-
-    Args:
-      out: A run's folder, or a COLMAP model's.
-      reference: Folder of Strecha .camera files or of a COLMAP model.
-      align_on: Text file: align on these images only (the paper's night protocol).
-      json: Write all figures here.
-    """
-    check_writable(json, "--json", (".json",))
-    from jaxsfm import evaluation
-    from jaxsfm.host.poses import find_model, model_poses, read_model, read_poses
-    from jaxsfm.host.workfolder import write_atomic
-    from jaxsfm.report import evaluation_lines
-
-    truth = read_poses(reference)
-    names = evaluation.read_names(align_on) if align_on else None
-    poses = model_poses(read_model(find_model(out)))
-    result = evaluation.evaluate(poses, truth, align_on=names).as_dict()
-    for name, error in result["images"].items():
-        print(f"{name!s:40s} {error['position']:10.4f} {error['rotation_deg']:9.4f} deg")
-    for name in result["missing"]:
-        print(f"{name!s:40s} not in the model")
-    print("\n".join(evaluation_lines(result)))
-    if json is not None:
-        write_atomic(json, dumps(result, indent=1).encode())
-    return 0
-
-
-def demo(*, out: Path | None = None, seed: int = 0) -> int:
-    """Render a small scene with known cameras, reconstruct it, compare with the truth.
-
-    Ends with 1 if a camera is missing or the mean errors exceed the stated ones.
-
-    Args:
-      out: Folder for the scene and the results; default: a new one under the temporary folder.
-      seed: Of the scene's noise and of the reconstruction.
-    """
-    from jaxsfm.demo import run_demo
-
-    lines, passed = run_demo(out, seed=seed)
-    print("\n".join(lines))
-    return 0 if passed else 1

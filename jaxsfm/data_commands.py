@@ -34,6 +34,9 @@ def list_all(*, to: Path | None = None) -> int:
 def fetch(name: Positional[str], *, to: Path | None = None) -> int:
     """Download a data set; an interrupted download goes on.
 
+    For example
+        $ jaxsfm data fetch wxbs
+
     Args:
       name: Of the data set (jaxsfm data list).
       to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.

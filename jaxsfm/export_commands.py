@@ -35,22 +35,30 @@ def export(
 ) -> int:
     """A run's model or matches in another tool's format (docs/formats.md).
 
+    For example
+        $ jaxsfm export OUT --to nerfstudio --out NERF --copy-images
+        $ jaxsfm export OUT --to hloc --out HLOC
+
     Args:
       run: A run's folder; for formats of models also a COLMAP model's.
       to: hloc: features.h5, matches.h5 and pairs.txt. colmap, colmap-text: the model. ply: its
         points. bundler, nvm: cameras, points, observations. openmvg: sfm_data.json, features,
         matches. nerfstudio: transforms.json and points.
       out: File (ply, nvm) or new folder to write.
-      images: The photos' folder, for nerfstudio and openmvg, which refer to them.
+      images: The photos' folder, for nerfstudio and openmvg, which refer to them; default: the one
+        that the run was made of, if it is still there.
       copy_images: Copy the photos beside nerfstudio's transforms.json (into images).
       matches: Which of them hloc gets: all handed to COLMAP, or the verified ones of trusted pairs.
     """
-    if copy_images and (to != "nerfstudio" or images is None):
-        raise UserError("--copy-images: goes with --to nerfstudio and --images")
+    if copy_images and to != "nerfstudio":
+        raise UserError("--copy-images: goes with --to nerfstudio")
     if images is not None and not images.is_dir():
         raise UserError(f"--images {images}: no such folder")
     if not run.is_dir():
         raise UserError(f"{run}: no such folder")
+    images = images or _recorded_photos(run)
+    if copy_images and images is None:
+        raise UserError(f"--copy-images: {run} does not say where its photos are; --images does")
     if to in FILES:
         check_writable(out, "--out", (FILES[to],))
         _export_file(run, to, out)
@@ -81,6 +89,16 @@ def _new_folder(path: Path) -> Iterator[Path]:
             os.replace(fresh, path)
     except OSError as error:
         raise UserError(f"--out {path}: cannot be written ({error.strerror or error})") from error
+
+
+def _recorded_photos(run: Path) -> Path | None:
+    """The photos' folder of a run, if it says and they are still there."""
+    try:
+        report = json.loads((run / "report.json").read_text(encoding="utf-8"))
+        folder = Path(report["images"]["folder"])
+    except (OSError, ValueError, KeyError, TypeError):  # a model of COLMAP's, or an older run
+        return None
+    return folder if folder.is_dir() else None
 
 
 def _model(run: Path) -> "pycolmap.Reconstruction":

@@ -27,6 +27,9 @@ def train(
 ) -> int:
     """Learn the scores by which keypoints are relocalized, from any photos.
 
+    For example
+        $ jaxsfm train relocalizer --images PHOTOS --out mine.safetensors
+
     Pairs of views are made of them on the fly, through random homographies and under other lights;
     every fifth photo is held out to measure on. An interrupted training goes on with the same
     command. Use the result by reconstruct --relocalizer FILE.

@@ -56,7 +56,10 @@ def convert(
     family: Family = "auto",
     kernels: Kernels = "auto",
 ) -> int:
-    """Convert VGG-16 weights of another framework, for --weights.
+    """Convert VGG-16 weights of another framework (torchvision's VGG-19 too), for --weights.
+
+    For example
+        $ jaxsfm weights convert vgg16.h5 vgg16.safetensors
 
     Args:
       source: torchvision's vgg16 .pth or .safetensors, Keras' VGG16 .h5, MatConvNet's

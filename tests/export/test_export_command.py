@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -193,12 +195,16 @@ def test_a_failed_export_leaves_nothing(tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run"]
 
 
-def test_nerfstudios_images_are_referred_to_or_copied(tmp_path, run, capsys):
-    photos = tmp_path / "my photos"
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "my photos"
     for name in NAMES:
-        (photos / name).parent.mkdir(parents=True, exist_ok=True)
-        (photos / name).write_text(name)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+    return folder
 
+
+def test_nerfstudios_images_are_referred_to_or_copied(tmp_path, run, photos, capsys):
     def paths(out):
         meta = json.loads((out / "transforms.json").read_text())
         return [out / frame["file_path"] for frame in meta["frames"]]
@@ -248,3 +254,19 @@ def test_a_missing_or_damaged_run_is_one_sentence(tmp_path, model, capsys):
     assert "not a readable COLMAP model" in refusal(capsys, run, "colmap", tmp_path / "h")
     (run / "database.db").unlink()
     assert "not a readable COLMAP model" in refusal(capsys, run, "openmvg", tmp_path / "h")
+
+
+def test_the_photos_are_those_of_the_run_unless_others_are_given(run, photos, tmp_path, capsys):
+    made = tmp_path / "run"
+    shutil.copytree(run, made)
+    (made / "report.json").write_text(json.dumps({"images": {"folder": str(photos)}}))
+    assert export(made, "nerfstudio", tmp_path / "a") == 0
+    frames = json.loads((tmp_path / "a/transforms.json").read_text())["frames"]
+    assert all(Path(frame["file_path"]).is_relative_to(photos) for frame in frames)
+    assert export(made, "nerfstudio", tmp_path / "b", "--copy-images") == 0
+    assert (tmp_path / "b/images").is_dir()
+    for text in ("{", "[]", json.dumps({"images": {"folder": str(tmp_path / "gone")}})):
+        (made / "report.json").write_text(text)
+        assert export(made, "nerfstudio", tmp_path / f"c{len(text)}") == 0
+        message = refusal(capsys, made, "nerfstudio", tmp_path / "n", "--copy-images")
+        assert "--images" in message
