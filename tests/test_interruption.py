@@ -155,12 +155,12 @@ def interrupt():
     time.sleep(1)
     os.kill(os.getpid(), signal.SIGINT)
 
-def weights():
+def stuck():
     threading.Thread(target=interrupt, daemon=True).start()
     mapping.build_models(path, {}, mapping.MapOptions(mapper=mapper, threads=1))
 
-jaxsfm.cli.COMMANDS["weights"] = weights
-sys.exit(jaxsfm.cli.main(["weights"]))
+jaxsfm.cli.COMMANDS["stuck"] = stuck
+sys.exit(jaxsfm.cli.main(["stuck"]))
 """
 
 

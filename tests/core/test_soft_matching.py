@@ -72,6 +72,7 @@ def test_the_true_pose_has_no_epipolar_error(seed):
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))
     translation = rng.normal(size=3)
+    translation *= 1 + 0.5 / np.linalg.norm(translation)  # parallax enough to tell poses apart
     points = rng.normal(size=(30, 3)) + [0, 0, 6]
     moved = points @ rotation.T + translation
 
@@ -86,7 +87,9 @@ def test_the_true_pose_has_no_epipolar_error(seed):
     f = f / jnp.linalg.norm(f)
     found = epipolar_loss(jnp.eye(30), project(points), project(moved), f)
     assert float(found) < 1e-3
-    wrong = fundamental_matrix(CAMERA, CAMERA, pose[0], jnp.roll(pose[1], 1))
+    across = np.cross(translation, np.roll(translation, 1) + [0, 0, 1])  # at right angles
+    across *= np.linalg.norm(translation) / np.linalg.norm(across)
+    wrong = fundamental_matrix(CAMERA, CAMERA, pose[0], jnp.asarray(across, jnp.float32))
     assert float(epipolar_loss(jnp.eye(30), project(points), project(moved), wrong)) > 0.01
 
 

@@ -34,7 +34,15 @@ def layers_of(seed: int = 0) -> dict[str, dict[str, np.ndarray]]:
 def good(tmp_path):
     path = tmp_path / "good.safetensors"
     about = {"source": "a.h5", "source_sha256": "00"}
-    save_weights(path, layers_of(), extras={}, family="keras", preprocessing=CAFFE, about=about)
+    save_weights(
+        path,
+        layers_of(),
+        extras={},
+        architecture="vgg16",
+        family="keras",
+        preprocessing=CAFFE,
+        about=about,
+    )
     return path
 
 
@@ -70,7 +78,7 @@ def test_a_wrong_file_is_refused_by_its_path(good, tmp_path):
         "extra": (made({"netvlad.centres": nan}), r"netvlad.centres must be float32 \(512, 64\)"),
         "family": (made(family="alexnet"), "its family must be torchvision or"),
         "unhashable": (made(family=["keras"]), "its family must be torchvision or"),
-        "architecture": (made(architecture="vgg19"), "its architecture must be vgg16"),
+        "architecture": (made(architecture="vgg20"), "its architecture must be vgg16 or vgg19"),
         "no mean": (made(preprocessing={"scale": 1}), "its preprocessing cannot be used"),
         "zero": (made(preprocessing={**usual, "std": [1, 0, 1]}), "preprocessing cannot be used"),
         "words": (made(preprocessing={**usual, "mean": "abc"}), "preprocessing cannot be used"),
