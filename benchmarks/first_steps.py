@@ -32,23 +32,23 @@ STEPS = (
         (
             "ls photos | wc -l",
             "jaxsfm/.venv/bin/jaxsfm reconstruct photos --out model",
-            "jaxsfm/.venv/bin/jaxsfm export model --to nerfstudio --out nerf",
+            "jaxsfm/.venv/bin/jaxsfm export model --to nerfstudio --out nerf --copy-images",
             "ls model nerf",
         ),
     ),
 )
-PROGRESS = re.compile(r"[^\n]*\r")
-"""A bar that was drawn over."""
-KEPT_LINES = 40
+BAR = re.compile(r"(\w+): +\d+%\|")
+"""Of a progress bar, which is drawn again and again; the last one stays."""
+QUIET = {"PYTHONPATH": "", "COLUMNS": "100", "PIP_QUIET": "2"}
 
 
 def shown(text: str, folder: Path) -> str:
     """What a terminal would show at the end, without this machine's folders."""
-    text = PROGRESS.sub("", text).replace(str(folder), "~").replace(str(ROOT), "jaxsfm.git")
+    text = text.replace("\x1b[A", "").replace(str(folder), "~").replace(str(ROOT), "jaxsfm.git")
     lines = [line.rstrip() for line in text.splitlines() if line.strip()]
-    if len(lines) > KEPT_LINES:
-        lines = [*lines[: KEPT_LINES // 2], "...", *lines[-KEPT_LINES // 2 :]]
-    return "\n".join(lines)
+    bars = {bar[1]: k for k, line in enumerate(lines) if (bar := BAR.match(line))}
+    kept = (k for k, line in enumerate(lines) if not BAR.match(line) or k in bars.values())
+    return "\n".join(lines[k] for k in kept)
 
 
 def run_steps(photos: Path, folder: Path) -> list[str]:
@@ -63,7 +63,7 @@ def run_steps(photos: Path, folder: Path) -> list[str]:
             done = subprocess.run(
                 ["bash", "-c", command.format(root=ROOT)],
                 cwd=folder,
-                env={**os.environ, "PYTHONPATH": "", "COLUMNS": "100"},
+                env={**os.environ, **QUIET},
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
