@@ -12,7 +12,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-DATA = ("jaxsfm/py.typed", "jaxsfm/relocalizer.safetensors")
+DATA = (
+    "jaxsfm/py.typed",
+    "jaxsfm/relocalizer.safetensors",
+    *(f"jaxsfm/page/page.{kind}" for kind in ("html", "css", "js")),
+)
 
 
 def run(*command: object, cwd: Path, **environment: str) -> str:
@@ -46,7 +50,8 @@ def test_wheel_and_sdist_hold_all_modules_and_data(built):
     in_wheel = set(zipfile.ZipFile(wheel).namelist())
     with tarfile.open(sdist) as archive:
         in_sdist = {name.partition("/")[2] for name in archive.getnames()}
-    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "jaxsfm").rglob("*.py")}
+    packages = (ROOT / "jaxsfm", ROOT / "weights_conversion")
+    sources = {str(path.relative_to(ROOT)) for each in packages for path in each.rglob("*.py")}
     for names in (in_wheel, in_sdist):
         assert sources | set(DATA) <= names
     assert not [name for name in in_wheel if name.startswith(("tests", "benchmarks", "docs"))]
