@@ -8,7 +8,8 @@ from pathlib import Path, PurePosixPath
 import platformdirs
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.download import download, progress_bar, sha256_of, unpack
+from jaxsfm.host.download import download, progress_bar, unpack
+from jaxsfm.host.hashes import sha256_of
 from jaxsfm.host.workfolder import write_atomic
 
 _STRECHA = (
@@ -202,7 +203,11 @@ def fetch(name: str, folder: Path | None = None, *, progress: bool = False) -> P
             download(file.url, path, known_hash=file.known_hash, on_bytes=on_bytes)
         fetched[file.name] = sha256_of(path)
         if file.archive:
-            unpack(path, home)
+            try:
+                unpack(path, home)
+            except UserError:
+                path.unlink()  # the same command asks for it again
+                raise
         write_atomic(home / _FETCHED, _text(fetched))
         if file.archive:
             path.unlink()

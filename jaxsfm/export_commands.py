@@ -82,13 +82,14 @@ def _new_folder(path: Path) -> Iterator[Path]:
         if path.is_dir() and any(path.iterdir()):
             raise UserError(f"--out {path}: not empty; choose an empty or new folder")
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".jaxsfm-") as scratch:
-            fresh = Path(scratch) / "export"
-            fresh.mkdir()
-            yield fresh
-            os.replace(fresh, path)
+        scratch = tempfile.TemporaryDirectory(dir=path.parent, prefix=".jaxsfm-")
     except OSError as error:
         raise UserError(f"--out {path}: cannot be written ({error.strerror or error})") from error
+    with scratch:
+        fresh = Path(scratch.name) / "export"
+        fresh.mkdir()
+        yield fresh
+        os.replace(fresh, path)
 
 
 def _recorded_photos(run: Path) -> Path | None:

@@ -1,7 +1,7 @@
 """What a run did, as plain JSON and as the last lines on the screen; why images were lost."""
 
 import dataclasses
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
 from typing import Any
 
 from jaxsfm.core.types import Status
@@ -162,7 +162,7 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
 def pair_figures(
     pair: Pair,
     counts: PairCounts,
-    chosen: set[Pair],
+    chosen: Container[Pair],
     verified: dict[Pair, int],
     verdicts: dict[Pair, Verdict],
 ) -> dict[str, Any]:

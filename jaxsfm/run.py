@@ -102,6 +102,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 "options": {
                     "config": dataclasses.asdict(config),
                     **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
+                    # Read again from anywhere, as the photos' folder is.
+                    "reference": options.reference and options.reference.absolute(),
                 },
                 "images": {
                     "folder": str(images.absolute()),
@@ -112,12 +114,12 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 "pairs": {
                     "tried": len(results),
                     "verified": sum(r.num_inliers > 0 for r in results.values()),
-                    "handed_on": len(chosen),
+                    "handed_on": len(handed_on),
                     "trusted": len(verified) - len(untrusted) if made.verdicts else None,
                     "overflowed": sum(r.num_dropped > 0 for r in results.values()),
                     "each": [
-                        pair_figures(pair, counts, chosen, verified, made.verdicts)
-                        for pair, counts in sorted(results.items())
+                        pair_figures(pair, counts, handed_on, verified, made.verdicts)
+                        for pair, counts in sorted(given.counts(results).items())
                     ],
                 },
                 "given": given.about,
@@ -141,8 +143,9 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             text = json.dumps(report, indent=1, default=str)
             write_atomic(fresh / "report.json", text.encode())
         folder.drop_features()
-    page_after_run(out if models or not (out / "sparse").exists() else out / "failed")
-    return report
+        # While the folder is ours: another run there would replace what the page shows.
+        page_after_run(out if models or not (out / "sparse").exists() else out / "failed")
+        return report
 
 
 def _map(

@@ -1,5 +1,6 @@
 """A model in the browser, served by viser: for models too large for the page."""
 
+import socket
 import time
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -142,6 +143,16 @@ class Viewer:
         return handle
 
 
+def _check_address(host: str) -> None:
+    """Viser would wait for ever for a server that cannot start."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as trial:
+            trial.bind(address)
+    except OSError as error:
+        raise UserError(f"--host {host}: cannot be listened on ({error.strerror})") from error
+
+
 def serve(run: KeptRun, *, host: str, port: int) -> None:
     """Show a run's model until Ctrl-C.
 
@@ -151,6 +162,7 @@ def serve(run: KeptRun, *, host: str, port: int) -> None:
     viser = _viser()
     if run.model is None:
         raise UserError(f"{run.folder}: no model to show (sparse/0)")
+    _check_address(host)
     server = viser.ViserServer(host=host, port=port, label="jaxsfm", verbose=False)
     try:
         Viewer(server, run)

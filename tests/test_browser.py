@@ -139,3 +139,9 @@ def test_the_viewer_says_what_it_lacks(plain, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(plain[0])]) == 2
     assert "jaxsfm view needs viser: pip install 'jaxsfm[view]'" in capsys.readouterr().err
+
+
+def test_an_address_that_cannot_be_listened_on_is_one_sentence(plain, capsys):
+    assert main(["view", str(plain[0]), "--host", "203.0.113.1"]) == 2  # of no machine
+    error = capsys.readouterr().err
+    assert "--host 203.0.113.1" in error and "Traceback" not in error

@@ -1,6 +1,7 @@
 """Data sets: downloads from a local server that breaks off, changes its mind or goes away."""
 
 import dataclasses
+import fcntl
 import hashlib
 import io
 import json
@@ -91,6 +92,15 @@ def test_no_server_no_file_no_folder_are_one_sentence(server, tmp_path):
     server.server_close()
     with pytest.raises(UserError, match="no connection"):
         download(address, tmp_path / "file", known_hash=None)
+
+
+def test_two_processes_do_not_write_one_file(server, tmp_path):
+    with (tmp_path / "file.part").open("ab") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(UserError, match="another process"):
+            download(url(server), tmp_path / "file", known_hash=None)
+    download(url(server), tmp_path / "file", known_hash=None)
+    assert (tmp_path / "file").read_bytes() == CONTENT
 
 
 def test_a_server_that_says_nothing_is_not_waited_for_forever(tmp_path, monkeypatch):
@@ -202,6 +212,7 @@ def test_a_damaged_archive_and_a_damaged_record_are_one_sentence(
     with pytest.raises(UserError, match="cannot be unpacked"):
         datasets.fetch("small", tmp_path)
     assert not datasets.is_complete("small", tmp_path)
+    assert not (tmp_path / "small/b.tar.gz").exists()  # or it would fail again for ever
     for text in ("{", "[]"):
         (tmp_path / "small/fetched.json").write_text(text)
         with pytest.raises(UserError, match="remove it"):

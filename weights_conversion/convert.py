@@ -1,6 +1,5 @@
 """Files of any family to one format; what a file is, its first bytes say."""
 
-import hashlib
 import importlib.metadata
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Literal
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
 from jaxsfm.host.converted import FORMAT, is_converted, save_weights
+from jaxsfm.host.hashes import sha256_of
 from weights_conversion.keras_files import Kernels, read_keras
 from weights_conversion.matlab_files import read_matlab
 from weights_conversion.source import (
@@ -75,8 +75,7 @@ def read_source(
     kind = file_kind(path)
     if is_converted(path):
         raise UserError(f"{path}: is converted already")
-    with path.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    sha256 = sha256_of(path)
     if kind == "hdf5":
         source = read_keras(path, sha256=sha256, kernels=kernels, shapes=shapes)
     elif kind == "matlab":

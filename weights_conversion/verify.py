@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxsfm.core.blocks import Layer, convolve, pool
 from jaxsfm.core.vgg import preprocess
+from jaxsfm.errors import UserError
 from jaxsfm.host.converted import Converted, read_converted, read_extras
 from weights_conversion.forward import layer_maps
 from weights_conversion.source import Source
@@ -80,10 +81,14 @@ def compare(
     """Every map of an image, and every extra array, of the source and of the converted file.
 
     Raises:
-      UserError: the converted file cannot be read.
+      UserError: the converted file cannot be read, or is of another network.
     """
-    rgb = noise_image(size)
-    ours = converted_maps(read_converted(converted, shapes=shapes), rgb)
+    rgb, found = noise_image(size), read_converted(converted, shapes=shapes)
+    if found.architecture != source.architecture:
+        raise UserError(
+            f"{converted}: of {found.architecture}, but {source.path} of {source.architecture}"
+        )
+    ours = converted_maps(found, rgb)
     rows = [_compared(name, theirs, ours[name]) for name, theirs in layer_maps(source, rgb)]
     extras = read_extras(converted)
     return rows + [

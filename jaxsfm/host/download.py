@@ -1,7 +1,8 @@
 """Files from the network: resumed where they stopped, compared with their hash, unpacked safely."""
 
 import contextlib
-import hashlib
+import fcntl
+import lzma
 import os
 import shutil
 import tarfile
@@ -25,6 +26,16 @@ OnBytes = Callable[[int, int | None], None]
 """Told how many bytes there are by now, and how many there will be where the server says."""
 
 
+_DAMAGED = (
+    tarfile.TarError,
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    RuntimeError,  # an encrypted zip; and what is not implemented
+)
+
+
 class _Resuming:
     """A downloader for pooch that goes on with what an earlier attempt left in FILE.part.
 
@@ -38,16 +49,34 @@ class _Resuming:
         self, url: str, output_file: Any, pooch: Any, check_only: bool | None = False
     ) -> None:
         known = self.part.with_name(self.part.name + ".etag")
-        headers = {"Accept-Encoding": "identity"}
-        if self.part.is_file() and known.is_file():
-            headers["Range"] = f"bytes={self.part.stat().st_size}-"
+        with self.part.open("ab") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise UserError(f"{self.part}: another process is downloading it") from error
+            try:
+                while not self._received(url, file, known):  # what is there is of another file
+                    file.truncate(0)
+            except BaseException:
+                if not file.seek(0, os.SEEK_END):
+                    self.part.unlink()
+                raise
+            known.unlink(missing_ok=True)
+            os.replace(self.part, output_file)
+
+    def _received(self, url: str, file: Any, known: Path) -> bool:
+        """Whether the rest came, or all of it; False: the server has nothing after our part."""
+        start, headers = file.seek(0, os.SEEK_END), {"Accept-Encoding": "identity"}
+        if start and known.is_file():
+            headers["Range"] = f"bytes={start}-"
             headers["If-Range"] = known.read_text(encoding="latin-1")
         with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as answer:
-            if answer.status_code == 416:  # nothing is left to send, or it is another file
-                self.part.unlink()
-                return self(url, output_file, pooch)
+            if answer.status_code == 416:
+                return False
             answer.raise_for_status()
-            done = self.part.stat().st_size if answer.status_code == 206 else 0
+            if answer.status_code != 206:
+                file.truncate(0)
+            done = file.seek(0, os.SEEK_END)
             length = answer.headers.get("Content-Length")
             total = done + int(length) if length and length.isdigit() else None
             validator = answer.headers.get("ETag") or answer.headers.get("Last-Modified")
@@ -55,15 +84,14 @@ class _Resuming:
                 known.write_text(validator, encoding="latin-1")
             else:
                 known.unlink(missing_ok=True)
-            with self.part.open("ab" if done else "wb") as file:
-                for chunk in answer.iter_content(CHUNK):
-                    file.write(chunk)
-                    done += len(chunk)
-                    self.on_bytes(done, total)
+            for chunk in answer.iter_content(CHUNK):
+                file.write(chunk)
+                done += len(chunk)
+                self.on_bytes(done, total)
+            file.flush()
             if total is not None and done != total:
                 raise requests.ConnectionError(f"{done} of {total} bytes came")
-        known.unlink(missing_ok=True)
-        os.replace(self.part, output_file)
+        return True
 
 
 def download(
@@ -124,12 +152,6 @@ def _reason(error: requests.RequestException) -> str:
     return type(error).__name__
 
 
-def sha256_of(path: Path) -> str:
-    """Of a file's content, hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def unpack(archive: Path, folder: Path) -> None:
     """A zip or tar archive into `folder`, beside what is there; nothing if it is damaged.
 
@@ -150,13 +172,7 @@ def unpack(archive: Path, folder: Path) -> None:
                 target.mkdir(exist_ok=True)
             else:
                 os.replace(path, target)
-    except (
-        tarfile.TarError,
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        NotImplementedError,
-    ) as error:
+    except _DAMAGED as error:
         raise UserError(f"{archive}: cannot be unpacked ({error})") from error
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror or error})") from error

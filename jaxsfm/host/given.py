@@ -1,7 +1,6 @@
 """Matches that somebody else made of the same photos, mapped beside ours in one model."""
 
 import dataclasses
-import hashlib
 import logging
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.host.formats.database import read_database
 from jaxsfm.host.formats.tables import CameraRow, Tables, one_to_one
+from jaxsfm.host.hashes import sha256_of
 from jaxsfm.host.images import ImageFile, shown_name
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, describe
@@ -113,8 +113,8 @@ def _checked(
         if pair[0] in keypoints and pair[1] in keypoints
     }
     about = {
-        "files": [str(path) for path in files],
-        "sha256": [hashlib.sha256(path.read_bytes()).hexdigest() for path in files],
+        "files": [str(path.absolute()) for path in files],
+        "sha256": [sha256_of(path) for path in files],
         "verified": bool(tables.inliers),
         "images": len(keypoints),
         "ignored": ignored,

@@ -5,7 +5,6 @@ file of something else costs nothing.
 """
 
 import contextlib
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ import safetensors
 import safetensors.numpy
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.hashes import sha256_of
 from jaxsfm.host.workfolder import write_atomic
 
 
@@ -90,8 +90,7 @@ def open_tensors(path: Path, *, marker: str, what: str, made_by: str) -> Iterato
       UserError: no such file, or of another format.
     """
     try:
-        with path.open("rb") as raw:
-            digest = hashlib.file_digest(raw, "sha256").hexdigest()
+        digest = sha256_of(path)
     except OSError as error:
         raise UserError(f"{path}: cannot read the {what} ({error.strerror})") from error
     try:

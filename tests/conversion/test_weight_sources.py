@@ -253,7 +253,7 @@ def test_a_converted_file_is_no_source_and_no_source_is_overwritten(files, sourc
     assert files["keras_1"].read_bytes() == before
 
 
-def test_vgg19_of_torchvision_is_known_by_its_last_layer(tmp_path):
+def test_vgg19_of_torchvision_is_known_by_its_last_layer(sources, tmp_path):
     """Its modules are numbered past three more convolutions; the halves of a VGG-16 are none."""
     layers = random_layers({n: (3 if i == 3 else i // 16, o // 16) for n, (i, o) in DEEP.items()})
     tensors = {}
@@ -271,6 +271,8 @@ def test_vgg19_of_torchvision_is_known_by_its_last_layer(tmp_path):
     assert found.architecture == "vgg19" and same(found.layers, layers)
     rows = compare(source, tmp_path / "out", size=(32, 32), shapes=small)
     assert agrees(rows) and len(rows) == 16 + 5
+    with pytest.raises(UserError, match="of vgg19, but .* of vgg16"):
+        compare(sources["torchvision_zip"], tmp_path / "out", shapes=small)
     del tensors["features.34.weight"]
     safetensors.numpy.save_file(tensors, tmp_path / "cut.safetensors")
     with pytest.raises(UserError, match="missing|must be"):

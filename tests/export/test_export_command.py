@@ -270,3 +270,20 @@ def test_the_photos_are_those_of_the_run_unless_others_are_given(run, photos, tm
         assert export(made, "nerfstudio", tmp_path / f"c{len(text)}") == 0
         message = refusal(capsys, made, "nerfstudio", tmp_path / "n", "--copy-images")
         assert "--images" in message
+
+
+@pytest.mark.parametrize("name", ["../../secret.txt", "/etc/secret.txt", "a/../../b.jpg"])
+def test_no_name_of_a_model_leads_out_of_the_photos(name, tmp_path, capsys):
+    """A model can come from a stranger; photos are copied by its names."""
+    model = exact_model([camera("SIMPLE_PINHOLE")])
+    model.image(model.reg_image_ids()[0]).name = name
+    folder = tmp_path / "deep" / "model"
+    folder.mkdir(parents=True)
+    model.write_binary(folder)
+    photos = tmp_path / "deep" / "photos"
+    photos.mkdir()
+    (tmp_path / "secret.txt").write_text("not for export")
+    for to in ("nerfstudio", "bundler", "openmvg"):
+        more = ("--images", photos, "--copy-images") if to == "nerfstudio" else ()
+        message = refusal(capsys, folder, to, tmp_path / "out" / to, *more)
+        assert "outside" in message and not (tmp_path / "out" / to).exists()

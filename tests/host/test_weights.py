@@ -36,6 +36,8 @@ def test_alexnets_weights_come_with_the_same_distribution(tmp_path):
     assert loaded.backbone == "alexnet" and loaded.sha256 != weights.SHA256
     with pytest.raises(UserError, match="damaged"):
         load_weights(default_path("alexnet"))  # of another network than asked for
+    with pytest.raises(UserError, match="no learned keypoints with alexnet"):
+        _ = loaded.learned
     with pytest.raises(UserError, match="--backbone vgg19.*--weights"):
         load_weights(backbone="vgg19")
 

@@ -1,6 +1,7 @@
 """COLMAP's cameras in the terms that other formats share, and what a format cannot express."""
 
 from collections.abc import Iterable, Iterator
+from pathlib import PurePosixPath
 from typing import NamedTuple
 
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
@@ -129,8 +130,16 @@ class Observed(NamedTuple):
 
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """Images with a pose, by name."""
-    images = (model.image(image_id) for image_id in model.reg_image_ids())
+    """Images with a pose, by name.
+
+    Raises:
+      UserError: a name that leads out of the photos' folder.
+    """
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    for image in images:
+        path = PurePosixPath(image.name)
+        if path.is_absolute() or ".." in path.parts:
+            raise UserError(f"{shown_name(image.name)}: an image outside the photos' folder")
     return sorted(images, key=lambda image: image.name)
 
 
