@@ -1,14 +1,9 @@
 """The command line: parses, runs a command, turns failures into one sentence."""
 
-import functools
 import logging
-import operator
 import os
-import re
 import sys
 import threading
-from collections.abc import Callable
-from typing import Annotated, Any
 
 import tyro
 
@@ -21,19 +16,10 @@ from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.host.versions import package_versions
+from jaxsfm.subcommands import one_of, unwrapped
 from jaxsfm.train_commands import train
 from jaxsfm.view_commands import report, view
 from jaxsfm.weights_commands import weights, with_action
-
-_WRAPPED = re.compile(r"\n {8,}(?=[^\s$])")
-"""A line of an argument's description that goes on; examples start with $."""
-
-
-def _unwrapped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """With every argument's description on one line: tyro wraps by itself and keeps our ends."""
-    command.__doc__ = _WRAPPED.sub(" ", command.__doc__ or "")
-    return command
-
 
 BENCHMARKS = {
     "strecha": strecha,
@@ -43,13 +29,7 @@ BENCHMARKS = {
     "planes": planes,
     "warps": warps,
 }
-_Benchmark = functools.reduce(
-    operator.or_,
-    (
-        Annotated[Any, tyro.conf.subcommand(name, constructor=_unwrapped(command))]
-        for name, command in BENCHMARKS.items()
-    ),
-)
+_Benchmark = one_of(BENCHMARKS)
 
 
 def bench(result: _Benchmark) -> int:  # pyright: ignore[reportInvalidTypeForm]
@@ -101,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with interrupt.noted():
             return tyro.extras.subcommand_cli_from_dict(
-                {name: _unwrapped(command) for name, command in COMMANDS.items()},
+                {name: unwrapped(command) for name, command in COMMANDS.items()},
                 prog="jaxsfm",
                 description=DESCRIPTION,
                 args=with_action(sys.argv[1:] if argv is None else argv),

@@ -1,11 +1,10 @@
 """`jaxsfm data`: public data sets for the benchmarks."""
 
 from pathlib import Path
-from typing import Annotated, Any
 
 import tyro
 
-from jaxsfm.errors import UserError
+from jaxsfm.subcommands import one_of
 
 Positional = tyro.conf.Positional
 
@@ -60,15 +59,9 @@ def path(name: Positional[str], *, to: Path | None = None) -> int:
     return 0
 
 
-_Data = (
-    Annotated[Any, tyro.conf.subcommand("list", constructor=list_all)]
-    | Annotated[Any, tyro.conf.subcommand("fetch", constructor=fetch)]
-    | Annotated[Any, tyro.conf.subcommand("path", constructor=path)]
-)
+_Data = one_of({"list": list_all, "fetch": fetch, "path": path})
 
 
 def data(result: _Data) -> int:  # pyright: ignore[reportInvalidTypeForm]
     """Public data sets for the benchmarks."""
-    if not isinstance(result, int):
-        raise UserError("data: list, fetch or path")
     return result

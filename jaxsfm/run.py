@@ -94,6 +94,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             models, verified = made.models, made.verified
             untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
             figures = [model_figures(model) for model in models]
+            counts = given.counts(results)
             report: dict[str, Any] = {
                 "version": identity["version"],
                 "versions": versions(),
@@ -118,8 +119,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     "trusted": len(verified) - len(untrusted) if made.verdicts else None,
                     "overflowed": sum(r.num_dropped > 0 for r in results.values()),
                     "each": [
-                        pair_figures(pair, counts, handed_on, verified, made.verdicts)
-                        for pair, counts in sorted(given.counts(results).items())
+                        pair_figures(pair, each, handed_on, verified, made.verdicts)
+                        for pair, each in sorted(counts.items())
                     ],
                 },
                 "given": given.about,
@@ -129,7 +130,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 "lost": lost_images(
                     [image.name for image in good],
                     figures[0]["images"] if figures else [],
-                    given.counts(results),
+                    counts,
                     verified,
                     untrusted,
                 ),

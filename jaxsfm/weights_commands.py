@@ -1,15 +1,14 @@
 """`jaxsfm weights`: show, convert, verify and fetch VGG-16 weights."""
 
-import functools
-import operator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
 import tyro
 
 from jaxsfm.commands import check_writable
 from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
+from jaxsfm.subcommands import one_of
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 Positional = tyro.conf.Positional
@@ -131,13 +130,7 @@ def fetch(name: Positional[str] = "list", *, out: Path | None = None) -> int:
 
 
 ACTIONS = {"show": show, "convert": convert, "verify": verify, "fetch": fetch}
-_Action = functools.reduce(
-    operator.or_,
-    (
-        Annotated[Any, tyro.conf.subcommand(name, constructor=action)]
-        for name, action in ACTIONS.items()
-    ),
-)
+_Action = one_of(ACTIONS)
 
 
 def weights(result: _Action) -> int:  # pyright: ignore[reportInvalidTypeForm]

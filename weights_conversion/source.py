@@ -7,26 +7,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jaxsfm.core.vgg import BLOCKS, Blocks, Preprocessing
+from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
 
 Family = Literal["torchvision", "keras", "caffe", "netvlad"]
-
-
-def numbered(blocks: Blocks) -> dict[str, str]:
-    """torchvision's modules -> layers: convolutions, rectifiers and poolings are numbered
-    together."""
-    modules, index = {}, 0
-    for block, widths in enumerate(blocks, start=1):
-        for conv in range(1, len(widths) + 1):
-            modules[f"features.{index}"] = f"conv{block}_{conv}"
-            index += 2
-        index += 1
-    return modules
-
-
-NUMBERED = numbered(BLOCKS)
-"""VGG-16's."""
 
 
 class Convention(NamedTuple):

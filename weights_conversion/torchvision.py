@@ -6,13 +6,28 @@ from pathlib import Path
 import numpy as np
 import safetensors
 
-from jaxsfm.core.vgg import BLOCKS_19, LAYERS, layers_of
+from jaxsfm.core.vgg import BLOCKS, BLOCKS_19, LAYERS, Blocks, layers_of
 from jaxsfm.errors import UserError
 from jaxsfm.host.weights import TORCHVISION
-from weights_conversion.source import NUMBERED, Convention, Source, check_layers, numbered
+from weights_conversion.source import Convention, Source, check_layers
 from weights_conversion.torch_files import read_tensors
 
 CONVENTION = Convention(layout="OIHW", bgr=False, convolution=False)
+
+
+def numbered(blocks: Blocks) -> dict[str, str]:
+    """torchvision's modules -> layers: convolutions, rectifiers and poolings are numbered
+    together."""
+    modules, index = {}, 0
+    for block, widths in enumerate(blocks, start=1):
+        for conv in range(1, len(widths) + 1):
+            modules[f"features.{index}"] = f"conv{block}_{conv}"
+            index += 2
+        index += 1
+    return modules
+
+
+NUMBERED = numbered(BLOCKS)
 NUMBERED_19 = numbered(BLOCKS_19)
 NAMES = [
     f"{module}.{part}" for module in {**NUMBERED, **NUMBERED_19} for part in ("weight", "bias")

@@ -25,7 +25,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.host.converted import read_converted, read_extras
 from jaxsfm.host.weights import TORCHVISION
 from weights_conversion.convert import read_source, write_converted
-from weights_conversion.source import numbered
+from weights_conversion.torchvision import numbered
 from weights_conversion.verify import agrees, compare
 
 DEEP = layers_of(BLOCKS_19)
