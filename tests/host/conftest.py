@@ -2,14 +2,13 @@
 
 from typing import NamedTuple
 
-import numpy as np
 import pycolmap
 import pytest
+from foreign_model import results_of
 
-from jaxsfm.core.types import Status
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
-from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.host.pairs import Pair, PairResult
 
 SIZE = (1024, 768)
 KNOWN = Intrinsics(model="PINHOLE", params=(1280.0, 1280.0, 512.0, 384.0))
@@ -43,31 +42,9 @@ def _truth() -> pycolmap.Reconstruction:
     return model
 
 
-def _results(truth: pycolmap.Reconstruction) -> dict[Pair, PairResult]:
-    seen = {
-        image.name: {p.point3D_id: p.xy - 0.5 for p in image.points2D}
-        for image in truth.images.values()
-    }
-    found = {}
-    for a, b in exhaustive_pairs(NAMES):
-        cells = np.asarray(sorted(seen[a].keys() & seen[b].keys()), np.int32)
-        found[a, b] = PairResult(
-            pair=(a, b),
-            cells=np.stack([cells, cells], axis=1),
-            keypoints0=np.asarray([seen[a][c] for c in cells], np.float32),
-            keypoints1=np.asarray([seen[b][c] for c in cells], np.float32),
-            plane=np.zeros(len(cells), np.int32),
-            homographies=np.eye(3)[None],
-            num_tentative=len(cells),
-            num_dropped=0,
-            status=Status.VERIFIED,
-        )
-    return found
-
-
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory) -> Scene:
     nowhere = tmp_path_factory.mktemp("images")
     images = [ImageFile(name=n, path=nowhere / n, size=SIZE, sha256=64 * "0") for n in NAMES]
     truth = _truth()
-    return Scene(truth, NAMES, images, _results(truth), KNOWN)
+    return Scene(truth, NAMES, images, results_of(truth), KNOWN)
