@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from selenium import webdriver
+from selenium.common.exceptions import NoSuchElementException, StaleElementReferenceException
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.remote.webelement import WebElement
 
@@ -62,19 +63,23 @@ def prefer(chrome: webdriver.Chrome, scheme: str) -> None:
 
 
 def wait_for(condition, seconds: float = 60.0):
-    """The condition's value once it is true."""
+    """The condition's value once it is true. What is not there yet (a page without its body), or
+    was drawn anew while it was looked at, is waited for too."""
     end = time.monotonic() + seconds
-    while not (value := condition()):
-        assert time.monotonic() < end, "nothing came"
+    while True:
+        try:
+            if value := condition():
+                return value
+            missing = "nothing came"
+        except (NoSuchElementException, StaleElementReferenceException) as error:
+            missing = str(error.msg)
+        assert time.monotonic() < end, missing
         time.sleep(0.1)
-    return value
 
 
 def element(chrome: webdriver.Chrome, selector: str) -> WebElement:
     """The first element."""
-    found = chrome.find_elements("css selector", selector)
-    assert found, f"no {selector}"
-    return found[0]
+    return chrome.find_element("css selector", selector)
 
 
 def picture(chrome: webdriver.Chrome, selector: str) -> np.ndarray:
