@@ -21,15 +21,16 @@ from typing import Any
 os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP tells of every step
 
 from jaxsfm.host import colmap
+from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.mapping import MapOptions, build_models
+from jaxsfm.host.store import SavedMatches
 from jaxsfm.host.viewgraph import trusted_pairs
-from jaxsfm.host.workfolder import SavedMatches, write_atomic
 from jaxsfm.kept import KeptRun, read_run
 from jaxsfm.localize import choose_camera, known_model, locate_photo, reader
 from jaxsfm.localize_report import error_against, located_figures
-from jaxsfm.pipeline import pixel_scale
+from jaxsfm.reconstruction import pixel_scale
 from jaxsfm.refine import refine_model
 
 LIMITS = (0.3, 1.0)

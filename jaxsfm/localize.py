@@ -36,8 +36,8 @@ from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.model import Tracks, View, read_model_arrays
 from jaxsfm.host.pairs import Pair, PairResult
 from jaxsfm.host.poses import read_model
+from jaxsfm.host.store import Store
 from jaxsfm.host.weights import Weights, chosen_weights
-from jaxsfm.host.workfolder import WorkFolder
 from jaxsfm.kept import KeptRun, read_run
 from jaxsfm.localize_report import UNUSABLE, error_against, located_figures
 from jaxsfm.matching import matched
@@ -209,7 +209,7 @@ def _features(
 ) -> Iterator[Callable[[str], ImageFeatures]]:
     """Features of the run's photos by name: kept ones, else computed once, on disk meanwhile."""
     with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-        fresh = WorkFolder(Path(scratch))
+        fresh = Store(Path(scratch), run.report["identity"])
         todo = [image for image in files.values() if not run.matches.has_features(image)]
         stream = extracted(weights, todo, config=run.config, execution=options.execution)
         bar = tqdm(

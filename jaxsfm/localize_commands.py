@@ -37,7 +37,7 @@ def localize(
       network: The network's parameters; they must be the run's.
     """
     check_writable(out, "--out", (".json",))
-    from jaxsfm.host.workfolder import write_atomic
+    from jaxsfm.host.atomic import write_atomic
     from jaxsfm.localize import LocalizeOptions, localize
     from jaxsfm.localize_report import LOCALIZED, localize_lines
 
