@@ -16,7 +16,7 @@ from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.host.versions import package_versions
-from jaxsfm.localize_commands import localize
+from jaxsfm.localize_commands import extend, localize
 from jaxsfm.subcommands import one_of, unwrapped
 from jaxsfm.train_commands import train
 from jaxsfm.view_commands import report, view
@@ -50,6 +50,7 @@ COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
     "localize": localize,
+    "extend": extend,
     "evaluate": evaluate,
     "report": report,
     "view": view,
