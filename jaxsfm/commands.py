@@ -175,8 +175,9 @@ def reconstruct(
     report = run_folder(images, out, config=config, options=options)
     print("\n".join(summary_lines(report)))
     if not report["models"]:
+        where = out / "failed" if (out / "sparse").exists() else out
         print(
-            f"jaxsfm: no model: see the lost images above and {out / 'report.json'}",
+            f"jaxsfm: no model: see the lost images above and {where / 'report.json'}",
             file=sys.stderr,
         )
         return 1

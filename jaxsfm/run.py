@@ -200,7 +200,8 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def _bar(items: Iterable[T], total: int, stage: str, unit: str, options: RunOptions) -> Iterator[T]:
-    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=not options.progress)
+    quiet = not options.progress or not total
+    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=quiet)
     interrupt.check()
 
 
