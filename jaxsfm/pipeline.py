@@ -117,6 +117,8 @@ class Reconstructed:
     """The view graph's, by pair; empty where it is switched off."""
     verified: dict[Pair, int]
     """COLMAP's two-view inliers, by pair that has any."""
+    angles: dict[Pair, float]
+    """Degrees at which the rays of a verified pair's points meet (median); 0: unknown."""
     attempts: "list[Attempt]"
     """Runs of the mapper."""
     refinement: "list[RefinementFigures | None]"
@@ -167,6 +169,7 @@ def reconstruct(
     )
     two_views = colmap.read_two_views(database)
     verified = {pair: view.geometry.num_inliers for pair, view in two_views.items()}
+    angles = {pair: view.tri_angle_deg for pair, view in two_views.items()}
     verdicts: dict[Pair, Verdict] = {}
     if config.view_graph:
         verdicts = trusted_pairs({pair: view.geometry for pair, view in two_views.items()})
@@ -194,6 +197,7 @@ def reconstruct(
         models=models,
         verdicts=verdicts,
         verified=verified,
+        angles=angles,
         attempts=attempts,
         refinement=figures,
     )

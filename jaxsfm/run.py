@@ -12,10 +12,12 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
+from jaxsfm.advice import Circumstances
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.extraction import extracted, image_features
+from jaxsfm.failures import explained
 from jaxsfm.host import interrupt
 from jaxsfm.host.colmap import write_models
 from jaxsfm.host.features import ImageFeatures, image_room
@@ -30,8 +32,9 @@ from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
 from jaxsfm.matching import matched
 from jaxsfm.page.after_run import page_after_run
+from jaxsfm.pair_outcomes import PairOutcomes
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
-from jaxsfm.report import lost_images, model_figures, pair_figures
+from jaxsfm.report import model_figures, pair_figures
 from jaxsfm.run_options import RunOptions, check_options
 
 T = TypeVar("T")
@@ -127,12 +130,22 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 "models": figures,
                 "mapping": [dataclasses.asdict(attempt) for attempt in made.attempts],
                 "refinement": [each and dataclasses.asdict(each) for each in made.refinement],
-                "lost": lost_images(
-                    [image.name for image in good],
-                    figures[0]["images"] if figures else [],
-                    counts,
-                    verified,
-                    untrusted,
+                **explained(
+                    [each["images"] for each in figures],
+                    PairOutcomes(
+                        results=counts,
+                        handed_on=handed_on,
+                        verified=verified,
+                        verdicts=made.verdicts,
+                        angles=made.angles,
+                        min_inliers=config.min_inliers,
+                    ),
+                    Circumstances(
+                        config=config,
+                        pairs=options.pairs,
+                        known_camera=intrinsics is not None,
+                        sizes={image.name: image.size for image in good},
+                    ),
                 ),
                 "seconds": seconds,
             }
