@@ -1,8 +1,8 @@
 """COLMAP's binary model files, looked through before COLMAP reads them.
 
 Its readers trust every count in a file and do not look at the file's end: 9 of 168 models with one
-damaged file made them allocate until memory ended or read for ever; none of 1500 that came past this
-check did. The readers of text files refuse what is wrong (none of 400 damaged models did that).
+damaged file made them allocate until memory ended or read for ever. None of 1500 that came past
+this check did. The readers of text files refuse what is wrong (none of 400 models did that).
 
 Layout: COLMAP 4, src/colmap/scene/reconstruction_io.cc; all little-endian.
 """
