@@ -1,10 +1,9 @@
 """Damage done to files by seed, and the cases of a fuzz test that can each be repeated alone."""
 
-import contextlib
 import json
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,28 +26,8 @@ def rng_of(kind: str, case: int) -> np.random.Generator:
     return np.random.default_rng([SEED, zlib.crc32(kind.encode()), case])
 
 
-@contextlib.contextmanager
-def _told(kind: str, case: int) -> Iterator[None]:
-    try:
-        yield
-    except BaseException as error:
-        error.add_note(f"fuzz: JAXSFM_FUZZ_SEED={SEED}, {kind}, case {case}")
-        raise
-
-
-def fuzz(
-    kind: str, check: Callable[[np.random.Generator], str], count: int, start: int = 0
-) -> list[str]:
-    """What `check` made of each of `count` cases; a failure says which case it was."""
-    found = []
-    for case in range(start, start + count):
-        with _told(kind, case):
-            found.append(check(rng_of(kind, case)))
-    return found
-
-
 def outcome(read: Callable[[], Any], *names: object) -> tuple[str, Any]:
-    """('refused', None) for one sentence that names the input, or ('read', result).
+    """('refused', the sentence) for one that names the input, or ('read', the result).
 
     Args:
       names: the file or option, one of which the sentence must name.
@@ -60,7 +39,7 @@ def outcome(read: Callable[[], Any], *names: object) -> tuple[str, Any]:
         assert "\n" not in text and "\r" not in text, text
         assert any(str(name) in text for name in names), (names, text)
         assert len(text) < 2000, text
-        return "refused", None
+        return "refused", text
 
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
