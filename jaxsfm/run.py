@@ -13,9 +13,10 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from jaxsfm.config import Config
+from jaxsfm.engines import chosen_engine
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.extraction import extracted, image_features
+from jaxsfm.extraction import image_features
 from jaxsfm.host import interrupt
 from jaxsfm.host.colmap import write_models
 from jaxsfm.host.features import ImageFeatures, image_room
@@ -28,7 +29,6 @@ from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.versions import versions
 from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
-from jaxsfm.matching import matched
 from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
 from jaxsfm.report import lost_images, model_figures, pair_figures
@@ -235,7 +235,8 @@ def _extract(
     skipped: dict[str, str] = {}
     if not todo:
         return skipped
-    stream = extracted(weights, todo, config=config, execution=options.execution)
+    engine = chosen_engine(options.engine)
+    stream = engine.extracted(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
             folder.mark_unusable(image, str(found))
@@ -263,7 +264,7 @@ def _match(
         return found
 
     rooms = {name: image_room(image, config=config) for name, image in images.items()}
-    stream = matched(
+    stream = chosen_engine(options.engine).matched(
         load, rooms, pairs, config=config, seed=options.seed, execution=options.execution
     )
     for result in _bar(stream, len(pairs), "matching", "pair", options):
