@@ -9,6 +9,7 @@ import contextlib
 import itertools
 import logging
 import os
+import socket
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -86,23 +87,32 @@ def connected(address: str | None) -> Iterator["ModuleType"]:
         yield ray
         return
     address = address or os.environ.get("RAY_ADDRESS")
-    quiet = {"logging_level": logging.CRITICAL, "log_to_driver": False}
-    if address and address.startswith("ray://"):
-        raise UserError(
-            f"--ray-address {address}: run jaxsfm on a machine of the cluster and give its "
-            "HOST:PORT; Ray's client protocol (ray://) does not hand results on as they come"
-        )
+    _check_answers(address)
     try:
-        ray.init(address=address or "auto", **quiet)
+        # Without an address: what `ray start` has left on this machine, else a cluster of its own.
+        ray.init(address=address, logging_level=logging.CRITICAL, log_to_driver=False)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        if address not in (None, "local"):
-            why = str(error).strip().partition("\n")[0]
-            raise UserError(f"--ray-address {address}: no cluster to work with ({why})") from error
-        ray.init(address="local", include_dashboard=False, **quiet)
+        why = str(error).strip().partition("\n")[0]
+        raise UserError(f"--engine ray: Ray cannot be used ({why})") from error
     try:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _check_answers(address: str | None) -> None:
+    """Ray itself would try for minutes, and print about it."""
+    if address in (None, "auto", "local"):
+        return
+    host, _, port = address.rpartition(":")
+    if "://" in address or not host or not port.isdecimal():
+        raise UserError(
+            f"--ray-address {address}: must be HOST:PORT of a cluster that this machine belongs to"
+        )
+    try:
+        socket.create_connection((host, int(port)), timeout=5).close()
+    except (OSError, OverflowError) as error:
+        raise UserError(f"--ray-address {address}: nothing answers there ({error})") from error
 
 
 def threads() -> int:
