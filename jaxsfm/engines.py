@@ -62,8 +62,8 @@ def chosen_engine(choice: EngineChoice) -> Engine:
             given = "--ray-address" if choice.workers is None else "--workers"
             raise UserError(f"{given} is for --engine ray")
         return LocalEngine()
+    from jaxsfm.ray_cluster import imported_ray
     from jaxsfm.ray_engine import RayEngine
-    from jaxsfm.ray_workers import imported_ray
 
     imported_ray()  # before the work
     return RayEngine(address=choice.ray_address, workers=choice.workers)

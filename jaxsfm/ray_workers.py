@@ -8,8 +8,6 @@ the workers before JAX is, and must not import it.
 import contextlib
 import itertools
 import logging
-import os
-import socket
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -18,6 +16,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.host.versions import package_versions
+from jaxsfm.ray_cluster import connected, threads, wanted
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -57,90 +56,6 @@ class _Worker:
         """A generator of (item, result); the first `work` is kept."""
         self._work = self._work or work
         yield from self._work(items, dict(zip(names, objects, strict=True)))
-
-
-def imported_ray() -> "ModuleType":
-    """Ray, with its reports to its makers and its advice to developers switched off.
-
-    Raises:
-      UserError: it is not installed.
-    """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    try:
-        import ray
-    except ImportError as error:
-        raise UserError("--engine ray needs Ray: pip install 'jaxsfm[ray]'") from error
-    return ray
-
-
-@contextlib.contextmanager
-def connected(address: str | None) -> Iterator["ModuleType"]:
-    """Ray, connected: to what this process is connected to already, to `address`, to a cluster
-    that runs here (RAY_ADDRESS tells another), or to one that lives as long as the block.
-
-    Raises:
-      UserError: Ray is not installed, or there is no cluster at the address.
-    """
-    ray = imported_ray()
-    if ray.is_initialized():
-        yield ray
-        return
-    address = address or os.environ.get("RAY_ADDRESS")
-    _check_answers(address)
-    try:
-        # Without an address: what `ray start` has left on this machine, else a cluster of its own.
-        ray.init(address=address, logging_level=logging.CRITICAL, log_to_driver=False)
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        why = str(error).strip().partition("\n")[0]
-        raise UserError(f"--engine ray: Ray cannot be used ({why})") from error
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
-
-
-def _check_answers(address: str | None) -> None:
-    """Ray itself would try for minutes, and print about it."""
-    if address in (None, "auto", "local"):
-        return
-    host, _, port = address.rpartition(":")
-    if "://" in address or not host or not port.isdecimal():
-        raise UserError(
-            f"--ray-address {address}: must be HOST:PORT of a cluster that this machine belongs to"
-        )
-    try:
-        socket.create_connection((host, int(port)), timeout=5).close()
-    except (OSError, OverflowError) as error:
-        raise UserError(f"--ray-address {address}: nothing answers there ({error})") from error
-
-
-def threads() -> int:
-    """Of XLA in this process. Sums are split among them: a worker with another number would round
-    differently (on CPUs; one thread and two differ in the last place of features, measured)."""
-    given = os.environ.get("NPROC", "")
-    if given.isdecimal():
-        return int(given)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def share(cpus: Sequence[int], workers: int | None, usual: int) -> tuple[int, int]:
-    """How many workers, and how many CPUs Ray is asked for each.
-
-    Args:
-      cpus: of each machine.
-      workers: as asked for; None: one for every `usual` CPUs of a machine, at least one.
-
-    Raises:
-      UserError: there are fewer CPUs than workers.
-    """
-    if workers is None:
-        each = min(usual, *cpus)
-        return sum(n // each for n in cpus), each
-    for each in range(max(cpus), 0, -1):
-        if sum(n // each for n in cpus) >= workers:
-            return workers, each
-    raise UserError(f"--workers {workers}: there are {sum(cpus)} CPUs")
 
 
 class _Slot:
@@ -304,18 +219,7 @@ def crew(work: Work, *, address: str | None, workers: int | None) -> Iterator[Cr
       UserError: as `connected`, or the cluster has no such number of CPUs or GPUs.
     """
     with connected(address) as ray:
-        machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        gpus = int(sum(machine.get("GPU", 0) for machine in machines))
-        if gpus:
-            count, needs = workers or gpus, {"num_gpus": 1}
-            if count > gpus:
-                raise UserError(f"--workers {count}: there are {gpus} GPUs")
-        else:
-            cpus = [n for machine in machines if (n := int(machine.get("CPU", 0)))]
-            if not cpus:
-                raise UserError("the Ray cluster has no CPUs for workers")
-            count, each = share(cpus, workers, threads())
-            needs = {"num_cpus": each}
+        count, needs = wanted(ray, workers)
         actor = ray.remote(**needs, max_restarts=0, max_task_retries=0)(_Worker)
         environment = {"env_vars": {"NPROC": str(threads())}}
 

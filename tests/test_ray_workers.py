@@ -14,7 +14,8 @@ from jaxsfm import ray_workers
 from jaxsfm.cli import main
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
-from jaxsfm.ray_workers import AHEAD, LOSSES, Piece, connected, crew, share
+from jaxsfm.ray_cluster import connected
+from jaxsfm.ray_workers import AHEAD, LOSSES, Piece, crew
 
 pytest.importorskip("ray")
 WORKERS = 2
@@ -157,18 +158,3 @@ def test_what_cannot_be_is_one_sentence(
     assert main(["reconstruct", str(scene / "images"), "--out", out, *options]) == 2
     error = capsys.readouterr().err
     assert re.search(why, error) and "Traceback" not in error
-
-
-def test_an_address_where_nothing_answers_is_told_at_once():
-    for address, why in (("127.0.0.1:1", "nothing answers"), ("ray://h:1", "must be HOST:PORT")):
-        with pytest.raises(UserError, match=why), ray_workers.connected(address):
-            pass
-
-
-def test_cpus_are_shared_among_workers():
-    assert share([8], None, 8) == (1, 8)
-    assert share([8, 16], None, 8) == (3, 8)
-    assert share([4, 16], None, 8) == (5, 4)
-    assert share([8, 8], 3, 8) == (3, 4)
-    with pytest.raises(UserError, match="--workers 3"):
-        share([1, 1], 3, 8)
