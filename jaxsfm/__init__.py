@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jaxsfm.pipeline import extract as extract
     from jaxsfm.pipeline import match as match
     from jaxsfm.pipeline import open_images as open_images
-    from jaxsfm.pipeline import reconstruct as reconstruct
+    from jaxsfm.reconstruction import reconstruct as reconstruct
     from jaxsfm.run import run_folder as run_folder
     from jaxsfm.run_options import RunOptions as RunOptions
 
@@ -53,7 +53,7 @@ _HOME = {
     "extract": "pipeline",
     "match": "pipeline",
     "open_images": "pipeline",
-    "reconstruct": "pipeline",
+    "reconstruct": "reconstruction",
     "RunOptions": "run_options",
     "run_folder": "run",
 }

@@ -234,9 +234,9 @@ def match(
     import numpy as np
 
     from jaxsfm.extraction import image_features
+    from jaxsfm.host.atomic import atomic_file
     from jaxsfm.host.images import inspect_image, read_image
     from jaxsfm.host.weights import chosen_weights
-    from jaxsfm.host.workfolder import atomic_file
     from jaxsfm.matching import match_features
     from jaxsfm.pair_alignment import align
     from jaxsfm.run_options import check_seed

@@ -14,6 +14,18 @@ BackboneName = Literal["vgg16", "vgg19", "alexnet"]
 OneToOne = Literal["first", "similarity"]
 
 
+EXTRACTED_BY = (
+    "max_size",
+    "enlarge",
+    "octaves",
+    "centred",
+    "backbone",
+    "convolutions",
+    "keypoints",
+)
+"""Fields of `Config` that an image's features depend on."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairShape:
     """Static part of the pair program; changing any field recompiles it."""
@@ -152,16 +164,7 @@ class Config:
 
     def extraction(self) -> "Config":
         """The part that an image's features depend on; the rest at its defaults."""
-        names = (
-            "max_size",
-            "enlarge",
-            "octaves",
-            "centred",
-            "backbone",
-            "convolutions",
-            "keypoints",
-        )
-        return Config(**{name: getattr(self, name) for name in names})
+        return Config(**{name: getattr(self, name) for name in EXTRACTED_BY})
 
     def matching(self) -> dict[str, object]:
         """The part that the matches depend on, as plain data."""

@@ -8,9 +8,9 @@ from pathlib import Path, PurePosixPath
 import platformdirs
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.download import download, progress_bar, unpack
 from jaxsfm.host.hashes import sha256_of
-from jaxsfm.host.workfolder import write_atomic
 
 _STRECHA = (
     "https://raw.githubusercontent.com/openMVG/SfM_quality_evaluation/"

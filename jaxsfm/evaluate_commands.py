@@ -30,8 +30,8 @@ def evaluate(
     """
     check_writable(json, "--json", (".json",))
     from jaxsfm import evaluation
+    from jaxsfm.host.atomic import write_atomic
     from jaxsfm.host.poses import find_model, model_poses, read_model, read_poses
-    from jaxsfm.host.workfolder import write_atomic
     from jaxsfm.report import evaluation_lines
 
     truth = read_poses(reference)

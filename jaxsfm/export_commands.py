@@ -117,7 +117,7 @@ def _tables(run: Path) -> "Tables | None":
 
 
 def _export_file(run: Path, to: Format, out: Path) -> None:
-    from jaxsfm.host.workfolder import write_atomic
+    from jaxsfm.host.atomic import write_atomic
 
     if to == "nvm":
         from jaxsfm.host.formats.nvm import nvm_text
@@ -167,7 +167,8 @@ def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -
     if tables is None:
         raise UserError(f"{run}: no database.db here, whose matches hloc would get")
     try:
-        config = json.loads((run / "run.json").read_text(encoding="utf-8"))["config"]
+        report = json.loads((run / "report.json").read_text(encoding="utf-8"))
+        config = report["options"]["config"]
         limits = int(config["max_size"]), float(config["enlarge"])
     except (OSError, ValueError, KeyError, TypeError):  # not a run of ours: the photos' own pixels
         limits = 2**31, 1.0

@@ -16,9 +16,12 @@ from jaxsfm.host.images import ImageError, WorkingImage, inspect_image, read_ima
 from jaxsfm.host.model import Tracks, View, errors_px, point_colours, read_model_arrays
 from jaxsfm.host.pairs import Pair, PairResult
 from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
-from jaxsfm.host.workfolder import WorkFolder
+from jaxsfm.host.store import Store
+from jaxsfm.host.workfolder import RECORD
 
 logger = logging.getLogger(__name__)
+REPORTED = {"options", "identity", "images", "pairs", "models"}
+"""What every report has."""
 
 
 class Model(NamedTuple):
@@ -74,7 +77,7 @@ class KeptRun:
     photos: Photos
     model: Model | None
     reference: Reference | None
-    matches: WorkFolder
+    matches: Store
 
     def load_matches(self, pair: Pair) -> PairResult | None:
         """Of one pair, original pixels; None if there are none or the file is gone."""
@@ -132,12 +135,11 @@ def read_run(folder: Path, *, images: Path | None = None, reference: Path | None
       UserError: no finished run, or what was named cannot be used.
     """
     report = _json(folder / "report.json")
-    if report is None or not {"options", "images", "pairs", "models"} <= report.keys():
+    if report is None or not REPORTED <= report.keys():
         raise UserError(f"{folder}: no finished run here (report.json is missing or damaged)")
     if images is not None and not images.is_dir():
         raise UserError(f"--images {images}: no such folder")
-    home = folder if (folder / "run.json").exists() else folder.parent
-    hashes = (_json(home / "run.json") or {}).get("images", {})
+    home = folder if (folder / RECORD).exists() else folder.parent
     recorded = report["images"].get("folder")
     where = images or (Path(recorded) if recorded else None)
     found = _model(folder) if report["models"] else None
@@ -147,8 +149,8 @@ def read_run(folder: Path, *, images: Path | None = None, reference: Path | None
     return KeptRun(
         folder=folder,
         report=report,
-        photos=Photos(where, hashes, report),
+        photos=Photos(where, report["identity"]["images"], report),
         model=model,
         reference=_reference(report, poses, reference) if poses else None,
-        matches=WorkFolder(home),
+        matches=Store(home, report["identity"]),
     )

@@ -1,12 +1,11 @@
 """A whole run in its work folder: photos in, COLMAP model, database and report out."""
 
-import dataclasses
 import importlib.metadata
 import json
+import logging
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +17,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.extraction import image_features
 from jaxsfm.host import interrupt
+from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap import write_models
 from jaxsfm.host.features import ImageFeatures, image_room
 from jaxsfm.host.given import Beside, read_given
@@ -26,22 +26,25 @@ from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
 from jaxsfm.host.poses import model_poses, read_poses
-from jaxsfm.host.versions import versions
+from jaxsfm.host.store import SavedMatches, digest
 from jaxsfm.host.weights import Weights, chosen_weights
-from jaxsfm.host.workfolder import SavedMatches, WorkFolder, open_folder, write_atomic
+from jaxsfm.host.workfolder import WorkFolder, open_folder
 from jaxsfm.page.after_run import page_after_run
-from jaxsfm.pipeline import Reconstructed, open_images, reconstruct
-from jaxsfm.report import lost_images, model_figures, pair_figures
+from jaxsfm.pipeline import open_images
+from jaxsfm.reconstruction import Kept, Reconstructed, reconstruct
 from jaxsfm.run_options import RunOptions, check_options
+from jaxsfm.run_report import Done, run_report
 
 T = TypeVar("T")
+logger = logging.getLogger("jaxsfm")
 
 
 def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) -> dict[str, Any]:
     """Reconstruct a folder of photos; returns the report, also written to `out`/report.json.
 
-    Features and matches are kept in `out` as they are made: after an interruption the same call
-    goes on. `out`/sparse/0 is the best model, `out`/database.db the database.
+    Features, matches and finished stages are kept in `out` as they are made, each under what it
+    depends on: after an interruption, or with other photos or options, the same call goes on with
+    what still holds. `out`/sparse/0 is the best model, `out`/database.db the database.
 
     Raises:
       UserError: what was given cannot be used. Nothing already computed is lost.
@@ -72,13 +75,14 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     }
     seconds: dict[str, float] = {}
     with open_folder(out, identity) as folder:
-        known_bad = folder.unusable()
-        skipped |= {i.name: known_bad[i.sha256] for i in usable if i.sha256 in known_bad}
+        skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
         by_name = {image.name: image for image in usable if image.name not in skipped}
         pairs = [pair for pair in pairs if pair[0] in by_name and pair[1] in by_name]
         with _timed(seconds, "extraction"):
             results = {p: r.counts for p in pairs if (r := folder.load_matches(p)) is not None}
             missing = [pair for pair in pairs if pair not in results]
+            if results:
+                logger.info("%d of %d pairs have been matched before", len(results), len(pairs))
             skipped |= _extract(folder, weights, by_name, missing, config, options)
             missing = [pair for pair in missing if not skipped.keys() & set(pair)]
             good = [image for image in usable if image.name not in skipped]
@@ -86,66 +90,43 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
         with _timed(seconds, "matching"):
             for result in _match(folder, weights, by_name, missing, config, options):
                 results[result.pair] = result.counts
+        chosen = sorted(_choose(results, options.best_pairs))
+        ours = SavedMatches(folder, chosen)
+        handed_on = Beside(ours, given, {image.name for image in good})
+        matches_key = digest(
+            [[*pair, folder.match_key(pair)] for pair in chosen],
+            given.about and given.about["sha256"],
+        )
+        kept = Kept(folder, matches_key)
         with folder.publish() as fresh:
-            chosen = _choose(results, options.best_pairs)
-            ours = SavedMatches(folder, sorted(chosen))
-            handed_on = Beside(ours, given, {image.name for image in good})
-            made = _map(fresh, good, handed_on, intrinsics, config, options, seconds)
-            models, verified = made.models, made.verified
-            untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
-            figures = [model_figures(model) for model in models]
-            counts = given.counts(results)
-            report: dict[str, Any] = {
-                "version": identity["version"],
-                "versions": versions(),
-                "finished": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
-                "weights": weights.described(config),
-                "options": {
-                    "config": dataclasses.asdict(config),
-                    **{k: v for k, v in dataclasses.asdict(options).items() if k != "progress"},
-                    # Read again from anywhere, as the photos' folder is.
-                    "reference": options.reference and options.reference.absolute(),
-                },
-                "images": {
-                    "folder": str(images.absolute()),
-                    "found": len(names),
-                    "usable": len(good),
-                    "skipped": skipped,
-                },
-                "pairs": {
-                    "tried": len(results),
-                    "verified": sum(r.num_inliers > 0 for r in results.values()),
-                    "handed_on": len(handed_on),
-                    "trusted": len(verified) - len(untrusted) if made.verdicts else None,
-                    "overflowed": sum(r.num_dropped > 0 for r in results.values()),
-                    "each": [
-                        pair_figures(pair, each, handed_on, verified, made.verdicts)
-                        for pair, each in sorted(counts.items())
-                    ],
-                },
-                "given": given.about,
-                "models": figures,
-                "mapping": [dataclasses.asdict(attempt) for attempt in made.attempts],
-                "refinement": [each and dataclasses.asdict(each) for each in made.refinement],
-                "lost": lost_images(
-                    [image.name for image in good],
-                    figures[0]["images"] if figures else [],
-                    counts,
-                    verified,
-                    untrusted,
+            made = _map(fresh, good, handed_on, intrinsics, kept, config, options, seconds)
+            report = run_report(
+                Done(
+                    folder=images,
+                    identity=identity,
+                    usable=good,
+                    skipped=skipped,
+                    results=results,
+                    handed_on=handed_on,
+                    given=given,
+                    made=made,
+                    weights=weights.described(config),
+                    seconds=seconds,
                 ),
-                "seconds": seconds,
-            }
-            if reference is not None and models:
+                config=config,
+                options=options,
+            )
+            if reference is not None and made.models:
                 try:
-                    report["evaluation"] = evaluate(model_poses(models[0]), reference).as_dict()
+                    found = evaluate(model_poses(made.models[0]), reference)
+                    report["evaluation"] = found.as_dict()
                 except UserError as error:  # the model is there; only its comparison is not
                     report["evaluation_failed"] = str(error)
             text = json.dumps(report, indent=1, default=str)
             write_atomic(fresh / "report.json", text.encode())
         folder.drop_features()
         # While the folder is ours: another run there would replace what the page shows.
-        page_after_run(out if models or not (out / "sparse").exists() else out / "failed")
+        page_after_run(out if made.models or not (out / "sparse").exists() else out / "failed")
         return report
 
 
@@ -154,6 +135,7 @@ def _map(
     images: list[ImageFile],
     matches: Mapping[Pair, PairResult],
     intrinsics: Intrinsics | None,
+    kept: Kept,
     config: Config,
     options: RunOptions,
     seconds: dict[str, float],
@@ -189,6 +171,7 @@ def _map(
                 seed=options.seed,
                 threads=options.threads,
             ),
+            kept=kept,
             on_image=on_image,
             on_mapped=on_mapped,
             on_pass=on_pass,

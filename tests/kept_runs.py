@@ -1,13 +1,10 @@
 """Copies of a finished run, changed."""
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
 
 import pycolmap
-
-from jaxsfm.host.workfolder import WorkFolder
 
 HOSTILE = "<img src=x onerror=document.title='owned'><b>&amp;.png"
 """A file name that would do harm, or look wrong, if it were not escaped."""
@@ -39,11 +36,5 @@ def renamed(out: Path, images: Path, to: Path, old: str, new: str) -> tuple[Path
         if model.image(image_id).name == old:
             model.image(image_id).name = new
     model.write(run / "sparse" / "0")
-    folder, report = WorkFolder(run), json.loads((out / "report.json").read_text())
-    for row in report["pairs"]["each"]:
-        result = folder.load_matches(tuple(row["pair"]))
-        if old in row["pair"] and result is not None:
-            pair = tuple(new if name == old else name for name in row["pair"])
-            folder.save_matches(dataclasses.replace(result, pair=pair))
     change_report(run, lambda report: report["images"].update(folder=str(photos)))
     return run, photos

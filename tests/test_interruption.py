@@ -54,15 +54,16 @@ def test_an_interrupted_run_goes_on_where_it_was(
         interrupt_after(patch, owner, function, calls)
         assert main([*args, str(tmp_path / "cut")]) == 130
     assert "interrupted" in capsys.readouterr().err
-    done = len(list((tmp_path / "cut").glob("features/*.npz")))
-    matched = len(list((tmp_path / "cut").glob("matches/*.npz")))
+    done = len(list((tmp_path / "cut").glob("features/*/*.npz")))
+    matched = len(list((tmp_path / "cut").glob("matches/*/*.npz")))
     assert (done, matched) == {"extraction": (1, 0), "matching": (3, 2), "mapping": (3, 3)}[stage]
     extracted = interrupt_after(monkeypatch, WorkFolder, "save_features", 99)
     rematched = interrupt_after(monkeypatch, WorkFolder, "save_matches", 99)
     assert main([*args, str(tmp_path / "cut")]) == 0
     assert extracted[0] == 3 - done and rematched[0] == 3 - matched
-    for file in sorted((tmp_path / "whole" / "matches").iterdir()):
-        assert file.read_bytes() == (tmp_path / "cut" / "matches" / file.name).read_bytes()
+    for file in sorted((tmp_path / "whole" / "matches").glob("*/*.npz")):
+        again = tmp_path / "cut" / file.relative_to(tmp_path / "whole")
+        assert file.read_bytes() == again.read_bytes()
     for name in ("images.bin", "points3D.bin"):
         one, two = (tmp_path / run / "sparse" / "0" / name for run in ("whole", "cut"))
         assert one.read_bytes() == two.read_bytes()
@@ -83,7 +84,7 @@ def test_an_interrupt_that_a_callback_swallowed_still_ends_the_run(
     assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == 130
     assert "interrupted" in capsys.readouterr().err
     # The photo that was saved, and the one that was on its way meanwhile.
-    assert len(list((tmp_path / "out" / "features").iterdir())) == 2
+    assert len(list((tmp_path / "out" / "features").glob("*/*"))) == 2
 
 
 @pytest.mark.parametrize(
@@ -105,7 +106,7 @@ def test_what_has_been_started_is_saved(scene, tmp_path, monkeypatch, owner, sta
 
     monkeypatch.setattr(owner, name, failing)
     assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == code
-    assert len(list((tmp_path / "out" / stage).glob("*.npz"))) == 1
+    assert len(list((tmp_path / "out" / stage).glob("*/*.npz"))) == 1
 
 
 def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
@@ -132,7 +133,7 @@ def test_ctrl_c_during_refinement_keeps_features_and_matches(scene, tmp_path, mo
     with monkeypatch.context() as patch:
         patch.setattr(jaxsfm.refine, "bundle_adjust", interrupted)
         assert main(args) == 130
-    assert len(list((tmp_path / "out" / "matches").glob("*.npz"))) == 3
+    assert len(list((tmp_path / "out" / "matches").glob("*/*.npz"))) == 3
     assert not (tmp_path / "out" / "sparse").exists()
     assert main(args) == 0
     assert (tmp_path / "out" / "sparse" / "0" / "images.bin").is_file()

@@ -30,7 +30,7 @@ from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.versions import package_versions
 from jaxsfm.host.weights import chosen_weights
 from jaxsfm.matching import matched
-from jaxsfm.pipeline import reconstruct
+from jaxsfm.reconstruction import reconstruct
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", "paper-learned", *RUN_ABLATED)

@@ -22,13 +22,13 @@ from jaxsfm.bench.common import (
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
+from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap import read_two_views, write_models
 from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.host.rootsift import write_rootsift_database
 from jaxsfm.host.versions import package_versions
-from jaxsfm.host.workfolder import write_atomic
 from jaxsfm.pipeline import open_images
 from jaxsfm.report import model_figures
 from jaxsfm.run import run_folder

@@ -273,6 +273,20 @@ def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
         model.write_binary(target)
 
 
+def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
+    """What `write_models` wrote, of a database's cameras: which focal lengths are known stands
+    there alone."""
+    with pycolmap.Database.open(database) as db:
+        known = {c.camera_id: c.has_prior_focal_length for c in db.read_all_cameras()}
+    models = []
+    while (path := folder / str(len(models))).is_dir():
+        model = pycolmap.Reconstruction(path)
+        for camera_id, camera in model.cameras.items():
+            camera.has_prior_focal_length = known[camera_id]
+        models.append(model)
+    return models
+
+
 def colour_points(
     model: pycolmap.Reconstruction,
     read_rgb: Callable[[str], tuple[np.ndarray, tuple[float, float]]],

@@ -15,8 +15,8 @@ import safetensors
 import safetensors.numpy
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.hashes import sha256_of
-from jaxsfm.host.workfolder import write_atomic
 
 
 def save_tensors(

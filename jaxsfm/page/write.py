@@ -9,8 +9,9 @@ import plotly.offline
 from markupsafe import Markup
 
 from jaxsfm.core.grid import FINE_STRIDE
+from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.images import shown_name
-from jaxsfm.host.workfolder import PAGE, write_atomic
+from jaxsfm.host.workfolder import PAGE
 from jaxsfm.kept import KeptRun, read_run
 from jaxsfm.page import close_ups, tables
 from jaxsfm.page.error_figures import cumulative_figures, reprojection_figure, track_figure

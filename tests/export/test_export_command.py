@@ -86,9 +86,9 @@ def test_hloc_gets_the_matches_that_were_asked_for(tmp_path, run, chosen):
 def test_the_uncertainty_is_a_working_pixel(tmp_path, run, model):
     import h5py
 
-    config = {"config": {"max_size": 256, "enlarge": 1.0}}
+    report = {"options": {"config": {"max_size": 256, "enlarge": 1.0}}}
     copy = write_run(tmp_path / "run", model)
-    (copy / "run.json").write_text(json.dumps(config))
+    (copy / "report.json").write_text(json.dumps(report))
     for folder, expected in ((run, 1.0), (copy, 4.0)):
         assert export(folder, "hloc", tmp_path / folder.name / "h") == 0
         with h5py.File(tmp_path / folder.name / "h" / FEATURES) as file:

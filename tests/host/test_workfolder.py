@@ -1,4 +1,4 @@
-"""A run's folder: whole files or none, bit for bit."""
+"""What a run keeps: whole files or none, bit for bit, under all that they depend on."""
 
 import os
 
@@ -10,7 +10,22 @@ from jaxsfm.errors import UserError
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import PairResult
-from jaxsfm.host.workfolder import SavedMatches, WorkFolder
+from jaxsfm.host.store import SavedMatches, Store
+
+PAIRS = [("a.jpg", "b.jpg"), ("a b", "c"), ("a", "b c"), ("new\nline", "日本"), ("x", "\udcff")]
+CONFIG = {"octaves": 2, "threshold_px": 10.0}
+IDENTITY = {
+    "version": "1",
+    "weights": "w",
+    "relocalizer": None,
+    "config": CONFIG,
+    "seed": 0,
+    "images": {name: f"hash of {name!r}" for name in ("c.jpg", *(n for p in PAIRS for n in p))},
+}
+
+
+def opened(path, **changes) -> Store:
+    return Store(path, IDENTITY | changes)
 
 
 def features(name: str = "a.jpg", digit: str = "a") -> ImageFeatures:
@@ -61,20 +76,19 @@ def assert_same(got, want) -> None:
 
 @pytest.mark.parametrize("n", [0, 5])
 def test_matches_come_back_bit_for_bit(tmp_path, n):
-    folder = WorkFolder(tmp_path)
-    pairs = [("a.jpg", "b.jpg"), ("a b", "c"), ("a", "b c"), ("new\nline", "日本"), ("x", "\udcff")]
-    for i, pair in enumerate(pairs):
+    folder = opened(tmp_path)
+    for i, pair in enumerate(PAIRS):
         folder.save_matches(result(pair, n + i))
-    for i, pair in enumerate(pairs):
-        assert_same(WorkFolder(tmp_path).load_matches(pair), result(pair, n + i))
+    for i, pair in enumerate(PAIRS):
+        assert_same(opened(tmp_path).load_matches(pair), result(pair, n + i))
     assert folder.load_matches(("b.jpg", "a.jpg")) is None
 
 
 def test_features_come_back_bit_for_bit(tmp_path):
     saved = features()
-    assert not WorkFolder(tmp_path).has_features(saved.image)
-    WorkFolder(tmp_path).save_features(saved)
-    fresh = WorkFolder(tmp_path)
+    assert not opened(tmp_path).has_features(saved.image)
+    opened(tmp_path).save_features(saved)
+    fresh = opened(tmp_path)
     assert fresh.has_features(saved.image)
     loaded = fresh.load_features(saved.image)
     assert_same(loaded, saved)
@@ -82,9 +96,9 @@ def test_features_come_back_bit_for_bit(tmp_path):
 
 
 def test_features_follow_the_content_not_the_name(tmp_path):
-    WorkFolder(tmp_path).save_features(features("a.jpg", "a"))
-    assert WorkFolder(tmp_path).load_features(features("renamed.jpg", "a").image) is not None
-    assert WorkFolder(tmp_path).load_features(features("a.jpg", "b").image) is None
+    opened(tmp_path).save_features(features("a.jpg", "a"))
+    assert opened(tmp_path).load_features(features("renamed.jpg", "a").image) is not None
+    assert opened(tmp_path).load_features(features("a.jpg", "b").image) is None
 
 
 def only_file(folder):
@@ -103,31 +117,29 @@ def damages(data: bytes):
 @pytest.mark.parametrize("case", range(9))
 def test_a_damaged_file_reads_as_none(tmp_path, case):
     """Including what zipfile calls NotImplementedError or RuntimeError."""
-    WorkFolder(tmp_path / "m").path.mkdir()
-    WorkFolder(tmp_path / "m").save_matches(result())
-    WorkFolder(tmp_path / "f").path.mkdir()
-    WorkFolder(tmp_path / "f").save_features(features())
+    opened(tmp_path / "m").save_matches(result())
+    opened(tmp_path / "f").save_features(features())
     for sub in ("m", "f"):
         file = only_file(tmp_path / sub)
         file.write_bytes(list(damages(file.read_bytes()))[case])
-    assert WorkFolder(tmp_path / "m").load_matches(result().pair) is None
-    assert WorkFolder(tmp_path / "f").load_features(features().image) is None
+    assert opened(tmp_path / "m").load_matches(result().pair) is None
+    assert opened(tmp_path / "f").load_features(features().image) is None
 
 
 def test_a_file_cut_anywhere_reads_as_none(tmp_path):
-    WorkFolder(tmp_path).save_matches(result())
+    opened(tmp_path).save_matches(result())
     file = only_file(tmp_path)
     data = file.read_bytes()
     for length in range(0, len(data), 97):
         file.write_bytes(data[:length])
-        assert WorkFolder(tmp_path).load_matches(result().pair) is None
+        assert opened(tmp_path).load_matches(result().pair) is None
 
 
 def test_an_interrupted_write_leaves_nothing_that_is_read(tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    folder = WorkFolder(tmp_path)
+    folder = opened(tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", interrupted)
         for save, value in ((folder.save_matches, result()), (folder.save_features, features())):
@@ -143,7 +155,7 @@ def test_an_interrupted_write_leaves_nothing_that_is_read(tmp_path, monkeypatch)
 
 
 def test_dropping_features_keeps_matches(tmp_path):
-    folder = WorkFolder(tmp_path)
+    folder = opened(tmp_path)
     folder.save_features(features())
     folder.save_matches(result())
     folder.drop_features()
@@ -153,7 +165,7 @@ def test_dropping_features_keeps_matches(tmp_path):
 
 
 def test_saved_matches_are_read_when_asked_for(tmp_path):
-    folder = WorkFolder(tmp_path)
+    folder = opened(tmp_path)
     pairs = [("a.jpg", "b.jpg"), ("a.jpg", "c.jpg")]
     for n, pair in enumerate(pairs, start=3):
         folder.save_matches(result(pair, n))
@@ -163,7 +175,7 @@ def test_saved_matches_are_read_when_asked_for(tmp_path):
     assert ("b.jpg", "c.jpg") not in saved and saved.get(("b.jpg", "c.jpg")) is None
     folder.save_matches(result(("b.jpg", "c.jpg")))  # another run's, or not handed on
     assert ("b.jpg", "c.jpg") not in saved
-    for path in (tmp_path / "matches").iterdir():
+    for path in (tmp_path / "matches").rglob("*.npz"):
         path.write_bytes(b"")
     with pytest.raises(UserError, match="a.jpg.*damaged"):
         saved[pairs[0]]
@@ -173,3 +185,55 @@ def test_counts_say_what_a_result_holds():
     counts = result(n=5).counts
     assert (counts.num_inliers, counts.num_planes, counts.num_tentative) == (5, 2, 77)
     assert (counts.num_dropped, counts.status) == (3, Status.NO_PLANE)
+
+
+def test_everything_is_kept_under_all_that_it_depends_on(tmp_path):
+    """And under nothing else: what does not depend on a change is found again."""
+    store = opened(tmp_path)
+    store.save_features(features())
+    store.save_matches(result())
+    store.save_descriptor(features().image, "kind", {"x": np.ones(3)})
+    store.mark_unusable(features(digit="b").image, "torn")
+    other = {"images": IDENTITY["images"] | {"b.jpg": "other"}}
+    fewer = {"images": {name: IDENTITY["images"][name] for name in ("a.jpg", "b.jpg")}}
+    cases = [  # change, features, matches, descriptor, unusable
+        ({}, True, True, True, True),
+        ({"version": "2"}, False, False, False, False),
+        ({"weights": "v"}, False, False, False, True),
+        ({"relocalizer": "r"}, False, False, False, True),
+        ({"config": CONFIG | {"octaves": 1}}, False, False, True, True),
+        ({"config": CONFIG | {"threshold_px": 5.0}}, True, False, True, True),
+        ({"seed": 1}, True, False, True, True),
+        (other, True, False, True, True),
+        (fewer, True, True, True, True),
+    ]
+    for change, *expected in cases:
+        now = opened(tmp_path, **change)
+        image = features().image
+        found = [
+            now.load_features(image) is not None,
+            now.load_matches(result().pair) is not None,
+            now.load_descriptor(image, "kind") is not None,
+            now.why_unusable(features(digit="b").image) is not None,
+        ]
+        assert found == expected, change
+    assert store.load_descriptor(features().image, "other kind") is None
+    assert store.load_descriptor(features(digit="b").image, "kind") is None
+
+
+def test_matches_follow_the_contents_not_the_names(tmp_path):
+    opened(tmp_path).save_matches(result())
+    renamed = {"images": {"y.jpg": IDENTITY["images"]["a.jpg"], "z.jpg": "hash of 'b.jpg'"}}
+    found = opened(tmp_path, **renamed).load_matches(("y.jpg", "z.jpg"))
+    assert found is not None and found.pair == ("y.jpg", "z.jpg")
+    assert_same(found, result(("y.jpg", "z.jpg")))
+    assert opened(tmp_path, **renamed).load_matches(("z.jpg", "y.jpg")) is None
+
+
+def test_sweeping_removes_what_was_half_written_alone(tmp_path):
+    store = opened(tmp_path)
+    store.save_matches(result())
+    file = only_file(tmp_path)
+    file.with_name(file.name + ".partial").write_bytes(b"half")
+    store.sweep()
+    assert only_file(tmp_path) == file

@@ -1,4 +1,4 @@
-"""A run's folder has one owner at a time and never another run's files."""
+"""A run's folder has one owner at a time; what changed since the last run is said."""
 
 import json
 import os
@@ -6,7 +6,8 @@ import os
 import pytest
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.workfolder import open_folder, write_atomic
+from jaxsfm.host.atomic import write_atomic
+from jaxsfm.host.workfolder import open_folder
 
 IDENTITY = {"seed": 0, "version": "1", "images": {"a.jpg": "00", "b.jpg": "11"}}
 
@@ -19,10 +20,12 @@ def test_the_same_run_goes_on_where_it_was(tmp_path):
         assert (folder.path / "mine").read_text() == "x"
 
 
-def test_identity_is_compared_as_json(tmp_path):
+def test_identity_is_compared_as_json(tmp_path, caplog):
+    caplog.set_level("INFO")
     for value in ((1, 2), [1, 2]):
-        with open_folder(tmp_path, {"size": value}):
+        with open_folder(tmp_path, IDENTITY | {"size": value}):
             pass
+    assert "continuing" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -35,16 +38,24 @@ def test_identity_is_compared_as_json(tmp_path):
         ({"images": {"b.jpg": "11", "c.jpg": "33"}}, "2 images, first 'a.jpg'"),
     ],
 )
-def test_another_run_is_refused_with_the_difference(tmp_path, change, message):
+def test_what_changed_since_the_last_run_is_said(tmp_path, caplog, change, message):
+    caplog.set_level("INFO")
     with open_folder(tmp_path, IDENTITY):
         (tmp_path / "mine").write_text("x")
+    with open_folder(tmp_path, {**IDENTITY, **change}):
+        assert (tmp_path / "mine").exists()
+    assert message in caplog.text and str(tmp_path) in caplog.text
+    assert json.loads((tmp_path / "run.json").read_text()) == {**IDENTITY, **change}
+
+
+def test_a_run_of_other_photos_is_refused(tmp_path):
+    with open_folder(tmp_path, IDENTITY):
+        pass
     before = (tmp_path / "run.json").read_bytes()
-    with pytest.raises(UserError, match="holds another run") as error:
-        with open_folder(tmp_path, {**IDENTITY, **change}):
+    with pytest.raises(UserError, match="holds a run of other photos .first 'a.jpg'"):
+        with open_folder(tmp_path, {**IDENTITY, "images": {"a.jpg": "22", "b.jpg": "33"}}):
             pytest.fail("opened")
-    assert message in str(error.value) and str(tmp_path) in str(error.value)
     assert (tmp_path / "run.json").read_bytes() == before
-    assert (tmp_path / "mine").exists()
 
 
 @pytest.mark.parametrize("record", ["", "{", "[]", "null", '{"images": []}', "\x00"])

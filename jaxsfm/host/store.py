@@ -1,0 +1,192 @@
+"""What a run has computed of its photos and pairs, each kept under all that it depends on.
+
+So whatever changes between two runs in a folder (photos, options, weights, version), what does not
+depend on it is found again, and nothing is ever taken for what it is not.
+"""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsfm.config import EXTRACTED_BY
+from jaxsfm.core.types import DenseFeatures, Status
+from jaxsfm.errors import UserError
+from jaxsfm.host.atomic import PARTIAL, load_arrays, save_arrays, write_atomic
+from jaxsfm.host.features import ImageFeatures
+from jaxsfm.host.images import ImageFile
+from jaxsfm.host.pairs import Pair, PairResult, describe
+
+Identity = Mapping[str, Any]
+"""What matches depend on, plain JSON: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
+`config` (`Config.matching`), `seed`, `images` (name -> SHA-256)."""
+
+_OCTAVES = ("coarse", "fine")
+"""Fields of DenseFeatures that hold an array per octave."""
+_RESULT = ("cells", "keypoints0", "keypoints1", "plane", "homographies")
+"""Arrays of a PairResult."""
+_FOLDERS = ("features", "matches", "descriptors")
+
+
+def digest(*parts: Any) -> str:
+    """32 hexadecimal digits of plain JSON."""
+    text = json.dumps(parts, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+class Store:
+    """Features, matches and descriptors in a folder, one file each.
+
+    Args:
+      identity: of the run that they are read and written for.
+    """
+
+    def __init__(self, path: Path, identity: Identity) -> None:
+        self.path, self.identity = path, identity
+
+    def _file(self, kind: str, *depends_on: Any) -> Path:
+        of_all = [self.identity.get(name) for name in ("version", "weights", "relocalizer")]
+        name = digest(of_all, depends_on)
+        return self.path / kind / name[:2] / f"{name[2:]}.npz"  # never 100 000 files in one folder
+
+    def sweep(self) -> None:
+        """Remove what a killed process had begun to write."""
+        for kind in _FOLDERS:
+            for partial in (self.path / kind).glob(f"*/*{PARTIAL}"):
+                partial.unlink(missing_ok=True)
+
+    # -- features: needed until all pairs have matches -------------------------------------------
+
+    def _feature_path(self, image: ImageFile) -> Path:
+        config = self.identity.get("config", {})
+        return self._file("features", {k: config.get(k) for k in EXTRACTED_BY}, image.sha256)
+
+    def save_features(self, features: ImageFeatures) -> None:
+        arrays = {"scale": np.asarray(features.scale, np.float64)}
+        for name, value in features.dense._asdict().items():
+            if name in _OCTAVES:
+                arrays |= {f"octave{k}_{name}": array for k, array in enumerate(value)}
+            else:
+                arrays[name] = value
+        save_arrays(self._feature_path(features.image), arrays)
+
+    def has_features(self, image: ImageFile) -> bool:
+        return self._feature_path(image).exists()
+
+    def load_features(self, image: ImageFile) -> ImageFeatures | None:
+        """The saved features, or None if there are none (or they are damaged)."""
+        found: dict[str, Any] | None = load_arrays(self._feature_path(image))
+        if found is None:
+            return None
+        octaves = sum(name.endswith("_coarse") for name in found)
+        try:
+            coarse, fine = (
+                tuple(found[f"octave{k}_{name}"] for k in range(octaves)) for name in _OCTAVES
+            )
+            rest = (found[name] for name in DenseFeatures._fields if name not in _OCTAVES)
+            dense = DenseFeatures(coarse, fine, *rest)
+            x, y = found["scale"]
+        except (KeyError, ValueError, TypeError):
+            return None
+        return ImageFeatures(image, (float(x), float(y)), dense)
+
+    def drop_features(self) -> None:
+        """Delete them, those of former options too: every pair has its matches."""
+        shutil.rmtree(self.path / "features", ignore_errors=True)
+
+    # -- descriptors of whole photos: small, kept ------------------------------------------------
+
+    def save_descriptor(self, image: ImageFile, kind: str, arrays: Mapping[str, Any]) -> None:
+        """Args:
+        kind: what they are and all that they depend on beside the photo, weights and version.
+        """
+        save_arrays(self._file("descriptors", kind, image.sha256), arrays)
+
+    def load_descriptor(self, image: ImageFile, kind: str) -> dict[str, np.ndarray] | None:
+        """Saved arrays, or None if there are none (or they are damaged)."""
+        return load_arrays(self._file("descriptors", kind, image.sha256))
+
+    # -- photos that could not be decoded --------------------------------------------------------
+
+    def _unusable(self) -> dict[str, str]:
+        try:
+            record = json.loads((self.path / "unusable.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return record if isinstance(record, dict) else {}
+
+    def why_unusable(self, image: ImageFile) -> str | None:
+        """Why an earlier attempt could not decode the photo."""
+        reason = self._unusable().get(digest(self.identity.get("version"), image.sha256))
+        return reason if isinstance(reason, str) else None
+
+    def mark_unusable(self, image: ImageFile, reason: str) -> None:
+        """Remember a photo that cannot be decoded, so that going on does not try again."""
+        record = self._unusable() | {digest(self.identity.get("version"), image.sha256): reason}
+        write_atomic(self.path / "unusable.json", json.dumps(record, indent=1).encode())
+
+    # -- matches ---------------------------------------------------------------------------------
+
+    def match_key(self, pair: Pair) -> str:
+        """Of all that a pair's matches depend on."""
+        return self._match_path(pair).stem
+
+    def _match_path(self, pair: Pair) -> Path:
+        known = self.identity.get("images", {})
+        hashes = [known.get(name) for name in pair]
+        return self._file("matches", self.identity.get("config"), self.identity.get("seed"), hashes)
+
+    def save_matches(self, result: PairResult) -> None:
+        arrays = {name: getattr(result, name) for name in _RESULT}
+        counts = [result.num_tentative, result.num_dropped, int(result.status)]
+        save_arrays(
+            self._match_path(result.pair), {**arrays, "counts": np.asarray(counts, np.int64)}
+        )
+
+    def load_matches(self, pair: Pair) -> PairResult | None:
+        """The saved matches, or None if there are none (or they are damaged)."""
+        found = load_arrays(self._match_path(pair))
+        try:
+            if found is None:
+                return None
+            tentative, dropped, status = (int(v) for v in found["counts"])
+            return PairResult(
+                pair=pair,
+                **{name: found[name] for name in _RESULT},
+                num_tentative=tentative,
+                num_dropped=dropped,
+                status=Status(status),
+            )
+        except (KeyError, ValueError, TypeError):
+            return None
+
+
+class SavedMatches(Mapping[Pair, PairResult]):
+    """Pairs' results in a folder, read when they are asked for."""
+
+    def __init__(self, store: Store, pairs: Iterable[Pair]) -> None:
+        self._store, self._pairs = store, dict.fromkeys(pairs)
+
+    def __getitem__(self, pair: Pair) -> PairResult:
+        if pair not in self._pairs:
+            raise KeyError(pair)
+        found = self._store.load_matches(pair)
+        if found is None:
+            raise UserError(
+                f"--out {self._store.path}: the matches of {describe(pair)} are gone or damaged; "
+                "run the same command again"
+            )
+        return found
+
+    def __contains__(self, pair: object) -> bool:
+        return pair in self._pairs
+
+    def __iter__(self) -> Iterator[Pair]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
