@@ -12,6 +12,7 @@ from typing import Literal
 import tyro
 
 from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
+from jaxsfm.engine_choice import LOCAL, EngineChoice
 from jaxsfm.errors import UserError
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
@@ -95,6 +96,7 @@ def reconstruct(
     images_at_once: int | None = None,
     pairs_at_once: int | None = None,
     memory_gb: float | None = None,
+    engine: EngineChoice = LOCAL,
 ) -> int:
     """A folder of photos to a COLMAP model.
 
@@ -132,6 +134,7 @@ def reconstruct(
       pairs_at_once: Matched side by side on each device; default: what fits, one on a CPU.
       memory_gb: For the features at hand, on each device; default: half of an accelerator, an
         eighth of a host, at most 1.6. Less makes photos come back more often.
+      engine: Where photos and pairs are computed.
     """
     config = _config(
         preset,
@@ -170,6 +173,7 @@ def reconstruct(
         with_database=with_database,
         with_hloc=with_hloc,
         execution=execution,
+        engine=engine,
         progress=True,
     )
     report = run_folder(images, out, config=config, options=options)

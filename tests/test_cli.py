@@ -441,7 +441,7 @@ def test_running_out_of_memory_is_one_sentence(scene, tmp_path, monkeypatch, cap
     def exhausted(*args, **kwargs):
         raise RuntimeError("RESOURCE_EXHAUSTED: out of memory allocating 1 TB")
 
-    monkeypatch.setattr("jaxsfm.run.matched", exhausted)
+    monkeypatch.setattr("jaxsfm.engines.LocalEngine.matched", exhausted)
     args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
     assert main(args) == 1
     error = capsys.readouterr().err
@@ -505,7 +505,7 @@ def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatc
     data = (folder / "view0.png").read_bytes()
     (folder / "bad.png").write_bytes(data[: len(data) // 2])
     run(scene, tmp_path / "out", images=folder)
-    monkeypatch.setattr("jaxsfm.run.extracted", None)  # calling it would fail
+    monkeypatch.setattr("jaxsfm.engines.LocalEngine.extracted", None)  # calling it would fail
     report = run(scene, tmp_path / "out", images=folder)
     assert list(report["images"]["skipped"]) == ["bad.png"]
 
