@@ -7,6 +7,7 @@ from typing import Literal
 from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
 from jaxsfm.host.mapping import Mapper
+from jaxsfm.host.plan import Retrieval
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 
@@ -15,7 +16,10 @@ class RunOptions:
     """What to do, beyond the matching `Config`."""
 
     pairs: str = "exhaustive"
-    """`exhaustive`, or a file with two image names a line."""
+    """`exhaustive`, a file with two image names a line, `sequential:K`, `retrieval:K`, or several
+    joined by `+` (`jaxsfm.host.plan`)."""
+    retrieval: Retrieval = "vlad"
+    """How photos are described for `retrieval:K`."""
     best_pairs: int | None = None
     """Hand on only each image's N pairs with the most inliers (a union); None: all."""
     intrinsics: str | None = None
