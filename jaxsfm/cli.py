@@ -16,6 +16,7 @@ from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.host.versions import package_versions
+from jaxsfm.pairs_command import pairs
 from jaxsfm.subcommands import one_of, unwrapped
 from jaxsfm.train_commands import train
 from jaxsfm.view_commands import report, view
@@ -48,6 +49,7 @@ that completes commands and options."""
 COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
+    "pairs": pairs,
     "evaluate": evaluate,
     "report": report,
     "view": view,
