@@ -17,6 +17,7 @@ from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.host.versions import package_versions
 from jaxsfm.localize_commands import extend, localize
+from jaxsfm.pairs_command import pairs
 from jaxsfm.subcommands import one_of, unwrapped
 from jaxsfm.train_commands import train
 from jaxsfm.view_commands import report, view
@@ -49,6 +50,7 @@ that completes commands and options."""
 COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
+    "pairs": pairs,
     "localize": localize,
     "extend": extend,
     "evaluate": evaluate,
