@@ -29,6 +29,8 @@ PAGES = (
 LONG = (
     "jaxsfm.run.run_folder",
     "jaxsfm.demo.run_demo",
+    "jaxsfm.localize.localize",
+    "jaxsfm.extend.extend",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.extraction.image_features",
     "jaxsfm.datasets.fetch",
