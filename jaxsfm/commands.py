@@ -12,6 +12,7 @@ from typing import Literal
 import tyro
 
 from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
+from jaxsfm.engine_choice import LOCAL, EngineChoice
 from jaxsfm.errors import UserError
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
@@ -96,6 +97,7 @@ def reconstruct(
     images_at_once: int | None = None,
     pairs_at_once: int | None = None,
     memory_gb: float | None = None,
+    engine: EngineChoice = LOCAL,
 ) -> int:
     """A folder of photos to a COLMAP model.
 
@@ -135,6 +137,7 @@ def reconstruct(
       pairs_at_once: Matched side by side on each device; default: what fits, one on a CPU.
       memory_gb: For the features at hand, on each device; default: half of an accelerator, an
         eighth of a host, at most 1.6. Less makes photos come back more often.
+      engine: Where photos and pairs are computed.
     """
     config = _config(
         preset,
@@ -174,13 +177,15 @@ def reconstruct(
         with_database=with_database,
         with_hloc=with_hloc,
         execution=execution,
+        engine=engine,
         progress=True,
     )
     report = run_folder(images, out, config=config, options=options)
     print("\n".join(summary_lines(report)))
     if not report["models"]:
+        where = out / "failed" if (out / "sparse").exists() else out
         print(
-            f"jaxsfm: no model: see the lost images above and {out / 'report.json'}",
+            f"jaxsfm: no model: see the lost images above and {where / 'report.json'}",
             file=sys.stderr,
         )
         return 1

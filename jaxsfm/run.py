@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from jaxsfm.config import Config
+from jaxsfm.engines import chosen_engine
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.extraction import extracted, image_features
+from jaxsfm.extraction import image_features
 from jaxsfm.host import interrupt
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap import write_models
@@ -29,7 +30,6 @@ from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.store import SavedMatches, digest
 from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import WorkFolder, open_folder
-from jaxsfm.matching import matched
 from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pipeline import open_images
 from jaxsfm.reconstruction import Kept, Reconstructed, reconstruct
@@ -205,7 +205,8 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def _bar(items: Iterable[T], total: int, stage: str, unit: str, options: RunOptions) -> Iterator[T]:
-    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=not options.progress)
+    quiet = not options.progress or not total
+    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=quiet)
     interrupt.check()
 
 
@@ -242,7 +243,8 @@ def _extract(
     skipped: dict[str, str] = {}
     if not todo:
         return skipped
-    stream = extracted(weights, todo, config=config, execution=options.execution)
+    engine = chosen_engine(options.engine)
+    stream = engine.extracted(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
             folder.mark_unusable(image, str(found))
@@ -270,7 +272,7 @@ def _match(
         return found
 
     rooms = {name: image_room(image, config=config) for name, image in images.items()}
-    stream = matched(
+    stream = chosen_engine(options.engine).matched(
         load, rooms, pairs, config=config, seed=options.seed, execution=options.execution
     )
     for result in _bar(stream, len(pairs), "matching", "pair", options):
