@@ -10,7 +10,9 @@ matches. Each row is a way to describe photos; a set's columns are the K of `ret
 """
 
 import argparse
+import functools
 import itertools
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +27,7 @@ from jaxsfm.bench.night_matches import CORRECT_PX, epipolar_distance
 from jaxsfm.core.blocks import pool
 from jaxsfm.core.numerics import unit
 from jaxsfm.core.pooling import gem, vlad
-from jaxsfm.core.vgg import VGG16, preprocess
+from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 from jaxsfm.core.vocabulary import fit_vocabulary
 from jaxsfm.global_descriptors import SAMPLE
 from jaxsfm.host.colmap import read_matches
@@ -50,6 +52,10 @@ KINDS: tuple[Retrieval, ...] = ("gem", "vlad")
 SIZES = (480, 640)
 Local = dict[str, np.ndarray]
 """Local descriptors (cells, channels) by image."""
+
+
+_fit = jax.jit(fit_vocabulary, static_argnames=("words",))
+_vlad = jax.jit(vlad)
 
 
 class Known(NamedTuple):
@@ -91,26 +97,28 @@ def true_pairs(database: Path, known: dict[str, Known]) -> dict[Pair, int]:
     return found
 
 
+@functools.partial(jax.jit, static_argnames=("of",))
+def both(params: dict, image: jax.Array, valid: jax.Array, *, of: Preprocessing) -> list[jax.Array]:
+    """pool4, conv5_3 before its rectifier, pool5."""
+    x = preprocess(image, of)[None]
+    levels = VGG16().apply(params, x, valid[None], method="levels")
+    conv5 = VGG16().apply(params, x, valid[None], method="conv5")
+    return [levels.pool4[0], conv5[0], pool(conv5, valid[None] // 16)[0]]
+
+
 def maps(weights: Weights, images: list[ImageFile], size: int) -> dict[str, Local]:
     """Local descriptors of both layers."""
-
-    @jax.jit
-    def both(image, valid):
-        x = preprocess(image, weights.preprocessing)[None]
-        levels = VGG16().apply(weights.params, x, valid[None], method="levels")
-        conv5 = VGG16().apply(weights.params, x, valid[None], method="conv5")
-        return levels.pool4[0], conv5[0], pool(conv5, valid[None] // 16)[0]
-
     found: dict[str, Local] = {"pool4": {}, "conv5": {}, "pool5": {}}
     for image in images:
         rgb = read_image(image, max_size=size).rgb
         height, width = rgb.shape[:2]
         padded = np.zeros((*padded_size((width, height)), 3), np.uint8)
         padded[:height, :width] = rgb
-        each = both(padded, np.asarray([height, width], np.int32))
+        valid = np.asarray([height, width], np.int32)
+        each = both(weights.params, padded, valid, of=weights.preprocessing)
         for layer, stride, x in zip(found, (16, 16, 32), each, strict=True):
-            valid = np.asarray(x)[: height // stride, : width // stride]
-            found[layer][image.name] = valid.reshape(-1, valid.shape[-1])
+            cells = np.asarray(x)[: height // stride, : width // stride]
+            found[layer][image.name] = cells.reshape(-1, cells.shape[-1])
     return found
 
 
@@ -132,11 +140,8 @@ def by_vlad(local: Local, words: int, seed: int) -> dict[str, np.ndarray]:
     units = {name: np.asarray(unit(x)) for name, x in local.items()}
     rng = np.random.default_rng(seed)
     parts = [rng.permutation(x)[: SAMPLE // len(units)] for x in units.values()]
-    fitted = jax.jit(fit_vocabulary, static_argnames=("words",))(
-        jax.random.key(seed), np.concatenate(parts), words=words
-    )
-    one = jax.jit(vlad)
-    return {name: np.asarray(one(x, fitted)) for name, x in units.items()}
+    fitted = _fit(jax.random.key(seed), np.concatenate(parts), words=words)
+    return {name: np.asarray(_vlad(x, fitted)) for name, x in units.items()}
 
 
 def ways(found: dict[str, Local]) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
@@ -145,7 +150,7 @@ def ways(found: dict[str, Local]) -> Iterator[tuple[str, dict[str, np.ndarray]]]
         for power in (1.0, 3.0):
             yield f"gem {layer} p {power:.0f}", by_gem(found[layer], power)
     for layer in ("pool4", "conv5"):
-        for words in (16, 64):
+        for words in (32, 64):
             for seed in (0, 1):
                 yield f"vlad {layer} {words} seed {seed}", by_vlad(found[layer], words, seed)
 
@@ -187,6 +192,7 @@ def main() -> None:
             ours |= {f"{size} {way}": vectors for way, vectors in ways(found)}
         for way, vectors in ours.items():
             rows.setdefault(way, []).extend(kept(vectors, truth, k) for k in ks)
+            print(name, way, *rows[way][-len(ks) :], file=sys.stderr)
     print("| |", " | ".join(head), "|")
     print("|---|" + "---|" * len(head))
     for way, cells in rows.items():

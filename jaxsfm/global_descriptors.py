@@ -199,10 +199,9 @@ def _conv5_rows(
         height, width = rgb.shape[:2]
         padded = np.zeros((*padded_size((width, height)), 3), np.uint8)
         padded[:height, :width] = rgb
-        maps = _conv5(
-            params, padded, np.asarray([height, width], np.int32), of=weights.preprocessing
-        )
-        yield image, np.asarray(maps).reshape(-1, maps.shape[-1])
+        size = np.asarray([height, width], np.int32)
+        maps = np.asarray(_conv5(params, padded, size, of=weights.preprocessing))
+        yield image, maps.reshape(-1, maps.shape[-1])
 
 
 @functools.partial(jax.jit, static_argnames=("of",))
