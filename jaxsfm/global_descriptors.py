@@ -159,7 +159,8 @@ def _rows(
             if isinstance(found, ImageError):
                 yield image, found
             else:
-                yield image, found.dense.coarse[0][: int(np.prod(found.dense.coarse_grid))]
+                cells = int(np.prod(found.dense.coarse_grid))
+                yield image, np.asarray(found.dense.coarse[0][:cells])
 
 
 def _again(work: Work, image: ImageFile) -> np.ndarray:
@@ -199,10 +200,9 @@ def _conv5_rows(
         height, width = rgb.shape[:2]
         padded = np.zeros((*padded_size((width, height)), 3), np.uint8)
         padded[:height, :width] = rgb
-        maps = _conv5(
-            params, padded, np.asarray([height, width], np.int32), of=weights.preprocessing
-        )
-        yield image, np.asarray(maps).reshape(-1, maps.shape[-1])
+        size = np.asarray([height, width], np.int32)
+        maps = np.asarray(_conv5(params, padded, size, of=weights.preprocessing))
+        yield image, maps.reshape(-1, maps.shape[-1])
 
 
 @functools.partial(jax.jit, static_argnames=("of",))

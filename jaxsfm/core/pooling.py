@@ -35,7 +35,7 @@ def vlad(x: Float[Array, "n c"], words: Vocabulary) -> Float[Array, " kd"]:
     """
     flat = whitened(x, words)
     own = jax.nn.one_hot(nearest_centre(flat, words.centres), len(words.centres), dtype=x.dtype)
-    own = own * seen(x)[:, None]
+    own = jnp.where(seen(x)[:, None], own, 0.0)
     sums = jnp.matmul(own.T, flat, precision=HIGHEST)
     rest = sums - jnp.sum(own, axis=0)[:, None] * words.centres
     return unit(unit(rest).reshape(-1))

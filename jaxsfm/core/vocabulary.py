@@ -47,11 +47,11 @@ def lloyd(
     x: Float[Array, "n d"], centres: Float[Array, "k d"], *, iterations: int = 25
 ) -> Float[Array, "k d"]:
     """k-means from given centres; zero rows of `x` do not count, empty centres stay."""
-    live = seen(x).astype(x.dtype)
+    live = seen(x)
 
     def step(_, centres):
         own = jax.nn.one_hot(nearest_centre(x, centres), len(centres), dtype=x.dtype)
-        own = own * live[:, None]
+        own = jnp.where(live[:, None], own, 0.0)
         counts = jnp.sum(own, axis=0)[:, None]
         sums = jnp.matmul(own.T, x, precision=HIGHEST)
         return jnp.where(counts > 0, sums / jnp.maximum(counts, 1.0), centres)
@@ -89,5 +89,5 @@ def fit_vocabulary(
     made = Vocabulary(mean, axes * scales, jnp.zeros((words, directions), sample.dtype))
     flat = whitened(sample, made)
     # Descriptors in random order, before the rows that are none.
-    order = jnp.argsort(jax.random.uniform(key, (rows,)) + ~live)
+    order = jnp.argsort(jnp.where(live, jax.random.uniform(key, (rows,)), 1.0))
     return made._replace(centres=lloyd(flat, flat[order[:words]]))
