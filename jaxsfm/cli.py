@@ -16,7 +16,7 @@ from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.host.versions import package_versions
-from jaxsfm.localize_commands import localize
+from jaxsfm.localize_commands import extend, localize
 from jaxsfm.pairs_command import pairs
 from jaxsfm.subcommands import one_of, unwrapped
 from jaxsfm.train_commands import train
@@ -52,6 +52,7 @@ COMMANDS = {
     "match": match,
     "pairs": pairs,
     "localize": localize,
+    "extend": extend,
     "evaluate": evaluate,
     "report": report,
     "view": view,

@@ -155,7 +155,7 @@ def locate_photo(
     read: ReadGray,
 ) -> Located:
     """The pose of a photo from its matches with the shortlisted photos of a model."""
-    views, tracks = part_of(model.views, model.tracks, shortlist)
+    views, tracks, _ = part_of(model.views, model.tracks, shortlist)
     return locate(
         view_of(image, chosen, model.config),
         views,
@@ -168,7 +168,7 @@ def locate_photo(
     )
 
 
-def _weights(run: KeptRun, choice: WeightsChoice) -> Weights:
+def run_weights(run: KeptRun, choice: WeightsChoice) -> Weights:
     """Those of the run, or UserError."""
     config = run.config
     weights = chosen_weights(choice, config.backbone)
@@ -228,7 +228,7 @@ def _features(
         yield load
 
 
-def _files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
+def run_files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
     """The run's photos, or UserError for one that is gone."""
     files = {}
     for name in names:
@@ -272,13 +272,13 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, unusable = _queries(photos)
     cameras = {path: choose_camera(i, model.views, intrinsics) for path, i in usable.items()}
-    weights = _weights(kept, options.network)
+    weights = run_weights(kept, options.network)
     names = [view.name for view in model.views]
     shortlists = {}
     for path, image in usable.items():
         own = kept.photos.called(image.sha256)
         shortlists[path] = options.shortlist(image, [name for name in names if name != own])
-    files = _files(kept, sorted({name for some in shortlists.values() for name in some}))
+    files = run_files(kept, sorted({name for some in shortlists.values() for name in some}))
     rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
     with _features(kept, weights, files, options) as load:
         each = tqdm(usable.items(), desc="localizing", unit="photo", disable=not options.progress)

@@ -1,4 +1,4 @@
-"""`jaxsfm localize`: photos against a finished run."""
+"""`jaxsfm localize` and `jaxsfm extend`: more photos for a finished run."""
 
 import sys
 from json import dumps
@@ -56,3 +56,41 @@ def localize(
         print("jaxsfm: no photo could be localized: see above", file=sys.stderr)
         return 1
     return 0
+
+
+def extend(
+    run: Positional[Path],
+    *,
+    images: Path | None = None,
+    network: WeightsChoice = USUAL_WEIGHTS,
+) -> int:
+    """Put photos that were added to a finished run's folder since into its model.
+
+    Poses and points that are there stay as they are. Ends with 1 if no new photo found its place.
+
+    For example
+        $ jaxsfm extend OUT
+
+    Args:
+      run: A run's folder.
+      images: Folder with the photos, old and new; default: where the run found them.
+      network: The network's parameters; they must be the run's.
+    """
+    from jaxsfm.extend import extend
+    from jaxsfm.host.images import shown_name
+    from jaxsfm.localize import LocalizeOptions
+
+    options = LocalizeOptions(images=images, network=network, progress=True)
+    report = extend(run, options=options)
+    if report is None:
+        print(f"no new photos for {run}")
+        return 0
+    last, model = report["extended"][-1], report["models"][0]
+    for row in report["lost"]:
+        if row["image"] in last["added"]:
+            print(f"lost       {shown_name(row['image'])}: {row['detail']}")
+    print(
+        f"placed     {len(last['placed'])} of {len(last['added'])} new photos in "
+        f"{last['rounds']} rounds: {model['registered']} images, {model['points']} points"
+    )
+    return 0 if last["placed"] else 1

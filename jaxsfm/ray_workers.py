@@ -139,12 +139,13 @@ class Crew:
     def _next(self) -> list[tuple[Any, Any]]:
         """Wait until something comes, and take it."""
         awaited = [(slot.awaited, slot) for slot in self._slots if slot.awaited is not None]
-        ready, _ = self._ray.wait([what for what, _ in awaited], num_returns=1, timeout=PATIENCE)
-        nobody = all(slot.greeting is not None for slot in self._slots)
-        if not ready and nobody and not self._warned:
+        ready, _ = self._ray.wait([what for what, _ in awaited], timeout=PATIENCE)
+        if ready:
+            return self._take(next(slot for what, slot in awaited if what is ready[0]))
+        if not self._warned and all(slot.greeting is not None for slot in self._slots):
             logger.warning("waiting for Ray to start workers (are CPUs or GPUs free?)")
             self._warned = True
-        return [one for what, slot in awaited if what in ready for one in self._take(slot)]
+        return []
 
     def _take(self, slot: _Slot) -> list[tuple[Any, Any]]:
         """The next of a worker's results, which is there."""

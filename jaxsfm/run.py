@@ -88,12 +88,12 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             missing = [pair for pair in pairs if pair not in results]
             if results:
                 logger.info("%d of %d pairs have been matched before", len(results), len(pairs))
-            skipped |= _extract(folder, weights, by_name, missing, config, options)
+            skipped |= extract_missing(folder, weights, by_name, missing, config, options)
             missing = [pair for pair in missing if not skipped.keys() & set(pair)]
             good = [image for image in usable if image.name not in skipped]
             _check_enough(images, good, skipped)
         with _timed(seconds, "matching"):
-            for result in _match(folder, weights, by_name, missing, config, options):
+            for result in match_missing(folder, weights, by_name, missing, config, options):
                 results[result.pair] = result.counts
         chosen = sorted(_choose(results, options.best_pairs))
         ours = SavedMatches(folder, chosen)
@@ -229,7 +229,7 @@ def _retrieve(
     return nearest_pairs(found.vectors, k)
 
 
-def _extract(
+def extract_missing(
     folder: WorkFolder,
     weights: Weights,
     images: dict[str, ImageFile],
@@ -254,7 +254,7 @@ def _extract(
     return skipped
 
 
-def _match(
+def match_missing(
     folder: WorkFolder,
     weights: Weights,
     images: dict[str, ImageFile],

@@ -21,6 +21,7 @@ from jaxsfm.placing import (
     MIN_COUNT,
     MIN_SHARE,
     Followed,
+    Observed,
     follow,
     pose_doubt,
     trusted,
@@ -36,7 +37,7 @@ class Located:
     """What became of a photo."""
 
     view: View | None
-    """Where it was taken; None: nowhere that its matches agree on."""
+    """Where it was taken; None: nowhere that alignment confirms or 30 matches agree on."""
     trusted: bool
     """Alignment confirms the pose; else it hangs on matches alone."""
     why: str | None
@@ -59,17 +60,21 @@ class Located:
     """Expected error of the centre, units of the model, beside the model's own."""
     rotation_error_deg: float | None
     """Likewise, of the rotation."""
+    observed: Observed | None = None
+    """The points that it shows, of a trusted pose."""
 
 
-def part_of(views: list[View], tracks: Tracks, names: Collection[str]) -> tuple[list[View], Tracks]:
-    """Some views of a model and the points that they see."""
+def part_of(
+    views: list[View], tracks: Tracks, names: Collection[str]
+) -> tuple[list[View], Tracks, np.ndarray]:
+    """Some views of a model, the points that they see, and which those are."""
     chosen = [k for k, view in enumerate(views) if view.name in names]
     place = np.full(len(views), -1)
     place[chosen] = np.arange(len(chosen))
     rows = np.flatnonzero(place[tracks.view] >= 0)
     point, index = np.unique(tracks.point[rows], return_inverse=True)
     part = Tracks(tracks.points[point], index, place[tracks.view[rows]], tracks.xy[rows])
-    return [views[k] for k in chosen], part
+    return [views[k] for k in chosen], part, point
 
 
 def locate(
@@ -116,6 +121,14 @@ def locate(
     if config.weak_octaves:
         follow([pose], views, tracks, read, config)
     best = trusted(pose)
+    if best is None and near.sum() < MIN_COUNT:
+        return dataclasses.replace(
+            _nowhere(len(xy), matches),
+            why=_doubtful(pose, int(near.sum()), len(xy)),
+            inliers=int(near.sum()),
+            candidates=pose.candidates,
+            agreed=pose.agreed,
+        )
     if best is None:
         error_px = float(np.median(errors[near]))
         seen, side, view = (points[near], xy[near]), CELL_PX, found
@@ -137,6 +150,7 @@ def locate(
         doubt_px=best.doubt_px if best else None,
         centre_error=doubt.centre,
         rotation_error_deg=doubt.rotation_deg,
+        observed=best.observed if best else None,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from kept_runs import change_report
 
+from jaxsfm import localize as localize_module
 from jaxsfm.cli import main
 from jaxsfm.localize import LocalizeOptions, localize
 from jaxsfm.synthetic import camera_matrix, look_at, render, room
@@ -138,10 +139,13 @@ def test_the_command_writes_poses_and_tells_them(plain, photos, tmp_path, capsys
     assert row["photo"] == str(new) and row["cam_from_world"]
 
 
-def test_nothing_localized_ends_with_1(plain, photos, capsys):
+def test_nothing_localized_ends_with_1(localized, plain, photos, capsys, monkeypatch):
+    rows = [localized["elsewhere.png"]]
+    monkeypatch.setattr(localize_module, "localize", lambda *args, **kwargs: {"photos": rows})
     lost = photos / "photos" / "elsewhere.png"
     assert main(["localize", str(lost), "--model", str(plain[0])]) == 1
-    assert "no photo could be localized" in capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert "no photo could be localized" in captured.err and "1 lost of 1" in captured.out
 
 
 def test_wrong_calls_are_one_sentence(plain, photos, scene, tmp_path, capsys):

@@ -5,7 +5,6 @@ import itertools
 import os
 import shutil
 import signal
-import sqlite3
 import threading
 import time
 import weakref
@@ -13,6 +12,7 @@ from collections import deque
 from pathlib import Path
 
 import pytest
+from databases import content
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,13 +36,6 @@ def busy_worker() -> int | None:
                 if int(parent.name) == os.getpid():
                     return int(folder.name)
     return None
-
-
-def content(database: Path) -> dict[str, list]:
-    with contextlib.closing(sqlite3.connect(database)) as opened:
-        tables = opened.execute("select name from sqlite_master where type = 'table'")
-        names = sorted(name for (name,) in tables.fetchall())
-        return {name: opened.execute(f"select * from {name}").fetchall() for name in names}
 
 
 def kill_a_busy_worker(killed: list[int]) -> None:
@@ -75,9 +68,9 @@ def test_a_killed_worker_and_a_damaged_photo_change_nothing(scene, tmp_path, mon
     assert main([*args, str(tmp_path / "ray"), "--engine", "ray", "--workers", "2"]) == 0
     assert killed and "Ray lost a worker, another is started" in capsys.readouterr().err
     local, ray = (tmp_path / run for run in ("local", "ray"))
-    files = sorted(path.name for path in (local / "matches").iterdir())
-    assert len(files) == 3 and files == sorted(path.name for path in (ray / "matches").iterdir())
-    for name in (*(f"matches/{file}" for file in files), "sparse/0/points3D.bin", "unusable.json"):
+    files = sorted(str(path.relative_to(local)) for path in local.glob("matches/**/*.npz"))
+    assert len(files) == 3 == len(list(ray.glob("matches/**/*.npz")))
+    for name in (*files, "sparse/0/points3D.bin", "unusable.json"):
         assert (local / name).read_bytes() == (ray / name).read_bytes(), name
     assert content(local / "database.db") == content(ray / "database.db")
 
