@@ -78,6 +78,7 @@ def reconstruct(
     intrinsics: str | None = None,
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto",
     pairs: str = "exhaustive",
+    retrieval: Literal["gem", "vlad", "netvlad"] = "vlad",
     best_pairs: int | None = None,
     view_graph: Switch = "preset",
     refine: int | None = None,
@@ -113,7 +114,9 @@ def reconstruct(
       intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
         model, COLMAP's pixels) for all photos; without it one camera per photo.
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.
-      pairs: exhaustive, or a file with two image names a line.
+      pairs: exhaustive; a file with two image names a line; retrieval:K, each photo's K most
+        similar ones; sequential:K, its K next ones by name; or several joined by +.
+      retrieval: How photos are described for retrieval:K; netvlad needs its --weights.
       best_pairs: Hand on only each image's N pairs with the most inliers.
       view_graph: Hand on only pairs whose rotations agree with stronger ones (scenes that repeat).
       refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
@@ -162,6 +165,7 @@ def reconstruct(
         raise UserError(f"--{str(error).replace('_', '-')}") from error
     options = RunOptions(
         pairs=pairs,
+        retrieval=retrieval,
         best_pairs=best_pairs,
         intrinsics=intrinsics,
         network=network,
@@ -179,8 +183,9 @@ def reconstruct(
     report = run_folder(images, out, config=config, options=options)
     print("\n".join(summary_lines(report)))
     if not report["models"]:
+        where = out / "failed" if (out / "sparse").exists() else out
         print(
-            f"jaxsfm: no model: see the lost images above and {out / 'report.json'}",
+            f"jaxsfm: no model: see the lost images above and {where / 'report.json'}",
             file=sys.stderr,
         )
         return 1

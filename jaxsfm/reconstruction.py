@@ -86,6 +86,8 @@ class Reconstructed:
     """The view graph's, by pair; empty where it is switched off."""
     verified: dict[Pair, int]
     """COLMAP's two-view inliers, by pair that has any."""
+    angles: dict[Pair, float]
+    """Degrees at which the rays of a verified pair's points meet (median); 0: unknown."""
     attempts: "list[Attempt]"
     """Runs of the mapper."""
     refinement: "list[RefinementFigures | None]"
@@ -173,7 +175,8 @@ def reconstruct(
         return Reconstructed(
             models=models,
             verdicts={(a, b): Verdict(**row) for (a, b), row in verification["verdicts"]},
-            verified={(a, b): count for (a, b), count in verification["verified"]},
+            verified={(a, b): count for (a, b), count, _ in verification["verified"]},
+            angles={(a, b): angle for (a, b), _, angle in verification["verified"]},
             attempts=[mapping.Attempt(**_paired(row)) for row in _read_json(mapped)],
             refinement=[_figures(row) for row in refinement],
         )
@@ -234,14 +237,18 @@ def _verify(
         scale=options.scale,
         relative_poses=view_graph,
     )
-    geometries = {pair: view.geometry for pair, view in colmap.read_two_views(database).items()}
+    two_views = colmap.read_two_views(database)
+    geometries = {pair: view.geometry for pair, view in two_views.items()}
     verdicts = trusted_pairs(geometries) if view_graph else {}
     colmap.drop_pairs(database, [pair for pair, v in verdicts.items() if not v.trusted])
     _write_json(
         folder,
         {
             "verdicts": [[pair, dataclasses.asdict(v)] for pair, v in verdicts.items()],
-            "verified": [[pair, g.num_inliers] for pair, g in geometries.items()],
+            "verified": [
+                [pair, view.geometry.num_inliers, view.tri_angle_deg]
+                for pair, view in two_views.items()
+            ],
         },
     )
 

@@ -1,64 +1,15 @@
-"""What a run did, as plain JSON and as the last lines on the screen; why images were lost."""
+"""What a run did, as plain JSON and as the last lines on the screen."""
 
 import dataclasses
-from collections.abc import Collection, Container, Iterable, Mapping
+from collections.abc import Container, Mapping, Sequence
 from typing import Any
 
-from jaxsfm.core.types import Status
 from jaxsfm.host.images import shown_name
-from jaxsfm.host.pairs import Pair, PairCounts, component_of
+from jaxsfm.host.pairs import Pair, PairCounts, describe
 from jaxsfm.host.viewgraph import Verdict
 
-
-def lost_images(
-    names: Iterable[str],
-    registered: Iterable[str],
-    results: Mapping[Pair, PairCounts],
-    verified: Mapping[Pair, int],
-    untrusted: Collection[Pair] = (),
-) -> list[dict[str, str]]:
-    """For every image without a pose, the stage that lost it and the numbers behind that.
-
-    Stages, in the pipeline's order: `pairs` (never paired), `too few matches` (no pair had enough
-    tentative matches), `no plane` (no homography had enough inliers), `not connected` (no chain of
-    COLMAP-verified pairs to the model), `no pose` (connected, but COLMAP found no pose).
-
-    Args:
-      results: every pair tried.
-      verified: COLMAP's inliers, of every pair that has any.
-      untrusted: those of them that the view graph dropped.
-    """
-    registered = set(registered)
-    verified = {pair: count for pair, count in verified.items() if pair not in set(untrusted)}
-    connected = component_of(registered, verified)
-    lost = []
-    for name in sorted(set(names) - registered):
-        own = [result for pair, result in results.items() if name in pair]
-        edges = [count for pair, count in verified.items() if name in pair]
-        tentative = max((r.num_tentative for r in own), default=0)
-        inliers = max((r.num_inliers for r in own), default=0)
-        if not own:
-            stage, detail = "pairs", "it is in no pair that was tried"
-        elif all(r.status == Status.TOO_FEW_MATCHES for r in own):
-            stage, detail = "too few matches", f"at most {tentative} tentative matches in a pair"
-        elif not any(r.status == Status.VERIFIED for r in own):
-            stage, detail = "no plane", f"{tentative} tentative matches, no homography among them"
-        elif not edges or (registered and name not in connected):
-            stage = "not connected"
-            dropped = sum(name in pair for pair in untrusted)
-            detail = (
-                f"{inliers} inliers in its best pair, {len(edges)} pairs verified by COLMAP, "
-                "none leads to the model"
-                + (
-                    f"; the view graph dropped {dropped} (--view-graph no keeps them)"
-                    * bool(dropped)
-                )
-            )
-        else:
-            stage = "no pose"
-            detail = f"{len(edges)} verified pairs with up to {max(edges)} inliers"
-        lost.append({"image": name, "stage": stage, "detail": detail})
-    return lost
+MAX_GROUPS = 10
+"""Groups of images named in the last lines; report.json has them all."""
 
 
 def model_figures(model: Any) -> dict[str, Any]:
@@ -91,10 +42,58 @@ def evaluation_lines(evaluation: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def summary_lines(report: Mapping[str, Any]) -> list[str]:
-    """The run's last words."""
-    images, pairs = report["images"], report["pairs"]
+def named(names: Sequence[str], most: int = 3) -> str:
+    """The first of a list of names, and how many more there are."""
+    shown = ", ".join(shown_name(name) for name in names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
+
+
+def component_lines(report: Mapping[str, Any]) -> list[str]:
+    """The groups of images that trusted pairs join, where they are not one, and what parts them."""
+    groups = report["view_graph"]["components"]
+    several = [group for group in groups if len(group["images"]) > 1]
+    if len(several) < 2:
+        return []
+    alone = len(groups) - len(several)
+    sizes = ", ".join(str(len(group["images"])) for group in several[:MAX_GROUPS])
     lines = [
+        f"view graph       {len(several)} groups of images that no trusted pair joins, of {sizes}"
+        + ", ..." * (len(several) > MAX_GROUPS)
+        + f" images; {alone} images alone" * bool(alone)
+    ]
+    for group in several[1:MAX_GROUPS]:
+        near = group["nearest"]
+        lines.append(
+            f"group            {named(group['images'])}: "
+            + (
+                f"nearest to the others is {describe((near['pair'][0], near['pair'][1]))}: "
+                f"{near['missed']}"
+                if near
+                else "no pair with any other was tried"
+            )
+        )
+    return lines
+
+
+def help_lines(lost: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What could help the lost images, each option once with those it could help."""
+    helped: dict[str | None, dict[str, str]] = {}
+    for row in lost:
+        for each in row.get("help", ()):
+            helped.setdefault(each["option"], {})[row["image"]] = each["reason"]
+    lines = []
+    for option in sorted(helped, key=lambda option: (option is None, option)):
+        images, reasons = list(helped[option]), list(helped[option].values())
+        first = f"for {shown_name(images[0])}, " * (len(set(reasons)) > 1) + reasons[0]
+        lines.append(f"may help         {option or 'more photos'} ({named(images)}): {first}")
+    return lines
+
+
+def summary_lines(report: Mapping[str, Any]) -> list[str]:
+    """The run's last words; without a model, the reason first."""
+    images, pairs = report["images"], report["pairs"]
+    lines = [f"no model         {report['no_model']}"] * bool(report["no_model"])
+    lines += [
         f"images           {images['usable']} usable of {images['found']}",
         f"pairs            {pairs['tried']} tried, {pairs['verified']} verified, "
         f"{pairs['handed_on']} handed to COLMAP"
@@ -119,7 +118,7 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
             f"reprojection error {best['reprojection_error_px']:.2f} px",
         ]
     else:
-        lines.append("registered       none: no model could be built")
+        lines.append(f"registered       none of {images['usable']} images")
     attempts = report["mapping"]
     if len(attempts) > 1:
         tries = ", ".join(str(max(a["registered"], default=0)) for a in attempts)
@@ -147,11 +146,13 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in seconds.items()))
     if pairs["overflowed"]:
         lines.append(f"warning          {pairs['overflowed']} pairs had more matches than kept")
+    lines += component_lines(report)
     lines += [f"skipped          {reason}" for reason in images["skipped"].values()]
     lines += [
         f"lost             {shown_name(row['image'])}: {row['stage']} ({row['detail']})"
         for row in report["lost"]
     ]
+    lines += help_lines(report["lost"])
     if report.get("evaluation"):
         lines += evaluation_lines(report["evaluation"])
     if report.get("evaluation_failed"):

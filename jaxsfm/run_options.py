@@ -9,6 +9,7 @@ from jaxsfm.engines import chosen_engine
 from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
 from jaxsfm.host.mapping import Mapper
+from jaxsfm.host.plan import Retrieval
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 
@@ -17,7 +18,10 @@ class RunOptions:
     """What to do, beyond the matching `Config`."""
 
     pairs: str = "exhaustive"
-    """`exhaustive`, or a file with two image names a line."""
+    """`exhaustive`, a file with two image names a line, `sequential:K`, `retrieval:K`, or several
+    joined by `+` (`jaxsfm.host.plan`)."""
+    retrieval: Retrieval = "vlad"
+    """How photos are described for `retrieval:K`."""
     best_pairs: int | None = None
     """Hand on only each image's N pairs with the most inliers (a union); None: all."""
     intrinsics: str | None = None

@@ -6,14 +6,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from jaxsfm.advice import Circumstances
 from jaxsfm.config import Config
+from jaxsfm.failures import explained
 from jaxsfm.host.given import Given
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import Pair, PairCounts
 from jaxsfm.host.store import Identity
 from jaxsfm.host.versions import versions
+from jaxsfm.pair_outcomes import PairOutcomes
 from jaxsfm.reconstruction import Reconstructed
-from jaxsfm.report import lost_images, model_figures, pair_figures
+from jaxsfm.report import model_figures, pair_figures
 from jaxsfm.run_options import RunOptions
 
 
@@ -76,12 +79,22 @@ def run_report(done: Done, *, config: Config, options: RunOptions) -> dict[str, 
         "models": figures,
         "mapping": [dataclasses.asdict(attempt) for attempt in made.attempts],
         "refinement": [each and dataclasses.asdict(each) for each in made.refinement],
-        "lost": lost_images(
-            [image.name for image in done.usable],
-            figures[0]["images"] if figures else [],
-            counts,
-            made.verified,
-            untrusted,
+        **explained(
+            [each["images"] for each in figures],
+            PairOutcomes(
+                results=counts,
+                handed_on=done.handed_on,
+                verified=made.verified,
+                verdicts=made.verdicts,
+                angles=made.angles,
+                min_inliers=config.min_inliers,
+            ),
+            Circumstances(
+                config=config,
+                pairs=options.pairs,
+                known_camera=options.intrinsics is not None,
+                sizes={image.name: image.size for image in done.usable},
+            ),
         ),
         "seconds": done.seconds,
     }

@@ -204,7 +204,9 @@ def test_weights_shows_what_is_in_use(capsys):
         assert word in text
 
 
-def test_a_report_says_which_weights_and_other_ones_are_another_run(scene, plain, tmp_path, capsys):
+def test_a_report_says_which_weights_and_with_other_ones_all_is_done_again(
+    scene, plain, tmp_path, capsys
+):
     from jaxsfm.core.vgg import init_shapes
     from jaxsfm.host.converted import save_weights
     from jaxsfm.host.weights import SHA256, TORCHVISION
@@ -229,8 +231,12 @@ def test_a_report_says_which_weights_and_other_ones_are_another_run(scene, plain
         "about": {"source": "zeros"},
     }
     save_weights(zeros, layers, extras={}, **made)
-    again = ["reconstruct", scene / "images", "--out", out, "--intrinsics", scene / "K.txt"]
-    refuse(capsys, [*again, "--threads", "1", "--weights", zeros], "another run (weights: 2ecbe4")
+    shutil.copytree(out, tmp_path / "out")
+    again = ["reconstruct", scene / "images", "--out", tmp_path / "out", "--weights", zeros]
+    assert main([*map(str, again), "--threads", "1"]) == 1
+    said = capsys.readouterr().err
+    assert "--weights: 2ecbe4" in said and "matched before" not in said
+    assert "no model this time: the earlier one stays" in said
 
 
 @pytest.mark.parametrize("name", ["strecha", "daynight", "wxbs", "homography", "warps"])
@@ -398,7 +404,11 @@ def test_lost_images_are_explained(scene, tmp_path, capsys):
     report = run(scene, tmp_path / "out", images=folder)
     lost = {row["image"]: row["stage"] for row in report["lost"]}
     assert lost == {"blank.png": "too few matches"} or lost == {"blank.png": "no plane"}
-    assert "blank.png" in capsys.readouterr().out
+    (row,) = report["lost"]
+    assert row["best_pair"]["tentative"] >= 0 and "--preset robust" in row["help"][0]["option"]
+    groups = report["view_graph"]["components"]
+    assert [len(group["images"]) for group in groups] == [3, 1] and report["no_model"] is None
+    assert f"may help         {row['help'][0]['option']} (blank.png): " in capsys.readouterr().out
 
 
 def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
@@ -410,6 +420,9 @@ def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
     assert main(["reconstruct", str(folder), "--out", str(tmp_path / "out")]) == 1
     captured = capsys.readouterr()
     assert "no model" in captured.err and "0.png" in captured.out
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert captured.out.startswith(f"no model         {report['no_model']}\n")
+    assert all(row["help"] for row in report["lost"])
 
 
 def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeypatch, capsys):

@@ -221,6 +221,7 @@ def test_a_run_without_a_model_says_why_each_photo_was_lost(plain, tmp_path):
             for k, name in enumerate(names)
         ]
         del report["versions"], report["finished"], report["images"]["folder"]  # an older run
+        del report["no_model"], report["view_graph"]
 
     out = tmp_path / "run"
     shutil.copytree(plain[0], out)
@@ -230,6 +231,35 @@ def test_a_run_without_a_model_says_why_each_photo_was_lost(plain, tmp_path):
     assert "No model could be built." in body and 'id="the-model"' not in body
     for k in range(3):
         assert f"<b>Lost: no plane.</b> &lt;{k}&gt; matches" in body
+
+
+def test_a_run_in_parts_says_what_parts_them_and_what_may_help(plain, tmp_path):
+    def part(report):
+        a, b, c = report["models"][0]["images"]
+        near = {"pair": [b, HOSTILE], "missed": "7 matches, 26 are needed"}
+        groups = [
+            {"images": [a, b], "pairs": 1, "registered": 2, "nearest": near},
+            {"images": [c, HOSTILE], "pairs": 1, "registered": 0, "nearest": near},
+        ]
+        report["view_graph"]["components"] = groups
+        why = {"stage": "not connected", "detail": "few"}
+        found = [
+            {"option": "--some <option>", "reason": "small"},
+            {"option": None, "reason": "far"},
+        ]
+        report["lost"] = [{"image": HOSTILE, **why, "help": found}]
+
+    out = tmp_path / "run"
+    shutil.copytree(plain[0], out)
+    change_report(out, part)
+    assert main(["report", str(out)]) == 0
+    body = without_scripts((out / "report.html").read_text())
+    assert "Groups of photos that trusted pairs join" in body
+    assert "7 matches, 26 are needed" in body and HOSTILE not in body
+    assert "What may help: --some &lt;option&gt; (small); far." in body
+    change_report(out, lambda report: report.update(models=[], no_model="nothing <fits>"))
+    assert main(["report", str(out)]) == 0
+    assert "<p>Nothing &lt;fits&gt;.</p>" in (out / "report.html").read_text()
 
 
 # -- never in a run's way -----------------------------------------------------------------------

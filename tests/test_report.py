@@ -1,87 +1,9 @@
-"""Why images were lost, and a run's last lines."""
+"""A run's last lines."""
 
-import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from jaxsfm.core.types import Status
 from jaxsfm.host.images import ImageError, inspect_image
-from jaxsfm.host.pairs import PairResult, component_of, exhaustive_pairs
-from jaxsfm.report import lost_images, summary_lines
-
-edges = st.lists(st.sampled_from(exhaustive_pairs("abcdefg")), max_size=10)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.sets(st.sampled_from("abcdefg")), edges)
-def test_a_component_is_what_repeated_steps_reach(seeds, edges):
-    slow = set(seeds)
-    for _ in "abcdefg":
-        slow |= {x for pair in edges if slow & set(pair) for x in pair}
-    assert component_of(seeds, edges) == slow == component_of(sorted(seeds)[::-1], edges[::-1])
-
-
-def result(a: str, b: str, status: Status, tentative: int, inliers: int = 0) -> PairResult:
-    return PairResult(
-        pair=(a, b),
-        cells=np.zeros((inliers, 2), np.int32),
-        keypoints0=np.zeros((inliers, 2), np.float32),
-        keypoints1=np.zeros((inliers, 2), np.float32),
-        plane=np.zeros(inliers, np.int32),
-        homographies=np.zeros((0, 3, 3)),
-        num_tentative=tentative,
-        num_dropped=0,
-        status=status,
-    )
-
-
-RESULTS = [
-    result("m0", "m1", Status.VERIFIED, 500, 400),
-    result("few", "m0", Status.TOO_FEW_MATCHES, 3),
-    result("few", "m1", Status.TOO_FEW_MATCHES, 7),
-    result("flat", "m0", Status.NO_PLANE, 90),
-    result("few", "flat", Status.TOO_FEW_MATCHES, 2),
-    result("alone", "m0", Status.VERIFIED, 60, 30),  # COLMAP verifies none of them
-    result("island0", "island1", Status.VERIFIED, 80, 70),
-    result("m1", "odd", Status.VERIFIED, 100, 55),
-]
-VERIFIED = {("m0", "m1"): 390, ("island0", "island1"): 66, ("m1", "odd"): 44}
-STAGES = {
-    "alone": ("not connected", "30 inliers in its best pair, 0 pairs verified"),
-    "few": ("too few matches", "at most 7 tentative"),
-    "flat": ("no plane", "90 tentative"),
-    "island0": ("not connected", "70 inliers in its best pair, 1 pairs verified"),
-    "island1": ("not connected", "none leads to the model"),
-    "never": ("pairs", "in no pair"),
-    "odd": ("no pose", "1 verified pairs with up to 44 inliers"),
-}
-
-
-def lost(registered) -> dict[str, dict[str, str]]:
-    names = ["m0", "m1", *STAGES]
-    rows = lost_images(names, registered, {r.pair: r for r in RESULTS}, VERIFIED)
-    assert [row["image"] for row in rows] == sorted(set(names) - set(registered))
-    return {row["image"]: row for row in rows}
-
-
-def test_every_lost_image_names_the_stage_that_lost_it():
-    rows = lost(["m0", "m1"])
-    assert rows.keys() == STAGES.keys()
-    for name, (stage, detail) in STAGES.items():
-        assert rows[name]["stage"] == stage and detail in rows[name]["detail"], name
-
-
-def test_without_a_model_no_image_is_called_connected():
-    assert {row["stage"] for row in lost([]).values()} >= {"not connected", "no plane", "pairs"}
-    assert lost([])["m0"]["stage"] == "no pose"
-
-
-def test_registered_images_are_not_lost():
-    assert lost_images(["m0", "m1"], ["m1", "m0"], {}, {}) == []
-
-
-# -- the last lines --------------------------------------------------------------------------------
+from jaxsfm.report import summary_lines
 
 MODEL = {"registered": 2, "points": 321, "track_length": 2.5, "reprojection_error_px": 0.71}
 
@@ -94,7 +16,9 @@ def report(**changes) -> dict:
         "mapping": [{"mapper": "incremental", "initial_pair": None, "registered": [2]}],
         "refinement": [],
         "seconds": {"extraction": 1.25, "mapping": 2.0},
+        "view_graph": {"components": [{"images": ["a", "b", "c"]}]},
         "lost": [],
+        "no_model": None,
         **changes,
     }
 
@@ -105,7 +29,7 @@ def test_a_summary_has_the_counts_of_every_stage():
         assert part in text
     assert "warning" not in text and "smaller" not in text and "reference" not in text
     assert "and 1 smaller model" in "\n".join(summary_lines(report(models=[MODEL, MODEL])))
-    assert "none: no model" in "\n".join(summary_lines(report(models=[])))
+    assert "none of 3 images" in "\n".join(summary_lines(report(models=[])))
 
 
 def test_second_tries_and_refinement_are_said():
@@ -130,12 +54,6 @@ def test_second_tries_and_refinement_are_said():
     back = {"passes": [figures | {"accepted": False}], "placed": []}
     text = "\n".join(summary_lines(report(refinement=[back])))
     assert "too few, taken back" in text
-
-
-def test_images_that_the_view_graph_cut_off_are_told_how_to_keep_them():
-    results = {("a", "b"): result("a", "b", Status.VERIFIED, 60, 30)}
-    (row,) = [r for r in lost_images("ab", "b", results, {}, [("a", "b")])]
-    assert row["stage"] == "not connected" and "--view-graph no" in row["detail"]
 
 
 def test_a_failed_evaluation_is_said():

@@ -81,7 +81,8 @@ def parse_intrinsics(text: str) -> Intrinsics:
             raise UserError(
                 f"--intrinsics: unknown camera model {model!r}; one of {', '.join(sorted(models))}"
             )
-        raise UserError(f"--intrinsics {text}: no such file, and not MODEL:p1,p2,...")
+        shown = shown_name(text)
+        raise UserError(f"--intrinsics {shown}: no such file, and not MODEL:p1,p2,...")
     where = f"--intrinsics {model}"
     values = _numbers(params.split(","), where)
     camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1)

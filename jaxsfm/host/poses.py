@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.model_files import Damaged, check_binary
 
 
 class CameraPose(NamedTuple):
@@ -49,11 +50,12 @@ def _read_strecha(path: Path) -> CameraPose:
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """The COLMAP model (binary or text) in a folder."""
-    points = path / "points3D.bin"
-    if points.is_file() and points.stat().st_size < 8:  # COLMAP would allocate without end
-        raise UserError(f"{path}: not a readable COLMAP model")
     try:
+        if (path / "images.bin").is_file():
+            check_binary(path)
         return pycolmap.Reconstruction(path)
+    except Damaged as error:
+        raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
     except Exception as error:  # native errors of several kinds; the text is long and technical
         raise UserError(f"{path}: not a readable COLMAP model") from error
 

@@ -27,6 +27,9 @@ from jaxsfm.host.pairs import Pair
 
 STRONG = 0.3
 """Strength above which a pair is trusted whatever its rotation; false pairs reached 0.09."""
+TOLERANCE_DEG = 15.0
+"""How far a trusted pair's rotation may be from the averaged ones. Two-view rotations of true pairs
+are good to 0.3 deg (median), of weak ones to 10."""
 MAX_VOTES = 500
 """Strongest pairs between two groups that vote: the vote is quadratic in them."""
 
@@ -85,14 +88,13 @@ def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
 
 
 def trusted_pairs(
-    geometries: Mapping[Pair, PairGeometry], *, tolerance_deg: float = 15.0
+    geometries: Mapping[Pair, PairGeometry], *, tolerance_deg: float = TOLERANCE_DEG
 ) -> dict[Pair, Verdict]:
     """A verdict for every pair.
 
     Args:
       geometries: by pair of image names (the lesser first).
-      tolerance_deg: how far a trusted pair's rotation may be from the averaged ones. Two-view
-        rotations of true pairs are good to 0.3 deg (median), of weak ones to 10.
+      tolerance_deg: see `TOLERANCE_DEG`.
     """
     if not 0 < tolerance_deg < 180:
         raise ValueError(f"tolerance_deg must lie in (0, 180); got {tolerance_deg}")

@@ -11,10 +11,13 @@ from jaxsfm.kept import KeptRun
 from jaxsfm.page.embedded import embed
 from jaxsfm.page.figures import count, figures3
 from jaxsfm.page.pair_states import NOT_TRUSTED, NOT_VERIFIED, STATES, USED, state
+from jaxsfm.report import MAX_GROUPS, named
 
 MAX_PHOTOS, MAX_PAIRS = 60, 15
 """Rows of a table; the rest is counted."""
 THUMBNAIL = 96
+MAX_NAMES = 8
+"""Photos named of a group."""
 
 ADVICE = {
     "pairs": "name pairs with it in the --pairs file, or leave that option out",
@@ -23,7 +26,7 @@ ADVICE = {
     "not connected": "take photos between it and the others, or look at the refused pairs",
     "no pose": "take more photos near it; known --intrinsics help too",
 }
-"""What may help an image lost at a stage."""
+"""What may help an image lost at a stage, for runs of versions that did not record it."""
 
 
 class Fact(NamedTuple):
@@ -60,7 +63,10 @@ def verdict(report: Mapping[str, Any]) -> Verdict:
         return Verdict(
             "none",
             "No model could be built.",
-            ["Below: what became of each pair, and of each photo."],
+            [
+                f"{reason[0].upper()}{reason[1:]}." if (reason := report.get("no_model")) else "",
+                "Below: what became of each pair, and of each photo.",
+            ],
             [Fact("photos in the model", f"0 of {usable}"), *facts],
         )
     best = models[0]
@@ -126,6 +132,25 @@ def pair_table(rows: Sequence[Any]) -> dict[str, Any]:
     }
 
 
+def component_table(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The groups of photos that trusted pairs join, the largest first; none where they are one."""
+    groups = report.get("view_graph", {}).get("components", [])
+    several = [group for group in groups if len(group["images"]) > 1]
+    if len(groups) < 2:
+        return []
+    return [{**group, "names": named(group["images"], MAX_NAMES)} for group in several[:MAX_GROUPS]]
+
+
+def advice(lost: Mapping[str, Any]) -> str | None:
+    """What may help a lost photo, in a line."""
+    if "help" not in lost:
+        return ADVICE.get(lost["stage"])
+    return "; ".join(
+        f"{each['option']} ({each['reason']})" if each["option"] else each["reason"]
+        for each in lost["help"]
+    )
+
+
 def _observations(run: KeptRun) -> dict[str, tuple[int, float]]:
     """Name -> number and mean reprojection error of a view's observations."""
     if run.model is None:
@@ -170,7 +195,7 @@ def photo_table(run: KeptRun, names: Sequence[str]) -> dict[str, Any]:
                 "pairs": used[name],
                 "evaluation": evaluation.get(name),
                 "lost": lost.get(name),
-                "advice": ADVICE.get(lost[name]["stage"]) if name in lost else None,
+                "advice": advice(lost[name]) if name in lost else None,
             }
         )
     if len(rows) == len(names):  # all fit: an order that readers find their way in

@@ -82,6 +82,7 @@ def page(run: KeptRun) -> str:
         patch=close_ups.SIDE,
         cell=FINE_STRIDE,
         pairs=tables.pair_table(report["pairs"]["each"]),
+        groups=tables.component_table(report),
         table=tables.photo_table(run, names),
         seconds=tables.stage_table(report["seconds"]),
         options=tables.flat(report["options"]),

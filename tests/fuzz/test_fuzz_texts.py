@@ -1,0 +1,80 @@
+"""Damaged pair files, intrinsics, camera files: what they say, or a sentence that names them."""
+
+import numpy as np
+from fuzz_children import run_cases
+from mutations import damaged_text, outcome
+
+from jaxsfm.host.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.host.pairs import read_pairs
+from jaxsfm.host.poses import read_poses
+from jaxsfm.synthetic import camera_matrix
+
+NAMES = ["a.jpg", "b c.jpg", "sub/d.jpg", "\u65e5.png", "#e.jpg"]
+PAIRS = "# pairs\na.jpg sub/d.jpg\na.jpg b c.jpg\n\u65e5.png\ta.jpg\n\nb c.jpg\tsub/d.jpg\n"
+MODELS = (
+    "PINHOLE:600,610.5,320,240",
+    "SIMPLE_RADIAL:600,320,240,-0.1",
+    "OPENCV:600,600,320,240,0.1,0.01,0,0",
+    "FULL_OPENCV:600,600,320,240,0,0,0,0,0,0,0,0",
+    "FOV:600,600,320,240,0.9",
+)
+SIZE = (640, 480)
+K = "\n".join(" ".join(f"{v}" for v in row) for row in camera_matrix(SIZE))
+TURN = "0.8 0.6 0\n-0.6 0.8 0\n0 0 1"
+CAMERA = f"{K}\n0 0 0\n{TURN}\n1.5 -2 0.25\n640 480\n"
+
+
+def pairs(rng, folder) -> str:
+    path = folder / "pairs.txt"
+    path.write_bytes(damaged_text(PAIRS, rng))
+    how, found = outcome(lambda: read_pairs(path, NAMES), "--pairs")
+    if how == "read":
+        assert found and found == sorted(set(found))
+        assert all(a < b and {a, b} <= set(NAMES) for a, b in found)
+    return how
+
+
+def checked(text: str) -> str:
+    def parse():
+        found = parse_intrinsics(text)
+        check_fits(found, {"a.jpg": SIZE})
+        return found, found.camera(SIZE)
+
+    how, found = outcome(parse, "--intrinsics")
+    if how == "read":
+        known, camera = found
+        assert np.isfinite(known.params).all() and camera.has_prior_focal_length
+        assert len(camera.params) == len(known.params)
+    return how
+
+
+def intrinsics_file(rng, folder) -> str:
+    path = folder / "K.txt"
+    path.write_bytes(damaged_text(K, rng))
+    return checked(str(path))
+
+
+def intrinsics_option(rng, folder) -> str:
+    spec = MODELS[rng.integers(len(MODELS))].replace(":", " : ").replace(",", " , ")
+    return checked(damaged_text(spec, rng).decode(errors="surrogateescape").replace(" ", ""))
+
+
+def camera_file(rng, folder) -> str:
+    path = folder / "a.jpg.camera"
+    path.write_bytes(damaged_text(CAMERA, rng))
+    how, found = outcome(lambda: read_poses(folder), path)
+    if how == "read":
+        pose = found["a.jpg"]
+        assert np.isfinite(pose.centre).all()
+        np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=2e-3)
+    return how
+
+
+def text(rng, folder) -> str:
+    """One of the four kinds."""
+    return [pairs, intrinsics_file, intrinsics_option, camera_file][rng.integers(4)](rng, folder)
+
+
+def test_a_damaged_text_is_read_or_refused_by_name(tmp_path):
+    found = run_cases("test_fuzz_texts", "text", 800, tmp_path)
+    assert found["read"] > 80 and found["refused"] > 200
