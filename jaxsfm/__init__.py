@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jaxsfm.pipeline import match as match
     from jaxsfm.pipeline import open_images as open_images
     from jaxsfm.reconstruction import reconstruct as reconstruct
+    from jaxsfm.retrieval import shortlist as shortlist
     from jaxsfm.run import run_folder as run_folder
     from jaxsfm.run_options import RunOptions as RunOptions
 
@@ -55,6 +56,7 @@ _HOME = {
     "open_images": "pipeline",
     "reconstruct": "reconstruction",
     "RunOptions": "run_options",
+    "shortlist": "retrieval",
     "run_folder": "run",
 }
 

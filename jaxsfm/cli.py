@@ -16,6 +16,8 @@ from jaxsfm.export_commands import export
 from jaxsfm.host import interrupt
 from jaxsfm.host.compiled import keep_compiled
 from jaxsfm.host.versions import package_versions
+from jaxsfm.localize_commands import extend, localize
+from jaxsfm.pairs_command import pairs
 from jaxsfm.subcommands import one_of, unwrapped
 from jaxsfm.train_commands import train
 from jaxsfm.view_commands import report, view
@@ -48,6 +50,9 @@ that completes commands and options."""
 COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,
+    "pairs": pairs,
+    "localize": localize,
+    "extend": extend,
     "evaluate": evaluate,
     "report": report,
     "view": view,

@@ -12,6 +12,7 @@ from typing import Literal
 import tyro
 
 from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
+from jaxsfm.engine_choice import LOCAL, EngineChoice
 from jaxsfm.errors import UserError
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
@@ -77,6 +78,7 @@ def reconstruct(
     intrinsics: str | None = None,
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto",
     pairs: str = "exhaustive",
+    retrieval: Literal["gem", "vlad", "netvlad"] = "vlad",
     best_pairs: int | None = None,
     view_graph: Switch = "preset",
     refine: int | None = None,
@@ -95,6 +97,7 @@ def reconstruct(
     images_at_once: int | None = None,
     pairs_at_once: int | None = None,
     memory_gb: float | None = None,
+    engine: EngineChoice = LOCAL,
 ) -> int:
     """A folder of photos to a COLMAP model.
 
@@ -111,7 +114,9 @@ def reconstruct(
       intrinsics: K.txt (3 x 3; centre of the top-left pixel is (0, 0)) or MODEL:p1,p2,.. (a COLMAP
         model, COLMAP's pixels) for all photos; without it one camera per photo.
       refine_intrinsics: Whether mapping refines them; auto: unless they are given.
-      pairs: exhaustive, or a file with two image names a line.
+      pairs: exhaustive; a file with two image names a line; retrieval:K, each photo's K most
+        similar ones; sequential:K, its K next ones by name; or several joined by +.
+      retrieval: How photos are described for retrieval:K; netvlad needs its --weights.
       best_pairs: Hand on only each image's N pairs with the most inliers.
       view_graph: Hand on only pairs whose rotations agree with stronger ones (scenes that repeat).
       refine: Passes of multi-view keypoint refinement; 0: none; default: the preset's.
@@ -132,6 +137,7 @@ def reconstruct(
       pairs_at_once: Matched side by side on each device; default: what fits, one on a CPU.
       memory_gb: For the features at hand, on each device; default: half of an accelerator, an
         eighth of a host, at most 1.6. Less makes photos come back more often.
+      engine: Where photos and pairs are computed.
     """
     config = _config(
         preset,
@@ -159,6 +165,7 @@ def reconstruct(
         raise UserError(f"--{str(error).replace('_', '-')}") from error
     options = RunOptions(
         pairs=pairs,
+        retrieval=retrieval,
         best_pairs=best_pairs,
         intrinsics=intrinsics,
         network=network,
@@ -170,13 +177,15 @@ def reconstruct(
         with_database=with_database,
         with_hloc=with_hloc,
         execution=execution,
+        engine=engine,
         progress=True,
     )
     report = run_folder(images, out, config=config, options=options)
     print("\n".join(summary_lines(report)))
     if not report["models"]:
+        where = out / "failed" if (out / "sparse").exists() else out
         print(
-            f"jaxsfm: no model: see the lost images above and {out / 'report.json'}",
+            f"jaxsfm: no model: see the lost images above and {where / 'report.json'}",
             file=sys.stderr,
         )
         return 1

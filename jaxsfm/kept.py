@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxsfm.config import Config, PairShape, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import Similarity, common_alignment, evaluate
-from jaxsfm.host.images import ImageError, WorkingImage, inspect_image, read_image
+from jaxsfm.host.images import ImageError, ImageFile, WorkingImage, inspect_image, read_image
 from jaxsfm.host.model import Tracks, View, errors_px, point_colours, read_model_arrays
 from jaxsfm.host.pairs import Pair, PairResult
 from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
@@ -51,15 +52,25 @@ class Photos:
         self._sizes = {"max_size": config["max_size"], "enlarge": config["enlarge"]}
         self.read = functools.lru_cache(maxsize=16)(self._read)
 
-    def _read(self, name: str) -> WorkingImage | None:
-        """A photo at working size; None if it is gone, changed or cannot be decoded."""
+    def file(self, name: str) -> ImageFile | None:
+        """A photo's file; None if it is gone or changed."""
         if self.folder is None:
             return None
         try:
             image = inspect_image(self.folder / name, name=name)
-            if image.sha256 != self._hashes.get(name):
-                return None
-            return read_image(image, **self._sizes)
+        except ImageError:
+            return None
+        return image if image.sha256 == self._hashes.get(name) else None
+
+    def called(self, sha256: str) -> str | None:
+        """What the run calls a photo of that content."""
+        return next((name for name, each in self._hashes.items() if each == sha256), None)
+
+    def _read(self, name: str) -> WorkingImage | None:
+        """A photo at working size; None if it is gone, changed or cannot be decoded."""
+        image = self.file(name)
+        try:
+            return image and read_image(image, **self._sizes)
         except ImageError:
             return None
 
@@ -76,6 +87,24 @@ class KeptRun:
     model: Model | None
     reference: Reference | None
     matches: Store
+
+    @property
+    def config(self) -> Config:
+        """The run's.
+
+        Raises:
+          UserError: this version of jaxsfm does not know it.
+        """
+        plain = dict(self.report["options"]["config"])
+        try:
+            shape, refinement = PairShape(**plain.pop("pair")), plain.pop("refinement")
+            passes = refinement and Refinement(**refinement)
+            return Config(**plain, pair=shape, refinement=passes)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"{self.folder}: was made by jaxsfm {self.report.get('version')}, whose options "
+                "this version does not know; run reconstruct again"
+            ) from error
 
     def load_matches(self, pair: Pair) -> PairResult | None:
         """Of one pair, original pixels; None if there are none or the file is gone."""

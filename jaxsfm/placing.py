@@ -144,11 +144,10 @@ def _observe(
     ]
 
 
-def _jacobian(view: View, points: np.ndarray) -> np.ndarray:
+def _jacobian(view: View, points: np.ndarray, *, focal: bool = False) -> np.ndarray:
     """Change (n, 2, 6) of the pixels of points with the view's rotation (radians, in its frame) and
-    centre (in units of the points' distance)."""
-    reach = np.median(np.linalg.norm(points - view.centre, axis=1))
-    at, columns = view.project(points)[0], []
+    centre (in units of the points' distance); (n, 2, 7) with that by the focal length, relative."""
+    at, reach, columns = view.project(points)[0], _reach(view, points), []
     for k in range(6):
         step = STEP * np.eye(6)[k]
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
@@ -156,30 +155,76 @@ def _jacobian(view: View, points: np.ndarray) -> np.ndarray:
             view, rotation=turn @ view.rotation, centre=view.centre + reach * step[3:]
         )
         columns.append((moved.project(points)[0] - at) / STEP)
+    if focal:
+        principal = view.project(view.centre[None] + view.rotation[2])[0]
+        columns.append(at - principal)
     return np.nan_to_num(np.stack(columns, axis=2))
+
+
+def _reach(view: View, points: np.ndarray) -> float:
+    """How far off points are: the median distance."""
+    return float(np.median(np.linalg.norm(points - view.centre, axis=1)))
+
+
+def _covariance(own: np.ndarray, xy: np.ndarray, error_px: float, side: float) -> np.ndarray | None:
+    """Of least squares over observations (n, 2); None if they determine no pose. Patches that
+    overlap see the same photons and agree in their errors: one counts.
+
+    Args:
+      own: their Jacobian (n, 2, parameters).
+      error_px: their median error.
+      side: of a patch.
+    """
+    distinct = len(np.unique(np.floor(xy / side), axis=0))
+    variance = (error_px / MEDIAN_RADIUS) ** 2 * len(xy) / distinct
+    information = np.einsum("nia,nib->ab", own, own)
+    if np.linalg.cond(information) > MAX_CONDITION:
+        return None
+    return variance * np.linalg.inv(information)
 
 
 def _doubt(view: View, seen: Observed, error_px: float, side: int) -> float:
     """How far off the projections of what a view could show are expected to be, root mean square
     along an axis, pixels: the covariance of least squares, carried over to those points.
 
-    So a hundred points in one corner say less about a pose than fifty everywhere. Patches that
-    overlap see the same photons and agree in their errors: one counts.
+    So a hundred points in one corner say less about a pose than fifty everywhere.
 
     Args:
       error_px: median error of `seen`.
       side: of a patch.
     """
-    distinct = len(np.unique(np.floor(seen.xy / side), axis=0))
-    variance = (error_px / MEDIAN_RADIUS) ** 2 * len(seen.xy) / distinct
     probes = seen.could[:: -(-len(seen.could) // MAX_PROBES)]
     columns = _jacobian(view, np.concatenate([seen.points, probes]))
     own, others = np.split(columns, [len(seen.points)])
-    information = np.einsum("nia,nib->ab", own, own)
-    if np.linalg.cond(information) > MAX_CONDITION:
+    covariance = _covariance(own, seen.xy, error_px, side)
+    if covariance is None:
         return np.inf
-    covariance = variance * np.linalg.inv(information)
     return float(np.sqrt(np.einsum("nia,ab,nib->n", others, covariance, others).mean() / 2))
+
+
+class PoseDoubt(NamedTuple):
+    """How far off a pose is expected to be, root mean square; infinite if nothing determines it."""
+
+    centre: float
+    """Units of the model."""
+    rotation_deg: float
+
+
+def pose_doubt(
+    view: View, points: np.ndarray, xy: np.ndarray, error_px: float, side: float, *, focal: bool
+) -> PoseDoubt:
+    """The same covariance, of the pose itself. The model's own error comes on top.
+
+    Args:
+      points, xy: what determined it, (n, 3) and (n, 2) in the view's pixels.
+      error_px, side: as in `_covariance`.
+      focal: the focal length was determined with it.
+    """
+    covariance = _covariance(_jacobian(view, points, focal=focal), xy, error_px, side)
+    if covariance is None:
+        return PoseDoubt(np.inf, np.inf)
+    turn, shift = (float(np.sqrt(np.trace(covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
+    return PoseDoubt(_reach(view, points) * shift, float(np.degrees(turn)))
 
 
 def _step(pose: Followed, view: View, seen: Observed, px: int, config: Refinement) -> bool:

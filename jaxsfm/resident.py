@@ -39,10 +39,11 @@ Held = TypeVar("Held")
 
 
 class Resident(Generic[Name, Held]):
-    """What is held of the images of a list of pairs; the one wanted again last makes room."""
+    """What is held of the images of a list of pairs, or of blocks of pairs; the one wanted again
+    last makes room."""
 
     def __init__(
-        self, load: Callable[[Name], Held], pairs: Sequence[tuple[Name, Name]], most: int
+        self, load: Callable[[Name], Held], pairs: Sequence[Sequence[Name]], most: int
     ) -> None:
         """`load` gives what is held of an image; `most` images are held at a time."""
         self._load, self._most = load, most

@@ -12,9 +12,10 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from jaxsfm.config import Config
+from jaxsfm.engines import chosen_engine
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.extraction import extracted, image_features
+from jaxsfm.extraction import image_features
 from jaxsfm.host import interrupt
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap import write_models
@@ -23,15 +24,16 @@ from jaxsfm.host.given import Beside, read_given
 from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions
-from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs, exhaustive_pairs, read_pairs
+from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs
+from jaxsfm.host.plan import planned_pairs, read_plan
 from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.store import SavedMatches, digest
 from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import WorkFolder, open_folder
-from jaxsfm.matching import matched
 from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pipeline import open_images
 from jaxsfm.reconstruction import Kept, Reconstructed, reconstruct
+from jaxsfm.retrieval import check_retrieval, described, nearest_pairs
 from jaxsfm.run_options import RunOptions, check_options
 from jaxsfm.run_report import Done, run_report
 
@@ -54,16 +56,15 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, skipped = open_images(images, progress=options.progress)
     names = [*(image.name for image in usable), *skipped]
-    pairs = (
-        exhaustive_pairs(image.name for image in usable)
-        if options.pairs == "exhaustive"
-        else read_pairs(Path(options.pairs), names)
-    )
+    plan = read_plan(options.pairs)
+    pairs = planned_pairs(plan, (image.name for image in usable), names)
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
     given = read_given(options.with_database, options.with_hloc, usable, intrinsics)
     weights = chosen_weights(options.network, config.backbone)
+    if plan.retrieval:
+        check_retrieval(options.retrieval, weights)
     relocalizer = weights.chosen_relocalizer(config)
     identity = {
         "version": importlib.metadata.version("jaxsfm"),
@@ -75,6 +76,10 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     }
     seconds: dict[str, float] = {}
     with open_folder(out, identity) as folder:
+        if plan.retrieval:
+            with _timed(seconds, "retrieval"):
+                found = _retrieve(folder, weights, usable, plan.retrieval, options)
+                pairs = sorted({*pairs, *found})
         skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
         by_name = {image.name: image for image in usable if image.name not in skipped}
         pairs = [pair for pair in pairs if pair[0] in by_name and pair[1] in by_name]
@@ -83,12 +88,12 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             missing = [pair for pair in pairs if pair not in results]
             if results:
                 logger.info("%d of %d pairs have been matched before", len(results), len(pairs))
-            skipped |= _extract(folder, weights, by_name, missing, config, options)
+            skipped |= extract_missing(folder, weights, by_name, missing, config, options)
             missing = [pair for pair in missing if not skipped.keys() & set(pair)]
             good = [image for image in usable if image.name not in skipped]
             _check_enough(images, good, skipped)
         with _timed(seconds, "matching"):
-            for result in _match(folder, weights, by_name, missing, config, options):
+            for result in match_missing(folder, weights, by_name, missing, config, options):
                 results[result.pair] = result.counts
         chosen = sorted(_choose(results, options.best_pairs))
         ours = SavedMatches(folder, chosen)
@@ -200,11 +205,31 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def _bar(items: Iterable[T], total: int, stage: str, unit: str, options: RunOptions) -> Iterator[T]:
-    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=not options.progress)
+    quiet = not options.progress or not total
+    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=quiet)
     interrupt.check()
 
 
-def _extract(
+def _retrieve(
+    folder: WorkFolder, weights: Weights, images: list[ImageFile], k: int, options: RunOptions
+) -> list[Pair]:
+    """Each image with its k most similar ones; notes those that cannot be decoded."""
+    total, quiet = len(images), not options.progress
+    with tqdm(total=total, desc="retrieval", unit="image", disable=quiet) as bar:
+        found = described(
+            weights,
+            images,
+            kind=options.retrieval,
+            store=folder,
+            execution=options.execution,
+            on_image=bar.update,
+        )
+    for image, why in found.lost:
+        folder.mark_unusable(image, why)
+    return nearest_pairs(found.vectors, k)
+
+
+def extract_missing(
     folder: WorkFolder,
     weights: Weights,
     images: dict[str, ImageFile],
@@ -218,7 +243,8 @@ def _extract(
     skipped: dict[str, str] = {}
     if not todo:
         return skipped
-    stream = extracted(weights, todo, config=config, execution=options.execution)
+    engine = chosen_engine(options.engine)
+    stream = engine.extracted(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
             folder.mark_unusable(image, str(found))
@@ -228,7 +254,7 @@ def _extract(
     return skipped
 
 
-def _match(
+def match_missing(
     folder: WorkFolder,
     weights: Weights,
     images: dict[str, ImageFile],
@@ -246,7 +272,7 @@ def _match(
         return found
 
     rooms = {name: image_room(image, config=config) for name, image in images.items()}
-    stream = matched(
+    stream = chosen_engine(options.engine).matched(
         load, rooms, pairs, config=config, seed=options.seed, execution=options.execution
     )
     for result in _bar(stream, len(pairs), "matching", "pair", options):

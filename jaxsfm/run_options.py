@@ -4,9 +4,12 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+from jaxsfm.engine_choice import LOCAL, EngineChoice
+from jaxsfm.engines import chosen_engine
 from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
 from jaxsfm.host.mapping import Mapper
+from jaxsfm.host.plan import Retrieval
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 
@@ -15,7 +18,10 @@ class RunOptions:
     """What to do, beyond the matching `Config`."""
 
     pairs: str = "exhaustive"
-    """`exhaustive`, or a file with two image names a line."""
+    """`exhaustive`, a file with two image names a line, `sequential:K`, `retrieval:K`, or several
+    joined by `+` (`jaxsfm.host.plan`)."""
+    retrieval: Retrieval = "vlad"
+    """How photos are described for `retrieval:K`."""
     best_pairs: int | None = None
     """Hand on only each image's N pairs with the most inliers (a union); None: all."""
     intrinsics: str | None = None
@@ -35,6 +41,8 @@ class RunOptions:
     """hloc's features and matches, likewise."""
     execution: Execution = dataclasses.field(default_factory=Execution)
     """Devices, batches, memory."""
+    engine: EngineChoice = LOCAL
+    """This process, or workers on Ray."""
     progress: bool = False
     """Progress bars on standard error."""
 
@@ -47,11 +55,12 @@ class RunOptions:
 
 
 def check_options(options: RunOptions) -> None:
-    """Raises UserError for what COLMAP would not take, before the work."""
+    """Raises UserError for what COLMAP or the engine would not take, before the work."""
     if options.best_pairs is not None and options.best_pairs < 1:
         raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
     check_seed(options.seed)
     check_threads(options.threads)
+    chosen_engine(options.engine)
 
 
 def check_seed(seed: int) -> None:

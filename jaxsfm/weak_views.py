@@ -82,14 +82,19 @@ def _structure(tracks: Tracks, weak: Sequence[int]) -> tuple[Tracks, np.ndarray]
     )
 
 
-def _matched_points(
+def matched_points(
     image: View,
     views: list[View],
     structure: Tracks,
     normal: np.ndarray,
     matches: Mapping[Pair, PairResult],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keypoints (n, 2) of an image, working pixels, and the surface (n, 3) under their partners."""
+    """Keypoints (n, 2) of an image, working pixels, and the surface (n, 3) under their partners.
+
+    Args:
+      image: its pose does not count.
+      normal: of the structure's points.
+    """
     xy, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
     for k, view in enumerate(views):
         pair = make_pair(image.name, view.name)
@@ -181,7 +186,7 @@ def _starts(
         own = refine_intrinsics and cameras.count(cameras[k]) == 1
         found = find_view(
             images[k],
-            *_matched_points(images[k], views, structure, normal, evidence.matches),
+            *matched_points(images[k], views, structure, normal, evidence.matches),
             max_error_px=MATCH_ERROR_PX,
             estimate_focal_length=own and not images[k].camera.has_prior_focal_length,
             seed=evidence.seed,

@@ -216,3 +216,69 @@ def join_octaves(levels: list[np.ndarray], grid: np.ndarray, weight: float) -> n
                 parts.append(weight ** (k / 2) * normal(total))
             result[cell] = normal(np.concatenate(parts)) if len(parts) > 1 else parts[0]
     return result
+
+
+# -- whole images ----------------------------------------------------------------------------------
+
+
+def length_one(x: np.ndarray) -> np.ndarray:
+    """x over its Euclidean length; zero stays zero."""
+    length = np.sqrt((x * x).sum())
+    return x / length if length > 0 else x
+
+
+def gem(x: np.ndarray, power: float) -> np.ndarray:
+    """Generalised mean, channel by channel."""
+    rows = [row.astype(np.float64) for row in x if row.any()]
+    means = [np.mean([max(v, 0) ** power for v in channel]) for channel in zip(*rows, strict=True)]
+    return length_one(np.asarray(means) ** (1 / power))
+
+
+def vlad(x: np.ndarray, mean, whitening, centres) -> np.ndarray:
+    """One descriptor after the other."""
+    sums = np.zeros(centres.shape)
+    for row in x.astype(np.float64):
+        if row.any():
+            flat = length_one((row - mean) @ whitening)
+            k = np.argmin([((flat - c) ** 2).sum() for c in centres])
+            sums[k] += flat - centres[k]
+    return length_one(np.concatenate([length_one(each) for each in sums]))
+
+
+def netvlad(x: np.ndarray, assignment, centres, whitening, bias) -> np.ndarray:
+    """weights_conversion/README.md, equation by equation; whitening's row 64 d + k is V[d, k]."""
+    channels, words = centres.shape
+    v = np.zeros((channels, words))
+    for row in x.astype(np.float64):
+        if row.any():
+            row = length_one(row)
+            weights = np.exp(row @ assignment)
+            weights /= weights.sum()
+            for k in range(words):
+                v[:, k] += weights[k] * (row - centres[:, k])
+    for k in range(words):
+        v[:, k] = length_one(v[:, k])
+    v = length_one(v)
+    flat = np.asarray([v[i // words, i % words] for i in range(channels * words)])
+    return length_one(flat @ whitening + bias)
+
+
+def lloyd(x: np.ndarray, centres: np.ndarray, iterations: int) -> np.ndarray:
+    """k-means; empty centres stay."""
+    x, centres = x.astype(np.float64), centres.astype(np.float64)
+    for _ in range(iterations):
+        nearest = [np.argmin(((row - centres) ** 2).sum(1)) for row in x]
+        for k in range(len(centres)):
+            own = [row for row, n in zip(x, nearest, strict=True) if n == k]
+            if own:
+                centres[k] = np.mean(own, axis=0)
+    return centres
+
+
+def nearest(x: np.ndarray, k: int, tie: float) -> np.ndarray:
+    """The k best other rows by their product, in steps of `tie`; then the lower index."""
+    rows = []
+    for i, row in enumerate(x.astype(np.float64)):
+        others = sorted((-round(float(row @ y) / tie), j) for j, y in enumerate(x) if j != i)
+        rows.append([j for _, j in others[:k]])
+    return np.asarray(rows)

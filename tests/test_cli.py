@@ -204,7 +204,9 @@ def test_weights_shows_what_is_in_use(capsys):
         assert word in text
 
 
-def test_a_report_says_which_weights_and_other_ones_are_another_run(scene, plain, tmp_path, capsys):
+def test_a_report_says_which_weights_and_with_other_ones_all_is_done_again(
+    scene, plain, tmp_path, capsys
+):
     from jaxsfm.core.vgg import init_shapes
     from jaxsfm.host.converted import save_weights
     from jaxsfm.host.weights import SHA256, TORCHVISION
@@ -229,8 +231,12 @@ def test_a_report_says_which_weights_and_other_ones_are_another_run(scene, plain
         "about": {"source": "zeros"},
     }
     save_weights(zeros, layers, extras={}, **made)
-    again = ["reconstruct", scene / "images", "--out", out, "--intrinsics", scene / "K.txt"]
-    refuse(capsys, [*again, "--threads", "1", "--weights", zeros], "another run (weights: 2ecbe4")
+    shutil.copytree(out, tmp_path / "out")
+    again = ["reconstruct", scene / "images", "--out", tmp_path / "out", "--weights", zeros]
+    assert main([*map(str, again), "--threads", "1"]) == 1
+    said = capsys.readouterr().err
+    assert "--weights: 2ecbe4" in said and "matched before" not in said
+    assert "no model this time: the earlier one stays" in said
 
 
 @pytest.mark.parametrize("name", ["strecha", "daynight", "wxbs", "homography", "warps"])
@@ -435,7 +441,7 @@ def test_running_out_of_memory_is_one_sentence(scene, tmp_path, monkeypatch, cap
     def exhausted(*args, **kwargs):
         raise RuntimeError("RESOURCE_EXHAUSTED: out of memory allocating 1 TB")
 
-    monkeypatch.setattr("jaxsfm.run.matched", exhausted)
+    monkeypatch.setattr("jaxsfm.engines.LocalEngine.matched", exhausted)
     args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
     assert main(args) == 1
     error = capsys.readouterr().err
@@ -499,7 +505,7 @@ def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatc
     data = (folder / "view0.png").read_bytes()
     (folder / "bad.png").write_bytes(data[: len(data) // 2])
     run(scene, tmp_path / "out", images=folder)
-    monkeypatch.setattr("jaxsfm.run.extracted", None)  # calling it would fail
+    monkeypatch.setattr("jaxsfm.engines.LocalEngine.extracted", None)  # calling it would fail
     report = run(scene, tmp_path / "out", images=folder)
     assert list(report["images"]["skipped"]) == ["bad.png"]
 

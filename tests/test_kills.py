@@ -5,7 +5,6 @@ import json
 import os
 import select
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from databases import content
 
 from jaxsfm.host.atomic import PARTIAL, load_arrays
 from jaxsfm.synthetic import write_scene
@@ -52,18 +52,6 @@ def nursery(tmp_path):
     made = Nursery(tmp_path / "compiled")
     yield made
     made.end()
-
-
-def content(database: Path) -> dict[str, list]:
-    """Every row of every table."""
-    with sqlite3.connect(f"file:{database}?mode=ro", uri=True) as db:
-        tables = [
-            name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type='table'")
-        ]
-        return {
-            name: sorted(db.execute(f"SELECT * FROM {name}").fetchall(), key=repr)
-            for name in tables
-        }
 
 
 def results(out: Path) -> dict[str, object]:

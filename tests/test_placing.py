@@ -9,7 +9,17 @@ from room_scene import SIZE, Room, exact_tracks, read_of
 from jaxsfm import placing
 from jaxsfm.config import Refinement
 from jaxsfm.host.resection import adjust_view
-from jaxsfm.placing import Followed, Observed, Pose, _doubt, at_octave, follow, trusted
+from jaxsfm.host.viewgraph import rotation_angle_deg
+from jaxsfm.placing import (
+    Followed,
+    Observed,
+    Pose,
+    _doubt,
+    at_octave,
+    follow,
+    pose_doubt,
+    trusted,
+)
 
 NIGHT = 2
 
@@ -40,6 +50,25 @@ def test_doubt_is_how_far_off_projections_are(rendered, sigma):
         errors.append(found.project(seen.could)[0] - view.project(seen.could)[0])
     true = np.sqrt(np.mean(np.square(errors)))
     assert 0.6 < np.median(doubts) / true < 1.3
+
+
+@pytest.mark.parametrize("focal", [False, True])
+def test_the_doubt_about_a_pose_is_how_far_off_it_is(rendered, focal):
+    """Root mean square over many draws of the noise, of centre and rotation."""
+    view = rendered.views[NIGHT]
+    rows = np.flatnonzero(rendered.visible[:, NIGHT])[::9]
+    points, exact = rendered.points[rows], view.project(rendered.points[rows])[0]
+    doubts, errors = [], []
+    for seed in range(40):
+        xy = exact + np.random.default_rng(seed).normal(0, 1.0, exact.shape)
+        found = adjust_view(view, xy, points, refine_focal_length=focal)
+        assert found is not None
+        median = float(np.median(np.linalg.norm(found.project(points)[0] - xy, axis=1)))
+        doubts.append(pose_doubt(found, points, xy, median, 1, focal=focal))
+        turn = rotation_angle_deg(found.rotation, view.rotation)
+        errors.append((np.linalg.norm(found.centre - view.centre), turn))
+    ratio = np.median(doubts, axis=0) / np.sqrt(np.mean(np.square(errors), axis=0))
+    assert (ratio > 0.6).all() and (ratio < 1.4).all(), ratio
 
 
 def test_points_in_a_corner_leave_more_doubt_than_fewer_everywhere(rendered):

@@ -148,6 +148,18 @@ class VGG(nn.Module):
         scores = (finest[0], score(pool1, heads[1]), score(pool2, heads[2]))
         return Levels(scores, pool3, pool4)
 
+    def conv5(
+        self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]
+    ) -> Float[Array, "b h16 w16 512"]:
+        """The last convolution before its rectifier, zero past the valid cells; arguments as
+        above."""
+        x = clear_padding(images, size)
+        for block in range(1, 5):
+            layers, large = self._layers(block), block <= LARGE_BLOCKS
+            _, x = scores_and_pool(x, size, layers, large=large, bfloat16=self.bfloat16)
+            size = size // 2
+        return convolve(x, size, self._layers(5), bfloat16=self.bfloat16)
+
     def walked(
         self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]
     ) -> tuple[Float[Array, "b h w 64"], Float[Array, "b h2 w2 64"], Float[Array, "b h4 w4 128"]]:

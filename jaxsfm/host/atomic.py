@@ -88,6 +88,25 @@ def read_json(path: Path) -> Any:
         return None
 
 
+def check_room(folder: Path, needed: int) -> None:
+    """Refuse what would not fit on the disk, before code that does not survive that begins.
+
+    COLMAP ends the process where a database cannot grow, and writes models that are cut off.
+
+    Args:
+      needed: bytes.
+
+    Raises:
+      UserError: what is needed and what there is.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise UserError(
+            f"{folder}: cannot be written (about {needed / 1e6:.0f} MB are needed, "
+            f"{free / 1e6:.0f} MB are left on the disk)"
+        )
+
+
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """A folder to fill that takes the place of `path` when it is complete.

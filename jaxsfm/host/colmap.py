@@ -18,6 +18,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.errors import UserError
+from jaxsfm.host.atomic import check_room
 from jaxsfm.host.images import ImageError, ImageFile, shown_name
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.native import native
@@ -47,6 +48,8 @@ def keypoint_tables(results: Iterable[PairResult]) -> dict[str, tuple[np.ndarray
     return {name: _united(rows) for name, rows in parts.items()}
 
 
+SPARE_BYTES = 4_000_000
+"""Left on the disk beside what is counted: tables' indices, poses, the page."""
 UNITED = 16
 """Pairs of an image whose keypoints are held apart: all would be gigabytes for 500 images."""
 
@@ -111,7 +114,15 @@ def write_database(
     Raises:
       ValueError: inconsistent results (nothing is written).
     """
-    tables = keypoint_tables(_consistent(results))
+    matched = 0
+
+    def counted() -> Iterator[PairResult]:
+        nonlocal matched
+        for result in _consistent(results):
+            matched += result.num_inliers
+            yield result
+
+    tables = keypoint_tables(counted())
     names = {image.name: image for image in images}
     if unknown := sorted(tables.keys() - names.keys()):
         raise ValueError(f"results name images that are not given: {unknown[0]!r}")
@@ -120,6 +131,8 @@ def write_database(
             raise ValueError(f"{name}: keypoints must be finite")
         if (xy < -0.5).any() or (xy > np.asarray(names[name].size) - 0.5).any():
             raise ValueError(f"{name}: keypoints outside the image {names[name].size}")
+    rows = sum(len(xy) for _, xy in tables.values()) + 2 * matched
+    check_room(path.parent, SPARE_BYTES + 2 * 8 * rows)  # and as much for SQLite's journal
     empty = np.zeros((0, 2), np.float32)
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
@@ -270,6 +283,9 @@ def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
     for index, model in enumerate(models):
         target = folder / str(index)
         target.mkdir(parents=True)
+        points2d = sum(image.num_points2D() for image in model.images.values())
+        rows = 24 * points2d + 8 * model.compute_num_observations() + 51 * model.num_points3D()
+        check_room(target, SPARE_BYTES + rows)
         model.write_binary(target)
 
 

@@ -127,6 +127,12 @@ def read_extras(path: Path) -> dict[str, np.ndarray]:
         return {name: file.read(name, EXTRAS[name]) for name in EXTRAS if name in file.shapes}
 
 
+def has_extras(path: Path) -> bool:
+    """Whether a converted file has NetVLAD's head. Raises UserError as `read_converted`."""
+    with _open(path) as file:
+        return all(name in file.shapes for name in EXTRAS)
+
+
 def _open(path: Path) -> AbstractContextManager[Tensors]:
     return open_tensors(path, marker=FORMAT, what="weights file", made_by="jaxsfm weights convert")
 

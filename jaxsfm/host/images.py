@@ -181,6 +181,18 @@ def _any_size() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = limit
 
 
+def image_bytes(image: ImageFile) -> bytes:
+    """The file as it is.
+
+    Raises:
+      ImageError: it cannot be read.
+    """
+    try:
+        return image.path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"{shown_name(image.name)}: cannot be read ({error.strerror})") from error
+
+
 def _decode(image: ImageFile) -> np.ndarray:
     shown = shown_name(image.name)
     width, height = image.size
@@ -196,10 +208,7 @@ def _decode(image: ImageFile) -> np.ndarray:
         logger.warning("%s: %d x %d pixels, decoded at 1/%d", shown, width, height, factors[0])
         flags = _REDUCED[factors[0]] | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        data = np.frombuffer(image.path.read_bytes(), np.uint8)
-        bgr = cv2.imdecode(data, flags)
-    except OSError as error:
-        raise ImageError(f"{shown}: cannot be read ({error.strerror})") from error
+        bgr = cv2.imdecode(np.frombuffer(image_bytes(image), np.uint8), flags)
     except (cv2.error, MemoryError) as error:
         raise ImageError(f"{shown}: cannot be decoded") from error
     if bgr is None:

@@ -145,3 +145,13 @@ def test_both_convolutions_give_the_same_maps(weights, photo, monkeypatch):
         assert_maps_equal(ours, np.asarray(expected))
     assert len(used) == len(LAYERS)
     jax.clear_caches()
+
+
+def test_the_last_convolution_is_what_pool5_pools(weights, photo):
+    size = (57, 71)
+    images, sizes = jnp.asarray(photo[None]), jnp.asarray([size], jnp.int32)
+    last = jax.jit(functools.partial(VGG16().apply, method="conv5"))(weights.params, images, sizes)
+    rows, cols = size[0] // 16, size[1] // 16
+    assert not np.any(last[:, rows:]) and not np.any(last[:, :, cols:]) and np.any(last < 0)
+    expected = apply(weights.params, images, sizes).pool5
+    assert_maps_equal(blocks.pool(last, sizes // 16), np.asarray(expected))

@@ -2,7 +2,9 @@
 
 import json
 import os
+import shutil
 
+import pycolmap
 import pytest
 
 from jaxsfm.errors import UserError
@@ -116,3 +118,19 @@ def test_a_full_disk_is_reported_as_such_and_leaves_no_partial_file(tmp_path, mo
         with pytest.raises(UserError, match="a.json: cannot be written .No space left"):
             write_atomic(tmp_path / "a.json", b"{}")
     assert not list(tmp_path.glob("a.json*"))
+
+
+@pytest.mark.parametrize("what", ["database", "model"])
+def test_what_would_not_fit_on_the_disk_is_refused_before_native_code_begins(
+    tmp_path, monkeypatch, what
+):
+    """COLMAP would end the process, or write a model that is cut off."""
+    from jaxsfm.host.colmap import write_database, write_models
+
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))
+    with pytest.raises(UserError, match="about 4 MB are needed, 3 MB are left"):
+        if what == "database":
+            write_database(tmp_path / "database.db", [], {}, None)
+        else:
+            write_models([pycolmap.Reconstruction()], tmp_path / "sparse")

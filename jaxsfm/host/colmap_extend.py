@@ -1,0 +1,133 @@
+"""A COLMAP database that gets more images; what is in it keeps its numbers."""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
+import numpy as np
+import pycolmap
+
+from jaxsfm.host.colmap import PIXEL_OFFSET, read_images, read_two_views, verify
+from jaxsfm.host.images import ImageFile
+from jaxsfm.host.pairs import Pair, PairResult
+
+
+def add_images(
+    path: Path, images: Mapping[str, tuple[ImageFile, pycolmap.Camera]]
+) -> dict[str, tuple[int, pycolmap.Camera]]:
+    """Write images and their cameras; their ids and cameras, by name.
+
+    Args:
+      images: by name. A camera whose id the database knows is that one; others are new.
+    """
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        known = {camera.camera_id for camera in db.read_all_cameras()}
+        for name, (_, camera) in sorted(images.items()):
+            camera_id = camera.camera_id
+            if camera_id not in known:
+                camera_id = db.write_camera(camera)
+            db.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+    every = read_images(path)
+    return {name: every[name] for name in images}
+
+
+def _appended(known: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Keypoints, and behind them those of `xy` that are not among them.
+
+    Args:
+      known: float32 (n, 2 or more): (x, y) and what follows; kept as it is.
+    """
+    there = {row.tobytes() for row in known[:, :2].copy()}
+    fresh = [row for row in np.unique(xy, axis=0) if row.tobytes() not in there]
+    rest = np.zeros((len(fresh), known.shape[1] - 2), np.float32)
+    if rest.shape[1] >= 4:  # an affine shape; COLMAP's for a bare point
+        rest[:, [0, 3]] = 1
+    return np.concatenate([known, np.c_[np.asarray(fresh).reshape(-1, 2), rest]])
+
+
+def add_matches(
+    path: Path,
+    results: Mapping[Pair, PairResult],
+    *,
+    seed: int,
+    threads: int,
+    scale: float,
+) -> dict[Pair, int]:
+    """Write matches and COLMAP's verification of them; inliers, by pair that has any.
+
+    An image's keypoints stay and get those that are new behind them.
+
+    Args:
+      results: of images that are in the database, pairs that have no matches in it.
+      scale: see `jaxsfm.host.colmap.verify`.
+    """
+    ids = {name: image_id for name, (image_id, _) in read_images(path).items()}
+    used: dict[str, list[np.ndarray]] = {}
+    for pair in results:
+        for name, xy in zip(pair, _sides(results[pair]), strict=True):
+            used.setdefault(name, []).append(xy)
+    matches: dict[Pair, np.ndarray] = {}
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        place: dict[str, dict[bytes, int]] = {}
+        for name, parts in used.items():
+            there = db.exists_keypoints(ids[name])
+            known = np.asarray(db.read_keypoints(ids[name]), np.float32) if there else _NONE
+            every = _appended(known if len(known) else _NONE, np.concatenate(parts))
+            (db.update_keypoints if there else db.write_keypoints)(ids[name], every)
+            rows = reversed(list(enumerate(every[:, :2].copy())))  # of equal ones the first
+            place[name] = {row.tobytes(): k for k, row in rows}
+        for pair in sorted(results):
+            columns = [
+                [place[name][row.tobytes()] for row in xy]
+                for name, xy in zip(pair, _sides(results[pair]), strict=True)
+            ]
+            rows = np.asarray(columns, np.uint32).T.reshape(-1, 2)
+            # Two cells may lie at one pixel: one match each.
+            for side in (0, 1):
+                rows = rows[np.sort(np.unique(rows[:, side], return_index=True)[1])]
+            if len(rows):
+                matches[pair] = rows
+                db.write_matches(ids[pair[0]], ids[pair[1]], rows)
+    return _verified(path, matches, ids, seed=seed, threads=threads, scale=scale)
+
+
+_NONE = np.zeros((0, 2), np.float32)
+
+
+def _sides(result: PairResult) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints in COLMAP's pixels, as the database holds them."""
+    both = (result.keypoints0, result.keypoints1)
+    return tuple(np.asarray(xy, np.float32) + PIXEL_OFFSET for xy in both)  # pyright: ignore[reportReturnType]
+
+
+def _verified(
+    path: Path,
+    matches: Mapping[Pair, np.ndarray],
+    ids: Mapping[str, int],
+    *,
+    seed: int,
+    threads: int,
+    scale: float,
+) -> dict[Pair, int]:
+    """COLMAP verifies all pairs of a database: those that are new in a copy without the others."""
+    scratch = path.with_name("new_pairs.db")
+    shutil.copyfile(path, scratch)
+    with pycolmap.Database.open(scratch) as db, pycolmap.DatabaseTransaction(db):
+        db.clear_matches()
+        db.clear_two_view_geometries()
+        for (a, b), rows in matches.items():
+            db.write_matches(ids[a], ids[b], rows)
+    verify(scratch, seed=seed, threads=threads, scale=scale, relative_poses=True)
+    found = {pair: view.geometry.num_inliers for pair, view in read_two_views(scratch).items()}
+    with (
+        pycolmap.Database.open(scratch) as new,
+        pycolmap.Database.open(path) as db,
+        pycolmap.DatabaseTransaction(db),
+    ):
+        for a, b in matches:
+            if new.exists_two_view_geometry(ids[a], ids[b]):
+                geometry = new.read_two_view_geometry(ids[a], ids[b])
+                db.write_two_view_geometry(ids[a], ids[b], geometry)
+    scratch.unlink()
+    return found

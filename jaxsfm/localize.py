@@ -1,0 +1,334 @@
+"""Photos localized in a finished run: each is matched with photos of the run, and its pose found in
+the model (`jaxsfm.single_view`), which stays as it is.
+
+A photo's result depends on its content, the run and the options; not on its name, nor on the other
+photos of the same call.
+"""
+
+import dataclasses
+import functools
+import importlib.metadata
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from jaxsfm.config import Config, Refinement
+from jaxsfm.errors import UserError
+from jaxsfm.execution import Execution
+from jaxsfm.extraction import extracted, image_features
+from jaxsfm.host.colmap import camera_for
+from jaxsfm.host.features import ImageFeatures, room_of
+from jaxsfm.host.images import (
+    ImageError,
+    ImageFile,
+    find_images,
+    inspect_image,
+    read_image,
+    shown_name,
+    working_size,
+)
+from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
+from jaxsfm.host.model import Tracks, View, read_model_arrays
+from jaxsfm.host.pairs import Pair, PairResult
+from jaxsfm.host.poses import read_model
+from jaxsfm.host.store import Store
+from jaxsfm.host.weights import Weights, chosen_weights
+from jaxsfm.kept import KeptRun, read_run
+from jaxsfm.localize_report import UNUSABLE, error_against, located_figures
+from jaxsfm.matching import matched
+from jaxsfm.patches import ReadGray, gray
+from jaxsfm.single_view import Located, locate, part_of
+from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
+
+GRAYS = 64
+"""Decoded images kept in memory: 8 MB each at 1600 x 1200."""
+Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
+"""A photo and the names of the model's photos -> those that it is matched with."""
+
+
+def everything(_: ImageFile, names: Sequence[str]) -> Sequence[str]:
+    """The shortlist of small models."""
+    return names
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocalizeOptions:
+    """What to do, beyond what the run fixes."""
+
+    images: Path | None = None
+    """Folder of the run's photos; None: where the run found them."""
+    intrinsics: str | None = None
+    """K.txt or MODEL:p1,p2,.. of the photos; None: the run's camera, if it has one for all and it
+    fits, else one per photo, whose focal length is estimated."""
+    reference: Path | None = None
+    """Reference poses of the photos and of the run's."""
+    network: WeightsChoice = USUAL_WEIGHTS
+    shortlist: Shortlist = everything
+    execution: Execution = dataclasses.field(default_factory=Execution)
+    progress: bool = False
+
+
+class KnownModel(NamedTuple):
+    """The best model of a run, in working pixels."""
+
+    views: list[View]
+    tracks: Tracks
+    config: Config
+    seed: int
+
+
+class ChosenCamera(NamedTuple):
+    """A photo's camera before it is localized."""
+
+    camera: Any
+    """pycolmap.Camera."""
+    source: str
+    """given, run, exif or guess."""
+
+    @property
+    def own(self) -> bool:
+        """Whether its focal length is estimated."""
+        return self.source in ("exif", "guess")
+
+
+def known_model(folder: Path, config: Config, *, seed: int = 0) -> KnownModel:
+    """A COLMAP model on disk, seen in the working pixels of a config.
+
+    Raises:
+      UserError: no readable model in `folder`.
+    """
+    model = read_model(folder)
+    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    sizes = {}
+    for name, camera in cameras.items():
+        width, height = working_size((camera.width, camera.height), config.max_size, config.enlarge)
+        sizes[name] = (width, height), (camera.width / width, camera.height / height)
+    return KnownModel(*read_model_arrays(model, sizes), config, seed)
+
+
+def choose_camera(
+    image: ImageFile, views: Sequence[View], intrinsics: Intrinsics | None
+) -> ChosenCamera:
+    """The given camera; else the model's, if it has one for all and of this size; else one from
+    EXIF or a guess.
+
+    Raises:
+      UserError: the given one does not fit.
+    """
+    if intrinsics is not None:
+        check_fits(intrinsics, {image.name: image.size})
+        return ChosenCamera(intrinsics.camera(image.size), "given")
+    shared = {view.camera.camera_id: view.camera for view in views}
+    if len(shared) == 1 and len(views) > 1:
+        (camera,) = shared.values()
+        if (camera.width, camera.height) == image.size:
+            return ChosenCamera(camera, "run")
+    camera = camera_for(image, None)
+    return ChosenCamera(camera, "exif" if camera.has_prior_focal_length else "guess")
+
+
+def view_of(image: ImageFile, chosen: ChosenCamera, config: Config) -> View:
+    """A photo that has no pose yet."""
+    width, height = working_size(image.size, config.max_size, config.enlarge)
+    return View(
+        image_id=0,
+        name=image.name,
+        rotation=np.eye(3),
+        centre=np.zeros(3),
+        camera=chosen.camera,
+        scale=np.asarray([image.size[0] / width, image.size[1] / height]),
+        size=(width, height),
+    )
+
+
+def locate_photo(
+    image: ImageFile,
+    chosen: ChosenCamera,
+    model: KnownModel,
+    shortlist: Sequence[str],
+    matches: Mapping[Pair, PairResult],
+    read: ReadGray,
+) -> Located:
+    """The pose of a photo from its matches with the shortlisted photos of a model."""
+    views, tracks, _ = part_of(model.views, model.tracks, shortlist)
+    return locate(
+        view_of(image, chosen, model.config),
+        views,
+        tracks,
+        matches,
+        read,
+        config=model.config.refinement or Refinement(),
+        own_camera=chosen.own,
+        seed=model.seed,
+    )
+
+
+def run_weights(run: KeptRun, choice: WeightsChoice) -> Weights:
+    """Those of the run, or UserError."""
+    config = run.config
+    weights = chosen_weights(choice, config.backbone)
+    made_with, now = run.report["weights"], weights.described(config)
+    for key, option in (("sha256", "--weights"), ("relocalizer_sha256", "--relocalizer")):
+        if made_with.get(key) != now[key]:
+            raise UserError(
+                f"{run.folder}: was made with other weights (SHA-256 "
+                f"{str(made_with.get(key))[:12]}..., not {str(now[key])[:12]}...); give them with "
+                f"{option}"
+            )
+    return weights
+
+
+def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, str]]:
+    """Usable photos by their path as given (folders: all in them), and why others are not.
+
+    A photo's name becomes its content's, which no photo of a run has.
+    """
+    paths = []
+    for path in photos:
+        paths += [path / name for name in find_images(path)] if path.is_dir() else [path]
+    usable, unusable = {}, {}
+    for path in dict.fromkeys(paths):
+        try:
+            image = inspect_image(path, name=str(path))
+            usable[str(path)] = dataclasses.replace(image, name=f"photo {image.sha256}")
+        except ImageError as error:
+            unusable[str(path)] = str(error)
+    if not usable:
+        raise UserError(next(iter(unusable.values()), "no photos to localize were given"))
+    return usable, unusable
+
+
+@contextmanager
+def _features(
+    run: KeptRun, weights: Weights, files: Mapping[str, ImageFile], options: LocalizeOptions
+) -> Iterator[Callable[[str], ImageFeatures]]:
+    """Features of the run's photos by name: kept ones, else computed once, on disk meanwhile."""
+    with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
+        fresh = Store(Path(scratch), run.report["identity"])
+        todo = [image for image in files.values() if not run.matches.has_features(image)]
+        stream = extracted(weights, todo, config=run.config, execution=options.execution)
+        bar = tqdm(
+            stream, total=len(todo), desc="extraction", unit="image", disable=not options.progress
+        )
+        for _, found in bar:
+            if isinstance(found, ImageError):
+                raise found
+            fresh.save_features(found)
+
+        def load(name: str) -> ImageFeatures:
+            image = files[name]
+            found = fresh.load_features(image) or run.matches.load_features(image)
+            return found or image_features(weights, image, config=run.config)
+
+        yield load
+
+
+def run_files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
+    """The run's photos, or UserError for one that is gone."""
+    files = {}
+    for name in names:
+        image = run.photos.file(name)
+        if image is None:
+            raise UserError(
+                f"{shown_name(name)}: gone or changed since the run (looked in "
+                f"{run.photos.folder}); say where the run's photos are with --images"
+            )
+        files[name] = image
+    return files
+
+
+def reader(files: Mapping[str, ImageFile], config: Config) -> ReadGray:
+    """Intensities of working images by name; the last GRAYS stay in memory."""
+
+    @functools.lru_cache(maxsize=GRAYS)
+    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        working = read_image(files[name], max_size=config.max_size, enlarge=config.enlarge)
+        return gray(working.rgb), working.scale
+
+    return read
+
+
+def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> dict[str, Any]:
+    """Localize photos in a finished run; returns plain JSON, a row for each photo.
+
+    Args:
+      photos: files, or folders of them.
+      run: a run's OUT.
+
+    Raises:
+      UserError: no finished run with a model, its photos or weights are not at hand, or no usable
+        photo was given.
+    """
+    kept = read_run(run, images=options.images, reference=options.reference)
+    if kept.model is None:
+        raise UserError(f"{run}: this run has no model to localize photos in")
+    seed = kept.report["options"]["seed"]
+    model = known_model(kept.folder / "sparse" / "0", kept.config, seed=seed)
+    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
+    usable, unusable = _queries(photos)
+    cameras = {path: choose_camera(i, model.views, intrinsics) for path, i in usable.items()}
+    weights = run_weights(kept, options.network)
+    names = [view.name for view in model.views]
+    shortlists = {}
+    for path, image in usable.items():
+        own = kept.photos.called(image.sha256)
+        shortlists[path] = options.shortlist(image, [name for name in names if name != own])
+    files = run_files(kept, sorted({name for some in shortlists.values() for name in some}))
+    rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
+    with _features(kept, weights, files, options) as load:
+        each = tqdm(usable.items(), desc="localizing", unit="photo", disable=not options.progress)
+        for path, image in each:
+            row: dict[str, Any] = {
+                "photo": path,
+                "in_run": kept.photos.called(image.sha256),
+                "shortlist": sorted(shortlists[path]),
+            }
+            try:
+                matches = _matches(image, shortlists[path], load, weights, model, options)
+                read = reader({**files, image.name: image}, model.config)
+                found = locate_photo(image, cameras[path], model, shortlists[path], matches, read)
+            except ImageError as error:
+                rows.append(row | {"status": UNUSABLE, "why": str(error)})
+                continue
+            row |= located_figures(found, cameras[path].source, matches)
+            if found.view is not None and kept.reference is not None:
+                name, reference = Path(path).name, kept.reference.poses
+                row["error"] = error_against(name, found.view, model.views, reference)
+            rows.append(row)
+    return {
+        "version": importlib.metadata.version("jaxsfm"),
+        "model": str(run.absolute()),
+        "photos": sorted(rows, key=lambda row: row["photo"]),
+    }
+
+
+def _matches(
+    image: ImageFile,
+    shortlist: Sequence[str],
+    load: Callable[[str], ImageFeatures],
+    weights: Weights,
+    model: KnownModel,
+    options: LocalizeOptions,
+) -> dict[Pair, PairResult]:
+    """Of one photo with its shortlist."""
+    own = image_features(weights, image, config=model.config)
+
+    def either(name: str) -> ImageFeatures:
+        return own if name == image.name else load(name)
+
+    sizes = {view.name: view.size for view in model.views}
+    rooms = {name: room_of(sizes[name]) for name in shortlist} | {image.name: own.room}
+    results = matched(
+        either,
+        rooms,
+        [(image.name, name) for name in shortlist],
+        config=model.config,
+        seed=model.seed,
+        execution=options.execution,
+    )
+    return {result.pair: result for result in results}

@@ -1,0 +1,59 @@
+"""Laws of a collection's vocabulary."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+
+from jaxsfm.core.vocabulary import fit_vocabulary, lloyd, whitened
+
+fit = jax.jit(functools.partial(fit_vocabulary, words=4, directions=3))
+
+
+def sample(n: int = 128, c: int = 8) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(n, c)) * np.linspace(0.2, 2, c) + 1
+    return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
+
+
+def test_centres_equal_those_of_an_obvious_k_means():
+    x = sample(60, 4)
+    start = np.r_[x[:5], [[9.0, 9, 9, 9]]].astype(np.float32)  # the last one is nobody's
+    found = lloyd(jnp.asarray(np.r_[x, np.zeros((7, 4), np.float32)]), jnp.asarray(start))
+    np.testing.assert_allclose(found, oracles.lloyd(x, start, 25), rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(found[5], start[5])
+
+
+def test_directions_are_whitened_and_of_the_largest_variance(key):
+    x = sample()
+    words = fit(key, jnp.asarray(x))
+    flat = (x - x.mean(0)) @ np.asarray(words.whitening)
+    np.testing.assert_allclose(flat.T @ flat / len(x), np.eye(3), atol=1e-3)
+    largest = np.linalg.eigvalsh(np.cov(x.T, bias=True))[-3:]
+    np.testing.assert_allclose(np.linalg.norm(words.whitening, axis=0), largest**-0.5, rtol=1e-3)
+
+
+def test_zero_rows_of_a_sample_do_not_count(key):
+    x = sample(100)
+    padded = np.r_[x, np.zeros((28, 8), np.float32)]
+    words = fit(key, jnp.asarray(padded))
+    np.testing.assert_allclose(words.mean, x.mean(0), rtol=1e-5)
+    assert np.all(np.linalg.norm(words.centres, axis=1) > 0.1)
+    assert not np.any(whitened(jnp.asarray(padded), words)[100:])
+
+
+def test_a_sample_that_lies_in_a_plane_or_in_a_point_gives_finite_words(key):
+    flat = np.zeros((128, 8), np.float32)
+    flat[:, :2] = sample(128, 2)
+    for x in (flat, np.tile(flat[:1], (128, 1)), np.zeros((128, 8), np.float32)):
+        words = fit(key, jnp.asarray(x))
+        assert all(np.isfinite(part).all() for part in words)
+
+
+@pytest.mark.parametrize("shape", [(3, 8), (50, 2)])
+def test_too_small_a_sample_is_an_error(key, shape):
+    with pytest.raises(ValueError, match=f"4 rows of 3 channels; got {shape[0]} of {shape[1]}"):
+        fit_vocabulary(key, jnp.zeros(shape), words=4, directions=3)

@@ -1,0 +1,22 @@
+"""Which Ray cluster is worked with, and how it is shared among workers."""
+
+import pytest
+
+from jaxsfm.errors import UserError
+from jaxsfm.ray_cluster import connected, share
+
+
+def test_an_address_where_nothing_answers_is_told_at_once():
+    pytest.importorskip("ray")
+    for address, why in (("127.0.0.1:1", "nothing answers"), ("ray://h:1", "must be HOST:PORT")):
+        with pytest.raises(UserError, match=why), connected(address):
+            pass
+
+
+def test_cpus_are_shared_among_workers():
+    assert share([8], None, 8) == (1, 8)
+    assert share([8, 16], None, 8) == (3, 8)
+    assert share([4, 16], None, 8) == (5, 4)
+    assert share([8, 8], 3, 8) == (3, 4)
+    with pytest.raises(UserError, match="--workers 3"):
+        share([1, 1], 3, 8)
