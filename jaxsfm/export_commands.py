@@ -93,13 +93,13 @@ def _new_folder(path: Path) -> Iterator[Path]:
 
 def _recorded_photos(run: Path) -> Path | None:
     """The photos' folder of a run, if it says and they are still there."""
-    from jaxsfm.reported import read_report
+    from jaxsfm.reported import PHOTOS, read_report
 
     try:
-        folder = read_report(run)["images"].get("folder")
+        folder = Path(read_report(run, PHOTOS)["images"]["folder"])
     except UserError:  # a model of COLMAP's, or an older run
         return None
-    return Path(folder) if folder and Path(folder).is_dir() else None
+    return folder if folder.is_dir() else None
 
 
 def _model(run: Path) -> "pycolmap.Reconstruction":
@@ -162,13 +162,13 @@ def _export_folder(
 def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -> None:
     from jaxsfm.host.formats.hloc import write_hloc
     from jaxsfm.host.images import working_size
-    from jaxsfm.reported import read_report
+    from jaxsfm.reported import SIZES, read_report
 
     tables = _tables(run)
     if tables is None:
         raise UserError(f"{run}: no database.db here, whose matches hloc would get")
     try:
-        config = read_report(run)["options"]["config"]
+        config = read_report(run, SIZES)["options"]["config"]
         limits = config["max_size"], float(config["enlarge"])
     except UserError:  # not a run of ours: the photos' own pixels
         limits = 2**31, 1.0

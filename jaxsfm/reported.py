@@ -44,6 +44,10 @@ def _side(value: Any) -> bool:
 
 _ERRORS = {"mean": number, "median": number, "max": number}
 _NEAREST = {"pair": _pair, "missed": text}
+SIZES: Shape = {"options": {"config": {"max_size": _side, "enlarge": _positive}}}
+"""How large working images were."""
+PHOTOS: Shape = {"images": {"folder": text}}
+"""Where the photos lay."""
 REPORT: Shape = {
     "version": text,
     "versions?": {"*": text},
@@ -144,8 +148,11 @@ def _entries(
             yield name[:-1], value[name[:-1]], one
 
 
-def read_report(folder: Path) -> dict[str, Any]:
+def read_report(folder: Path, shape: Shape = REPORT) -> dict[str, Any]:
     """A run's report.json.
+
+    Args:
+      shape: of what is wanted of it.
 
     Raises:
       UserError: there is none, or it is not what this version's readers need.
@@ -153,7 +160,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     report = read_json(folder / "report.json")
     if report is None:
         raise UserError(f"{folder}: no finished run here (report.json is missing or damaged)")
-    place = misfit(report, REPORT)
+    place = misfit(report, shape)
     if place is not None:
         what = place or "its content"
         raise UserError(f"{folder}: report.json is damaged, or of another version ({what!r})")
