@@ -159,7 +159,8 @@ def _rows(
             if isinstance(found, ImageError):
                 yield image, found
             else:
-                yield image, found.dense.coarse[0][: int(np.prod(found.dense.coarse_grid))]
+                cells = int(np.prod(found.dense.coarse_grid))
+                yield image, np.asarray(found.dense.coarse[0][:cells])
 
 
 def _again(work: Work, image: ImageFile) -> np.ndarray:
