@@ -84,8 +84,8 @@ def noted(all_pieces: Iterator[Piece], given: list) -> Iterator[Piece]:
 SQUARES = [(k, k * k) for k in range(40)]
 
 
-def results(work, count: int = 40) -> list:
-    with crew(work, address=None, workers=WORKERS) as workers:
+def results(work, count: int = 40, number: int = WORKERS) -> list:
+    with crew(work, address=None, workers=number) as workers:
         return sorted(workers.results(pieces(workers, count)))
 
 
@@ -93,8 +93,11 @@ def test_every_item_has_its_result_once(cluster):
     assert results(echo) == SQUARES
 
 
-def test_a_killed_worker_is_replaced_and_every_item_still_comes_once(cluster, tmp_path):
-    assert results(DiesOnce(19, tmp_path / "note")) == SQUARES
+@pytest.mark.parametrize(("number", "item"), [(WORKERS, 19), (1, 39)], ids=["two", "last of one"])
+def test_a_killed_worker_is_replaced_and_every_item_still_comes_once(
+    cluster, tmp_path, number, item
+):
+    assert results(DiesOnce(item, tmp_path / "note"), number=number) == SQUARES
     assert (tmp_path / "note").exists()
 
 
