@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
+from jaxsfm.failures import lost_at
 from jaxsfm.growing import Grown, Newcomer, grow
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap import colour_points, read_models, write_models
@@ -41,9 +42,10 @@ from jaxsfm.localize import (
     view_of,
 )
 from jaxsfm.page.after_run import page_after_run
+from jaxsfm.pair_outcomes import PairOutcomes
 from jaxsfm.pipeline import open_images
 from jaxsfm.reconstruction import pixel_scale
-from jaxsfm.report import lost_images, model_figures, pair_figures
+from jaxsfm.report import model_figures, pair_figures
 from jaxsfm.run import extract_missing, match_missing
 from jaxsfm.run_options import RunOptions
 
@@ -198,6 +200,17 @@ def _models(
     return models
 
 
+def _lost(name: str, grown: Grown, pairs: PairOutcomes) -> dict[str, Any]:
+    own = [pair for pair in pairs.results if name in pair]
+    best = pairs.best(own)
+    return {
+        "image": name,
+        "stage": "no pose",
+        "detail": grown.located[name].why or lost_at(own, True, pairs)[1],
+        "best_pair": best and pairs.row(best),
+    }
+
+
 def _report(
     kept: KeptRun,
     models: list[pycolmap.Reconstruction],
@@ -213,11 +226,15 @@ def _report(
     images, pairs = report["images"], report["pairs"]
     good = {pair for pair, each in counts.items() if each.num_inliers}
     rows = [pair_figures(p, c, good, dict(verified), {}) for p, c in counts.items()]
-    stages = lost_images(new.images, grown.placed, counts, verified)
-    lost = [
-        row | {"stage": "no pose", "detail": grown.located[row["image"]].why or row["detail"]}
-        for row in stages
-    ]
+    outcomes = PairOutcomes(
+        results=counts,
+        handed_on=good,
+        verified=verified,
+        verdicts={},
+        angles={},
+        min_inliers=report["options"]["config"]["min_inliers"],
+    )
+    lost = [_lost(name, grown, outcomes) for name in sorted(set(new.images) - set(grown.placed))]
     report |= {
         "images": images
         | {
