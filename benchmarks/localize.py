@@ -28,7 +28,8 @@ from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.store import SavedMatches
 from jaxsfm.host.viewgraph import trusted_pairs
 from jaxsfm.kept import KeptRun, read_run
-from jaxsfm.localize import choose_camera, known_model, locate_photo, reader
+from jaxsfm.known_run import choose_camera, known_model, reader
+from jaxsfm.localize import locate_photo
 from jaxsfm.localize_report import error_against, located_figures
 from jaxsfm.reconstruction import pixel_scale
 from jaxsfm.refine import refine_model

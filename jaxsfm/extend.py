@@ -16,24 +16,26 @@ from typing import Any, NamedTuple
 import pycolmap
 from tqdm import tqdm
 
+from jaxsfm.advice import Circumstances
+from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.failures import lost_at
+from jaxsfm.failures import explained
 from jaxsfm.growing import Grown, Newcomer, grow
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap import colour_points, read_models, write_models
 from jaxsfm.host.colmap_extend import add_images, add_matches
 from jaxsfm.host.images import ImageFile, read_image
 from jaxsfm.host.model import build_model
-from jaxsfm.host.pairs import Pair, make_pair
+from jaxsfm.host.pairs import Pair, PairCounts, make_pair
 from jaxsfm.host.poses import model_poses
 from jaxsfm.host.store import SavedMatches
 from jaxsfm.host.versions import versions
+from jaxsfm.host.viewgraph import Verdict
 from jaxsfm.host.workfolder import WorkFolder, open_folder
 from jaxsfm.kept import KeptRun, read_run
-from jaxsfm.localize import (
+from jaxsfm.known_run import (
     KnownModel,
-    LocalizeOptions,
     choose_camera,
     known_model,
     reader,
@@ -41,6 +43,7 @@ from jaxsfm.localize import (
     run_weights,
     view_of,
 )
+from jaxsfm.localize import LocalizeOptions
 from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pair_outcomes import PairOutcomes
 from jaxsfm.pipeline import open_images
@@ -97,8 +100,9 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
         progress=options.progress,
     )
     with open_folder(run, identity) as folder:
+        shortlist = options.chosen_shortlist(kept, weights, new)
         shortlists = {
-            name: options.shortlist(image, [n for n in sorted([*names, *new]) if n != name])
+            name: shortlist(image, [n for n in sorted([*names, *new]) if n != name])
             for name, image in new.items()
         }
         pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
@@ -200,17 +204,6 @@ def _models(
     return models
 
 
-def _lost(name: str, grown: Grown, pairs: PairOutcomes) -> dict[str, Any]:
-    own = [pair for pair in pairs.results if name in pair]
-    best = pairs.best(own)
-    return {
-        "image": name,
-        "stage": "no pose",
-        "detail": grown.located[name].why or lost_at(own, True, pairs)[1],
-        "best_pair": best and pairs.row(best),
-    }
-
-
 def _report(
     kept: KeptRun,
     models: list[pycolmap.Reconstruction],
@@ -226,15 +219,7 @@ def _report(
     images, pairs = report["images"], report["pairs"]
     good = {pair for pair, each in counts.items() if each.num_inliers}
     rows = [pair_figures(p, c, good, dict(verified), {}) for p, c in counts.items()]
-    outcomes = PairOutcomes(
-        results=counts,
-        handed_on=good,
-        verified=verified,
-        verdicts={},
-        angles={},
-        min_inliers=report["options"]["config"]["min_inliers"],
-    )
-    lost = [_lost(name, grown, outcomes) for name in sorted(set(new.images) - set(grown.placed))]
+    each = sorted([*pairs["each"], *rows], key=lambda row: row["pair"])
     report |= {
         "images": images
         | {
@@ -249,10 +234,20 @@ def _report(
             "verified": pairs["verified"] + len(good),
             "handed_on": pairs["handed_on"] + len(good),
             "overflowed": pairs["overflowed"] + sum(c.num_dropped > 0 for c in counts.values()),
-            "each": sorted([*pairs["each"], *rows], key=lambda row: row["pair"]),
+            "trusted": pairs["trusted"] and pairs["trusted"] + len(verified),
+            "each": each,
         },
         "models": figures,
-        "lost": sorted([*report["lost"], *lost], key=lambda row: row["image"]),
+        **explained(
+            [each["images"] for each in figures],
+            _outcomes(each, kept.config.min_inliers),
+            Circumstances(
+                config=kept.config,
+                pairs=report["options"]["pairs"],
+                known_camera=report["options"]["intrinsics"] is not None,
+                sizes=_sizes(kept, new),
+            ),
+        ),
         "extended": [
             *report.get("extended", []),
             {
@@ -264,6 +259,9 @@ def _report(
             },
         ],
     }
+    for row in report["lost"]:
+        if row["image"] in grown.located:
+            row["detail"] = grown.located[row["image"]].why or row["detail"]
     if kept.reference is not None:
         try:
             found = evaluate(model_poses(models[0]), kept.reference.poses)
@@ -271,3 +269,34 @@ def _report(
         except UserError as error:
             report["evaluation_failed"] = str(error)
     return report
+
+
+def _outcomes(rows: list[dict[str, Any]], min_inliers: int) -> PairOutcomes:
+    """What a report says of its pairs."""
+    named = {(row["pair"][0], row["pair"][1]): row for row in rows}
+    verdicts = {pair: row["view_graph"] for pair, row in named.items()}
+    return PairOutcomes(
+        results={
+            pair: PairCounts(
+                num_inliers=row["inliers"],
+                num_planes=row["planes"],
+                num_tentative=row["tentative"],
+                num_dropped=0,
+                status=Status[row["status"].upper()],
+            )
+            for pair, row in named.items()
+        },
+        handed_on={pair for pair, row in named.items() if row["handed_on"]},
+        verified={pair: n for pair, row in named.items() if (n := row["colmap_inliers"])},
+        verdicts={pair: Verdict(**verdict) for pair, verdict in verdicts.items() if verdict},
+        angles={},
+        min_inliers=min_inliers,
+    )
+
+
+def _sizes(kept: KeptRun, new: _New) -> dict[str, tuple[int, int]]:
+    """Of every usable image that is still there."""
+    skipped = kept.report["images"]["skipped"]
+    old = kept.report["identity"]["images"].keys() - skipped.keys()
+    every = {name: kept.photos.file(name) for name in old} | dict(new.images)
+    return {name: image.size for name, image in sorted(every.items()) if image is not None}

@@ -49,7 +49,7 @@ def lost_images(
         connected = bool(group.images & best_model) or not best_model
         advice: list[Help] | None = None  # of a group that is not connected: the same for all of it
         for name in sorted(group.images - best_model):
-            stage, detail = lost_at(own[name], connected, pairs)
+            stage, detail = _stage(name, own[name], connected, pairs)
             if stage != "no pose":
                 advice = advice or towards_others(group.images, group.crossing, pairs, made)
                 found = advice
@@ -73,13 +73,8 @@ def lost_images(
     return sorted(rows, key=lambda row: row["image"])
 
 
-def lost_at(own: Sequence[Pair], connected: bool, pairs: PairOutcomes) -> tuple[str, str]:
-    """The stage that lost an image, and the numbers in words.
-
-    Args:
-      own: the pairs tried with it.
-      connected: whether trusted pairs lead from it to the model.
-    """
+def _stage(name: str, own: Sequence[Pair], connected: bool, pairs: PairOutcomes) -> tuple[str, str]:
+    """Where an image was lost, and the numbers in words."""
     results = [pairs.results[pair] for pair in own]
     tentative = max((r.num_tentative for r in results), default=0)
     if not own:

@@ -62,6 +62,12 @@ class Photos:
             return None
         return image if image.sha256 == self._hashes.get(name) else None
 
+    def recorded(self, name: str) -> ImageFile:
+        """A photo as the run found it; nobody looks whether it is still there. Its size is not
+        known."""
+        path = (self.folder or Path()) / name
+        return ImageFile(name=name, path=path, size=(0, 0), sha256=self._hashes[name])
+
     def called(self, sha256: str) -> str | None:
         """What the run calls a photo of that content."""
         return next((name for name, each in self._hashes.items() if each == sha256), None)

@@ -6,54 +6,48 @@ photos of the same call.
 """
 
 import dataclasses
-import functools
 import importlib.metadata
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
-from jaxsfm.config import Config, Refinement
+from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
 from jaxsfm.extraction import extracted, image_features
-from jaxsfm.host.colmap import camera_for
 from jaxsfm.host.features import ImageFeatures, room_of
 from jaxsfm.host.images import (
     ImageError,
     ImageFile,
     find_images,
     inspect_image,
-    read_image,
-    shown_name,
-    working_size,
 )
-from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
-from jaxsfm.host.model import Tracks, View, read_model_arrays
+from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.pairs import Pair, PairResult
-from jaxsfm.host.poses import read_model
 from jaxsfm.host.store import Store
-from jaxsfm.host.weights import Weights, chosen_weights
+from jaxsfm.host.weights import Weights
 from jaxsfm.kept import KeptRun, read_run
+from jaxsfm.known_run import (
+    ChosenCamera,
+    KnownModel,
+    Shortlist,
+    by_similarity,
+    choose_camera,
+    known_model,
+    reader,
+    run_files,
+    run_weights,
+    view_of,
+)
 from jaxsfm.localize_report import UNUSABLE, error_against, located_figures
 from jaxsfm.matching import matched
-from jaxsfm.patches import ReadGray, gray
+from jaxsfm.patches import ReadGray
 from jaxsfm.single_view import Located, locate, part_of
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
-
-GRAYS = 64
-"""Decoded images kept in memory: 8 MB each at 1600 x 1200."""
-Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
-"""A photo and the names of the model's photos -> those that it is matched with."""
-
-
-def everything(_: ImageFile, names: Sequence[str]) -> Sequence[str]:
-    """The shortlist of small models."""
-    return names
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,82 +62,19 @@ class LocalizeOptions:
     reference: Path | None = None
     """Reference poses of the photos and of the run's."""
     network: WeightsChoice = USUAL_WEIGHTS
-    shortlist: Shortlist = everything
+    shortlist: Shortlist | int = 20
+    """Photos that a new one is matched with; a number: the most similar ones."""
+
+    def chosen_shortlist(
+        self, run: KeptRun, weights: Weights, new: Mapping[str, ImageFile]
+    ) -> Shortlist:
+        """As a function; `new` as in `by_similarity`."""
+        if isinstance(self.shortlist, int):
+            return by_similarity(run, weights, self.shortlist, new, self.execution)
+        return self.shortlist
+
     execution: Execution = dataclasses.field(default_factory=Execution)
     progress: bool = False
-
-
-class KnownModel(NamedTuple):
-    """The best model of a run, in working pixels."""
-
-    views: list[View]
-    tracks: Tracks
-    config: Config
-    seed: int
-
-
-class ChosenCamera(NamedTuple):
-    """A photo's camera before it is localized."""
-
-    camera: Any
-    """pycolmap.Camera."""
-    source: str
-    """given, run, exif or guess."""
-
-    @property
-    def own(self) -> bool:
-        """Whether its focal length is estimated."""
-        return self.source in ("exif", "guess")
-
-
-def known_model(folder: Path, config: Config, *, seed: int = 0) -> KnownModel:
-    """A COLMAP model on disk, seen in the working pixels of a config.
-
-    Raises:
-      UserError: no readable model in `folder`.
-    """
-    model = read_model(folder)
-    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    sizes = {}
-    for name, camera in cameras.items():
-        width, height = working_size((camera.width, camera.height), config.max_size, config.enlarge)
-        sizes[name] = (width, height), (camera.width / width, camera.height / height)
-    return KnownModel(*read_model_arrays(model, sizes), config, seed)
-
-
-def choose_camera(
-    image: ImageFile, views: Sequence[View], intrinsics: Intrinsics | None
-) -> ChosenCamera:
-    """The given camera; else the model's, if it has one for all and of this size; else one from
-    EXIF or a guess.
-
-    Raises:
-      UserError: the given one does not fit.
-    """
-    if intrinsics is not None:
-        check_fits(intrinsics, {image.name: image.size})
-        return ChosenCamera(intrinsics.camera(image.size), "given")
-    shared = {view.camera.camera_id: view.camera for view in views}
-    if len(shared) == 1 and len(views) > 1:
-        (camera,) = shared.values()
-        if (camera.width, camera.height) == image.size:
-            return ChosenCamera(camera, "run")
-    camera = camera_for(image, None)
-    return ChosenCamera(camera, "exif" if camera.has_prior_focal_length else "guess")
-
-
-def view_of(image: ImageFile, chosen: ChosenCamera, config: Config) -> View:
-    """A photo that has no pose yet."""
-    width, height = working_size(image.size, config.max_size, config.enlarge)
-    return View(
-        image_id=0,
-        name=image.name,
-        rotation=np.eye(3),
-        centre=np.zeros(3),
-        camera=chosen.camera,
-        scale=np.asarray([image.size[0] / width, image.size[1] / height]),
-        size=(width, height),
-    )
 
 
 def locate_photo(
@@ -166,21 +97,6 @@ def locate_photo(
         own_camera=chosen.own,
         seed=model.seed,
     )
-
-
-def run_weights(run: KeptRun, choice: WeightsChoice) -> Weights:
-    """Those of the run, or UserError."""
-    config = run.config
-    weights = chosen_weights(choice, config.backbone)
-    made_with, now = run.report["weights"], weights.described(config)
-    for key, option in (("sha256", "--weights"), ("relocalizer_sha256", "--relocalizer")):
-        if made_with.get(key) != now[key]:
-            raise UserError(
-                f"{run.folder}: was made with other weights (SHA-256 "
-                f"{str(made_with.get(key))[:12]}..., not {str(now[key])[:12]}...); give them with "
-                f"{option}"
-            )
-    return weights
 
 
 def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, str]]:
@@ -228,31 +144,6 @@ def _features(
         yield load
 
 
-def run_files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
-    """The run's photos, or UserError for one that is gone."""
-    files = {}
-    for name in names:
-        image = run.photos.file(name)
-        if image is None:
-            raise UserError(
-                f"{shown_name(name)}: gone or changed since the run (looked in "
-                f"{run.photos.folder}); say where the run's photos are with --images"
-            )
-        files[name] = image
-    return files
-
-
-def reader(files: Mapping[str, ImageFile], config: Config) -> ReadGray:
-    """Intensities of working images by name; the last GRAYS stay in memory."""
-
-    @functools.lru_cache(maxsize=GRAYS)
-    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        working = read_image(files[name], max_size=config.max_size, enlarge=config.enlarge)
-        return gray(working.rgb), working.scale
-
-    return read
-
-
 def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> dict[str, Any]:
     """Localize photos in a finished run; returns plain JSON, a row for each photo.
 
@@ -274,10 +165,11 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     cameras = {path: choose_camera(i, model.views, intrinsics) for path, i in usable.items()}
     weights = run_weights(kept, options.network)
     names = [view.name for view in model.views]
-    shortlists = {}
+    shortlists, unknown = {}, {image.name: image for image in usable.values()}
+    shortlist = options.chosen_shortlist(kept, weights, unknown)
     for path, image in usable.items():
         own = kept.photos.called(image.sha256)
-        shortlists[path] = options.shortlist(image, [name for name in names if name != own])
+        shortlists[path] = shortlist(image, [name for name in names if name != own])
     files = run_files(kept, sorted({name for some in shortlists.values() for name in some}))
     rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
     with _features(kept, weights, files, options) as load:

@@ -16,6 +16,7 @@ def localize(
     images: Path | None = None,
     intrinsics: str | None = None,
     reference: Path | None = None,
+    shortlist: int = 20,
     network: WeightsChoice = USUAL_WEIGHTS,
 ) -> int:
     """Where photos were taken, in the model of a finished run, which stays as it is.
@@ -34,6 +35,7 @@ def localize(
         and it fits, else one per photo, whose focal length is estimated.
       reference: Reference poses (Strecha .camera files or a COLMAP model) of these photos and of
         the run's: errors are told.
+      shortlist: How many of the run's photos, the most similar ones, a photo is matched with.
       network: The network's parameters; they must be the run's.
     """
     check_writable(out, "--out", (".json",))
@@ -45,6 +47,7 @@ def localize(
         images=images,
         intrinsics=intrinsics,
         reference=reference,
+        shortlist=shortlist,
         network=network,
         progress=True,
     )
@@ -62,6 +65,7 @@ def extend(
     run: Positional[Path],
     *,
     images: Path | None = None,
+    shortlist: int = 20,
     network: WeightsChoice = USUAL_WEIGHTS,
 ) -> int:
     """Put photos that were added to a finished run's folder since into its model.
@@ -74,13 +78,14 @@ def extend(
     Args:
       run: A run's folder.
       images: Folder with the photos, old and new; default: where the run found them.
+      shortlist: How many others, the most similar ones, a new photo is matched with.
       network: The network's parameters; they must be the run's.
     """
     from jaxsfm.extend import extend
     from jaxsfm.host.images import shown_name
     from jaxsfm.localize import LocalizeOptions
 
-    options = LocalizeOptions(images=images, network=network, progress=True)
+    options = LocalizeOptions(images=images, shortlist=shortlist, network=network, progress=True)
     report = extend(run, options=options)
     if report is None:
         print(f"no new photos for {run}")

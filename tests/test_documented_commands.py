@@ -29,6 +29,7 @@ PAGES = (
 LONG = (
     "jaxsfm.run.run_folder",
     "jaxsfm.demo.run_demo",
+    "jaxsfm.retrieval.shortlist",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.extraction.image_features",
     "jaxsfm.datasets.fetch",

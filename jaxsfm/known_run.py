@@ -1,0 +1,188 @@
+"""What placing photos in a finished run needs of it: its model, weights, photos, and which of them
+may show the same as a new one.
+"""
+
+import functools
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.core.pooling import TIE
+from jaxsfm.errors import UserError
+from jaxsfm.execution import Execution
+from jaxsfm.global_descriptors import GEM
+from jaxsfm.host.colmap import camera_for
+from jaxsfm.host.images import ImageError, ImageFile, read_image, shown_name, working_size
+from jaxsfm.host.intrinsics import Intrinsics, check_fits
+from jaxsfm.host.model import Tracks, View, read_model_arrays
+from jaxsfm.host.poses import read_model
+from jaxsfm.host.store import Store
+from jaxsfm.host.weights import Weights, chosen_weights
+from jaxsfm.kept import KeptRun
+from jaxsfm.patches import ReadGray, gray
+from jaxsfm.retrieval import described
+from jaxsfm.weights_choice import WeightsChoice
+
+GRAYS = 64
+"""Decoded images kept in memory: 8 MB each at 1600 x 1200."""
+
+Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
+"""A photo and the names of the model's photos -> those that it is matched with."""
+
+
+class KnownModel(NamedTuple):
+    """The best model of a run, in working pixels."""
+
+    views: list[View]
+    tracks: Tracks
+    config: Config
+    seed: int
+
+
+class ChosenCamera(NamedTuple):
+    """A photo's camera before it is localized."""
+
+    camera: Any
+    """pycolmap.Camera."""
+    source: str
+    """given, run, exif or guess."""
+
+    @property
+    def own(self) -> bool:
+        """Whether its focal length is estimated."""
+        return self.source in ("exif", "guess")
+
+
+def known_model(folder: Path, config: Config, *, seed: int = 0) -> KnownModel:
+    """A COLMAP model on disk, seen in the working pixels of a config.
+
+    Raises:
+      UserError: no readable model in `folder`.
+    """
+    model = read_model(folder)
+    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    sizes = {}
+    for name, camera in cameras.items():
+        width, height = working_size((camera.width, camera.height), config.max_size, config.enlarge)
+        sizes[name] = (width, height), (camera.width / width, camera.height / height)
+    return KnownModel(*read_model_arrays(model, sizes), config, seed)
+
+
+def choose_camera(
+    image: ImageFile, views: Sequence[View], intrinsics: Intrinsics | None
+) -> ChosenCamera:
+    """The given camera; else the model's, if it has one for all and of this size; else one from
+    EXIF or a guess.
+
+    Raises:
+      UserError: the given one does not fit.
+    """
+    if intrinsics is not None:
+        check_fits(intrinsics, {image.name: image.size})
+        return ChosenCamera(intrinsics.camera(image.size), "given")
+    shared = {view.camera.camera_id: view.camera for view in views}
+    if len(shared) == 1 and len(views) > 1:
+        (camera,) = shared.values()
+        if (camera.width, camera.height) == image.size:
+            return ChosenCamera(camera, "run")
+    camera = camera_for(image, None)
+    return ChosenCamera(camera, "exif" if camera.has_prior_focal_length else "guess")
+
+
+def view_of(image: ImageFile, chosen: ChosenCamera, config: Config) -> View:
+    """A photo that has no pose yet."""
+    width, height = working_size(image.size, config.max_size, config.enlarge)
+    return View(
+        image_id=0,
+        name=image.name,
+        rotation=np.eye(3),
+        centre=np.zeros(3),
+        camera=chosen.camera,
+        scale=np.asarray([image.size[0] / width, image.size[1] / height]),
+        size=(width, height),
+    )
+
+
+def run_weights(run: KeptRun, choice: WeightsChoice) -> Weights:
+    """Those of the run, or UserError."""
+    config = run.config
+    weights = chosen_weights(choice, config.backbone)
+    made_with, now = run.report["weights"], weights.described(config)
+    for key, option in (("sha256", "--weights"), ("relocalizer_sha256", "--relocalizer")):
+        if made_with.get(key) != now[key]:
+            raise UserError(
+                f"{run.folder}: was made with other weights (SHA-256 "
+                f"{str(made_with.get(key))[:12]}..., not {str(now[key])[:12]}...); give them with "
+                f"{option}"
+            )
+    return weights
+
+
+def run_files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
+    """The run's photos, or UserError for one that is gone."""
+    files = {}
+    for name in names:
+        image = run.photos.file(name)
+        if image is None:
+            raise UserError(
+                f"{shown_name(name)}: gone or changed since the run (looked in "
+                f"{run.photos.folder}); say where the run's photos are with --images"
+            )
+        files[name] = image
+    return files
+
+
+def reader(files: Mapping[str, ImageFile], config: Config) -> ReadGray:
+    """Intensities of working images by name; the last GRAYS stay in memory."""
+
+    @functools.lru_cache(maxsize=GRAYS)
+    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        working = read_image(files[name], max_size=config.max_size, enlarge=config.enlarge)
+        return gray(working.rgb), working.scale
+
+    return read
+
+
+def by_similarity(
+    run: KeptRun, weights: Weights, k: int, new: Mapping[str, ImageFile], execution: Execution
+) -> Shortlist:
+    """The `k` most similar photos by GeM, which describes each photo by itself; equally similar
+    ones by name. The run's photos are described once and kept in its folder.
+
+    Args:
+      new: photos that the run does not know, by name.
+
+    Raises:
+      UserError: k is less than 1.
+    """
+    if k < 1:
+        raise UserError(f"--shortlist must be at least 1; got {k}")
+
+    def describe(images: Sequence[ImageFile], store: Store) -> dict[str, np.ndarray]:
+        found = described(weights, images, kind="gem", store=store, execution=execution)
+        for _, why in found.lost:
+            raise ImageError(why)
+        return found.vectors
+
+    @functools.cache
+    def of(name: str) -> np.ndarray:
+        if name in new:
+            with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
+                store = Store(Path(scratch), run.report["identity"])
+                return describe([new[name]], store)[name]
+        unread = run.photos.recorded(name)
+        kept = run.matches.load_descriptor(unread, GEM)
+        image = run_files(run, [name])[name] if kept is None else unread
+        return describe([image], run.matches)[name]
+
+    def shortlist(image: ImageFile, names: Sequence[str]) -> Sequence[str]:
+        if k >= len(names):
+            return names
+        own = of(image.name)
+        return sorted(names, key=lambda name: (-round(float(of(name) @ own) / TIE), name))[:k]
+
+    return shortlist
