@@ -1,7 +1,6 @@
 """The command `export`: a run's model and matches in other tools' formats."""
 
 import contextlib
-import json
 import os
 import shutil
 import tempfile
@@ -94,10 +93,11 @@ def _new_folder(path: Path) -> Iterator[Path]:
 
 def _recorded_photos(run: Path) -> Path | None:
     """The photos' folder of a run, if it says and they are still there."""
+    from jaxsfm.reported import PHOTOS, read_report
+
     try:
-        report = json.loads((run / "report.json").read_text(encoding="utf-8"))
-        folder = Path(report["images"]["folder"])
-    except (OSError, ValueError, KeyError, TypeError):  # a model of COLMAP's, or an older run
+        folder = Path(read_report(run, PHOTOS)["images"]["folder"])
+    except UserError:  # a model of COLMAP's, or an older run
         return None
     return folder if folder.is_dir() else None
 
@@ -162,15 +162,15 @@ def _export_folder(
 def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -> None:
     from jaxsfm.host.formats.hloc import write_hloc
     from jaxsfm.host.images import working_size
+    from jaxsfm.reported import SIZES, read_report
 
     tables = _tables(run)
     if tables is None:
         raise UserError(f"{run}: no database.db here, whose matches hloc would get")
     try:
-        report = json.loads((run / "report.json").read_text(encoding="utf-8"))
-        config = report["options"]["config"]
-        limits = int(config["max_size"]), float(config["enlarge"])
-    except (OSError, ValueError, KeyError, TypeError):  # not a run of ours: the photos' own pixels
+        config = read_report(run, SIZES)["options"]["config"]
+        limits = config["max_size"], float(config["enlarge"])
+    except UserError:  # not a run of ours: the photos' own pixels
         limits = 2**31, 1.0
     scales = {s: max(s) / max(working_size(s, *limits)) for s in set(tables.sizes.values())}
     chosen = tables.matches if matches == "all" else tables.inliers

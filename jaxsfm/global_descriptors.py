@@ -33,9 +33,10 @@ SIDE, NETVLAD_SIDE = 480, 640
 (docs/guide/many-photos.md); NetVLAD's authors describe photos of 640 x 480."""
 SAMPLE = 1 << 14
 """Local descriptors that a vocabulary is fitted on, over all photos: 34 MB, however many."""
-GEM = f"gem {SIDE}"
 CELLS = f"cells {SIDE}"
-"""What GeM's and local descriptors are called in the store."""
+"""What local descriptors are called in the store."""
+GEM = f"gem {SIDE}"
+"""What its descriptors are called in the store."""
 Found = dict[str, np.ndarray]
 """Descriptors by content (SHA-256)."""
 _gem, _vlad, _netvlad, _fit = (jax.jit(f) for f in (gem, vlad, netvlad, fit_vocabulary))

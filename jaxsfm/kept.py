@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,10 +18,9 @@ from jaxsfm.host.pairs import Pair, PairResult
 from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.host.store import Store
 from jaxsfm.host.workfolder import RECORD
+from jaxsfm.reported import read_report
 
 logger = logging.getLogger(__name__)
-REPORTED = {"options", "identity", "images", "pairs", "models"}
-"""What every report has."""
 
 
 class Model(NamedTuple):
@@ -119,14 +117,6 @@ class KeptRun:
         return self.matches.load_matches(pair)
 
 
-def _json(path: Path) -> dict[str, Any] | None:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
-
-
 def _model(folder: Path) -> tuple[Model, Poses] | None:
     if not (folder / "sparse" / "0").is_dir():
         return None
@@ -169,9 +159,7 @@ def read_run(folder: Path, *, images: Path | None = None, reference: Path | None
     Raises:
       UserError: no finished run, or what was named cannot be used.
     """
-    report = _json(folder / "report.json")
-    if report is None or not REPORTED <= report.keys():
-        raise UserError(f"{folder}: no finished run here (report.json is missing or damaged)")
+    report = read_report(folder)
     if images is not None and not images.is_dir():
         raise UserError(f"--images {images}: no such folder")
     home = folder if (folder / RECORD).exists() else folder.parent

@@ -51,7 +51,10 @@ def connected(address: str | None) -> Iterator["ModuleType"]:
             ray.init(address=address, logging_level=logging.CRITICAL, log_to_driver=False)
     except (ConnectionError, RuntimeError, ValueError) as error:
         why = str(error).strip().partition("\n")[0]
-        raise UserError(f"--engine ray: Ray cannot be used ({why})") from error
+        raise UserError(
+            f"--engine ray: Ray cannot be used ({why}); a cluster with a token wants RAY_AUTH_MODE="
+            "token here too"
+        ) from error
     try:
         yield ray
     finally:

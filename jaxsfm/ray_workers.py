@@ -110,8 +110,9 @@ class Crew:
             try:
                 interrupt.check()
                 self._give(todo)
-                if self._all_given and not any(slot.running for slot in self._slots):
-                    return
+                if self._all_given and not self._again:
+                    if not any(slot.running for slot in self._slots):
+                        return
                 found = self._next()
             except BaseException:
                 yield from self._come()
@@ -165,7 +166,7 @@ class Crew:
             del self._losses[slot]
             return [(item, result)]
         except errors.RayTaskError as error:
-            raise (error.cause or error) from None
+            raise (error.cause or error) from error
         except errors.RayError as error:
             self._lost(slot, error)
             return []

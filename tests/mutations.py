@@ -1,5 +1,6 @@
 """Damage done to files by seed, and the cases of a fuzz test that can each be repeated alone."""
 
+import copy
 import json
 import os
 import zlib
@@ -114,7 +115,7 @@ def damaged_json(value: Any, rng: np.random.Generator) -> bytes:
 
 def _changed(value: Any, rng: np.random.Generator) -> Any:
     if not isinstance(value, dict | list) or not value or rng.random() < 0.2:
-        return WRONG[rng.integers(len(WRONG))]
+        return copy.deepcopy(WRONG[rng.integers(len(WRONG))])
     keys = list(value) if isinstance(value, dict) else range(len(value))
     key = keys[int(rng.integers(len(keys)))]
     if rng.random() < 0.2:

@@ -31,6 +31,7 @@ LONG = (
     "jaxsfm.demo.run_demo",
     "jaxsfm.localize.localize",
     "jaxsfm.extend.extend",
+    "jaxsfm.retrieval.shortlist",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.extraction.image_features",
     "jaxsfm.datasets.fetch",

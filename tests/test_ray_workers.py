@@ -14,7 +14,7 @@ from jaxsfm import ray_workers
 from jaxsfm.cli import main
 from jaxsfm.errors import UserError
 from jaxsfm.host import interrupt
-from jaxsfm.ray_cluster import connected
+from jaxsfm.ray_cluster import connected, threads
 from jaxsfm.ray_workers import AHEAD, LOSSES, Piece, crew
 
 pytest.importorskip("ray")
@@ -64,6 +64,11 @@ class Fails:
         yield
 
 
+def threads_there(items, objects):
+    for item in items:
+        yield item, os.environ["NPROC"]
+
+
 def pieces(workers, count: int, size: int = 3) -> Iterator[Piece]:
     for start in range(0, count, size):
         items = range(start, min(count, start + size))
@@ -79,8 +84,8 @@ def noted(all_pieces: Iterator[Piece], given: list) -> Iterator[Piece]:
 SQUARES = [(k, k * k) for k in range(40)]
 
 
-def results(work, count: int = 40) -> list:
-    with crew(work, address=None, workers=WORKERS) as workers:
+def results(work, count: int = 40, number: int = WORKERS) -> list:
+    with crew(work, address=None, workers=number) as workers:
         return sorted(workers.results(pieces(workers, count)))
 
 
@@ -88,9 +93,19 @@ def test_every_item_has_its_result_once(cluster):
     assert results(echo) == SQUARES
 
 
-def test_a_killed_worker_is_replaced_and_every_item_still_comes_once(cluster, tmp_path):
-    assert results(DiesOnce(19, tmp_path / "note")) == SQUARES
+@pytest.mark.parametrize(("number", "item"), [(WORKERS, 19), (1, 39)], ids=["two", "last of one"])
+def test_a_killed_worker_is_replaced_and_every_item_still_comes_once(
+    cluster, tmp_path, number, item
+):
+    assert results(DiesOnce(item, tmp_path / "note"), number=number) == SQUARES
     assert (tmp_path / "note").exists()
+
+
+def test_workers_compute_with_as_many_threads_as_this_process(cluster, monkeypatch):
+    """With one thread instead of two, features differ in their last place."""
+    assert set(results(threads_there, 3)) == {(k, str(threads())) for k in range(3)}
+    monkeypatch.setenv("NPROC", "7")
+    assert set(results(threads_there, 3)) == {(k, "7") for k in range(3)}
 
 
 def test_few_pieces_are_out_at_a_time(cluster):

@@ -1,6 +1,8 @@
 """Files and folders that appear whole or not at all, whenever the process is killed."""
 
 import contextlib
+import json
+import math
 import os
 import shutil
 import zipfile
@@ -14,7 +16,6 @@ from jaxsfm.errors import UserError
 
 PARTIAL = ".partial"
 """Ends the name of what is being written."""
-_DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile)
 
 
 @contextlib.contextmanager
@@ -55,11 +56,35 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """What `save_arrays` wrote; None if there is none or it is damaged. Never unpickles."""
+    """What `save_arrays` wrote; None if there is none or it is damaged. Never unpickles, and
+    allocates no more than the file is long."""
     try:
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                _check_member(archive, info)
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except _DAMAGED:
+    except Exception:  # damage raises nearly anything: struct.error, TokenError, MemoryError, ...
+        return None
+
+
+def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
+    """ValueError unless an array takes the room in the file that its header says."""
+    with archive.open(info) as file:
+        read = np.lib.format
+        version = read.read_magic(file)  # pyright: ignore[reportArgumentType]
+        head = read.read_array_header_1_0 if version == (1, 0) else read.read_array_header_2_0
+        shape, _, dtype = head(file)  # pyright: ignore[reportArgumentType]
+        stored = info.compress_type == zipfile.ZIP_STORED and min(shape, default=0) >= 0
+        if not stored or file.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
+            raise ValueError(f"{info.filename}: {info.file_size} bytes for {shape} {dtype}")
+
+
+def read_json(path: Path) -> Any:
+    """The content of a file, None where it cannot be read as JSON."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
         return None
 
 

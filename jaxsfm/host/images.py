@@ -7,6 +7,7 @@ stored, so keypoints, intrinsics and COLMAP's own tools agree.
 import contextlib
 import dataclasses
 import hashlib
+import io
 import logging
 import os
 import re
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
@@ -109,14 +110,17 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
         data = path.read_bytes()
     except OSError as error:
         raise ImageError(f"{shown}: cannot be read ({error.strerror})") from error
+    except ValueError as error:  # no path can hold such a name
+        raise ImageError(f"{shown}: not a file's name") from error
     if not data:
         raise ImageError(f"{shown}: the file is empty")
     try:
         with warnings.catch_warnings(), _any_size():
             warnings.simplefilter("ignore")  # odd metadata; only the size is wanted
-            with Image.open(path) as header:
+            # Not the path: reading from a file allocates what the header asks for.
+            with Image.open(io.BytesIO(data)) as header:
                 size = header.size
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+    except Exception as error:  # its readers of fifty formats raise nearly anything
         raise ImageError(f"{shown}: not a readable image") from error
     if min(size) < MIN_SIDE:
         raise ImageError(

@@ -18,6 +18,10 @@ NO_POINT = 2**64 - 1
 """Of a keypoint without a 3-D point."""
 
 
+ABSURD = 1e100
+"""Squares of such numbers are still finite."""
+
+
 class Damaged(ValueError):
     """What is wrong with a file, in words."""
 
@@ -39,12 +43,12 @@ class _Reader:
         return start
 
     def values(self, layout: str) -> tuple:
-        """Values by `struct`'s letters; finite ones."""
+        """Values by `struct`'s letters."""
         found = struct.unpack_from(
             "<" + layout, self.data, self.skip(struct.calcsize("<" + layout))
         )
-        if not np.isfinite([v for v in found if isinstance(v, float)]).all():
-            raise self.bad("a number in it is not finite")
+        if not all(abs(v) < ABSURD for v in found if isinstance(v, float)):
+            raise self.bad("a number in it is absurd")
         return found
 
     def number(self) -> int:

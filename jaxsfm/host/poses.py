@@ -53,7 +53,12 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
     try:
         if (path / "images.bin").is_file():
             check_binary(path)
-        return pycolmap.Reconstruction(path)
+        model = pycolmap.Reconstruction(path)
+        if not all(
+            np.isfinite([*p.rotation.flat, *p.centre]).all() for p in model_poses(model).values()
+        ):
+            raise Damaged("a pose that is not finite")
+        return model
     except Damaged as error:
         raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
     except Exception as error:  # native errors of several kinds; the text is long and technical

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
-from jaxsfm.host.atomic import PARTIAL, load_arrays, save_arrays, write_atomic
+from jaxsfm.host.atomic import PARTIAL, load_arrays, read_json, save_arrays, write_atomic
 from jaxsfm.host.features import ImageFeatures
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import Pair, PairResult, describe
@@ -89,10 +89,10 @@ class Store:
             )
             rest = (found[name] for name in DenseFeatures._fields if name not in _OCTAVES)
             dense = DenseFeatures(coarse, fine, *rest)
-            x, y = found["scale"]
+            x, y = found["scale"].tolist()
         except (KeyError, ValueError, TypeError):
             return None
-        return ImageFeatures(image, (float(x), float(y)), dense)
+        return ImageFeatures(image, (x, y), dense) if _are_features(dense, (x, y)) else None
 
     def drop_features(self) -> None:
         """Delete them, those of former options too: every pair has its matches."""
@@ -113,10 +113,7 @@ class Store:
     # -- photos that could not be decoded --------------------------------------------------------
 
     def _unusable(self) -> dict[str, str]:
-        try:
-            record = json.loads((self.path / "unusable.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
+        record = read_json(self.path / "unusable.json")
         return record if isinstance(record, dict) else {}
 
     def why_unusable(self, image: ImageFile) -> str | None:
@@ -153,8 +150,8 @@ class Store:
         try:
             if found is None:
                 return None
-            tentative, dropped, status = (int(v) for v in found["counts"])
-            return PairResult(
+            tentative, dropped, status = found["counts"].tolist()
+            result = PairResult(
                 pair=pair,
                 **{name: found[name] for name in _RESULT},
                 num_tentative=tentative,
@@ -163,6 +160,46 @@ class Store:
             )
         except (KeyError, ValueError, TypeError):
             return None
+        return result if _are_matches(result) else None
+
+
+def _is(array: Any, dtype: type, *shape: int) -> bool:
+    return array.dtype == dtype and array.shape == shape and bool(np.isfinite(array).all())
+
+
+def _are_matches(found: PairResult) -> bool:
+    """Whether a pair's result is one that COLMAP takes: a file of other arrays is damaged."""
+    n, planes = len(found.plane.ravel()), len(np.atleast_1d(found.homographies))
+    return (
+        all(type(v) is int and v >= 0 for v in (found.num_tentative, found.num_dropped))
+        and _is(found.cells, np.int32, n, 2)
+        and bool((found.cells >= 0).all())
+        and all(len(np.unique(column)) == n for column in found.cells.T)
+        and _is(found.keypoints0, np.float32, n, 2)
+        and _is(found.keypoints1, np.float32, n, 2)
+        and _is(found.homographies, np.float64, planes, 3, 3)
+        and _is(found.plane, np.int32, n)
+        and bool(((found.plane >= 0) & (found.plane < planes)).all())
+    )
+
+
+def _are_features(dense: DenseFeatures, scale: tuple[float, float]) -> bool:
+    """Whether arrays are features by shape and type; of descriptors the values are not looked at,
+    whose checksums are right (they are 25 MB)."""
+    every = (*dense.coarse, *dense.fine)
+    if not dense.coarse or any(a.ndim != 2 or a.dtype != every[0].dtype for a in every):
+        return False
+    cells = len(dense.fine[0])
+    grids = (dense.coarse_grid, dense.fine_grid)
+    return (
+        all(type(v) is float and 0 < v < np.inf for v in scale)
+        and every[0].dtype in (np.float16, np.float32)
+        and all(len({a.shape[1] for a in octaves}) == 1 for octaves in (dense.coarse, dense.fine))
+        and _is(dense.keypoints, np.float32, cells, 2)
+        and all(_is(grid, np.int32, 2) and bool((grid > 0).all()) for grid in grids)
+        and int(dense.coarse_grid.prod(dtype=np.int64)) <= len(dense.coarse[0])
+        and int(dense.fine_grid.prod(dtype=np.int64)) <= cells
+    )
 
 
 class SavedMatches(Mapping[Pair, PairResult]):

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.atomic import PARTIAL, atomic_folder, write_atomic
-from jaxsfm.host.store import Identity, Store
+from jaxsfm.host.atomic import PARTIAL, atomic_folder, read_json, write_atomic
+from jaxsfm.host.hashes import sha256_of
+from jaxsfm.host.store import Identity, Store, digest
 
 logger = logging.getLogger(__name__)
 
@@ -20,7 +21,7 @@ RECORD = "run.json"
 PAGE = "report.html"
 """Written after the other results, from them (`jaxsfm.page`)."""
 RESULTS = (PAGE, "report.json", "sparse", "database.db")
-_MOVES = "moves.json"
+_MOVES, _KEY = "moves.json", "key"
 
 
 class WorkFolder(Store):
@@ -29,24 +30,24 @@ class WorkFolder(Store):
     # -- stages after matching -------------------------------------------------------------------
 
     def stage(self, name: str, key: str) -> Path | None:
-        """The folder of a finished stage, if it was made from what `key` says."""
+        """The folder of a finished stage, if it was made from what `key` says and is whole."""
         folder = self.path / "stages" / name
         try:
-            found = (folder / "key").read_text(encoding="ascii")
+            found = (folder / _KEY).read_text(encoding="ascii")
+            return folder if found == f"{key} {_content(folder)}" else None
         except (OSError, ValueError):
             return None
-        return folder if found == key else None
 
     @contextlib.contextmanager
     def record_stage(self, name: str, key: str) -> Iterator[Path]:
         """A folder for a stage's files; it takes the place of the former one when it is whole."""
         with atomic_folder(self.path / "stages" / name) as fresh:
             yield fresh
-            (fresh / "key").write_text(key, encoding="ascii")
+            (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
 
     def forget_stage(self, name: str) -> None:
         """It is made again the next time."""
-        (self.path / "stages" / name / "key").unlink(missing_ok=True)
+        (self.path / "stages" / name / _KEY).unlink(missing_ok=True)
 
     # -- results ---------------------------------------------------------------------------------
 
@@ -75,11 +76,11 @@ class WorkFolder(Store):
     def finish_publishing(self) -> None:
         """Move complete results to where they belong, as far as that has not been done."""
         made = self.path / "publishing"
-        if not (made / _MOVES).exists():
+        moves = read_json(made / _MOVES)
+        if not isinstance(moves, dict) or not isinstance(moves.get("names"), list):
             _remove(made)
             return
-        moves = json.loads((made / _MOVES).read_text(encoding="utf-8"))
-        target = self.path / "failed" if moves["failed"] else self.path
+        target = self.path / "failed" if moves.get("failed") else self.path
         target.mkdir(exist_ok=True)
         for name in RESULTS:  # the report goes first and comes last: it never tells of other files
             if name not in moves["names"] or (made / name).exists():
@@ -89,6 +90,12 @@ class WorkFolder(Store):
                 (made / name).rename(target / name)
         (made / _MOVES).unlink()
         _remove(made)
+
+
+def _content(folder: Path) -> str:
+    """A digest of a stage's files: one that power failure tore is made again."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / _KEY)
+    return digest([[p.relative_to(folder).as_posix(), sha256_of(p)] for p in files])
 
 
 def _remove(path: Path) -> None:
@@ -154,10 +161,7 @@ def _former(path: Path) -> dict[str, Any] | None:
     record = path / RECORD
     if not record.exists():
         return None
-    try:
-        old = json.loads(record.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        old = None
+    old = read_json(record)
     if not isinstance(old, dict) or not isinstance(old.get("images"), dict):
         raise UserError(
             f"--out {path}: holds another run, whose {RECORD} is damaged; "

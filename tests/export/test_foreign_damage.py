@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 from foreign_model import NAMES, camera, exact_model, write_run
+from mutations import mutated
 
 from jaxsfm.errors import UserError
 from jaxsfm.host.formats.database import read_database
@@ -26,17 +27,6 @@ def files(tmp_path_factory):
                 old.copy(key, new)
         (folder / "copy.h5").replace(folder / name)
     return folder
-
-
-def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """Cut off, or with some bytes changed, mostly near the beginning."""
-    if rng.random() < 0.2:
-        return data[: rng.integers(len(data))]
-    changed = bytearray(data)
-    for _ in range(rng.integers(1, 20)):
-        end = min(4096, len(data)) if rng.random() < 0.6 else len(data)
-        changed[rng.integers(end)] = rng.choice([0, 1, 127, 128, 255, rng.integers(256)])
-    return bytes(changed)
 
 
 @pytest.mark.parametrize("which", ["database.db", FEATURES, MATCHES])

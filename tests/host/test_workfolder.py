@@ -45,7 +45,7 @@ def result(pair=("a.jpg", "b.jpg"), n: int = 5) -> PairResult:
     rng = np.random.default_rng(n)
     return PairResult(
         pair=pair,
-        cells=rng.integers(0, 99, (n, 2)).astype(np.int32),
+        cells=np.stack([rng.permutation(99)[:n] for _ in range(2)], axis=1).astype(np.int32),
         keypoints0=rng.normal(size=(n, 2)).astype(np.float32),
         keypoints1=rng.normal(size=(n, 2)).astype(np.float32),
         plane=np.zeros(n, np.int32),

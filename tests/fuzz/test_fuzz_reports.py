@@ -1,0 +1,118 @@
+"""Damaged reports of finished runs: the page, the viewer's scene, exports, or one sentence."""
+
+import json
+
+from foreign_model import NAMES, camera, exact_model, write_run
+from fuzz_children import run_cases
+from mutations import damaged_json, outcome
+
+from jaxsfm.export_commands import _recorded_photos
+from jaxsfm.kept import read_run
+from jaxsfm.page.write import page
+from jaxsfm.reported import REPORT, misfit
+from jaxsfm.scene import shown_scene
+
+ERRORS = {"mean": 0.01, "median": 0.02, "max": 0.03}
+VERDICT = {"trusted": True, "strength": 0.5, "rotation_error_deg": 0.1, "reason": ""}
+NEAREST = {"pair": [NAMES[0], NAMES[3]], "missed": "7 tentative matches, 26 are needed"}
+
+
+def pair(a: str, b: str, inliers: int = 40, verdict=VERDICT) -> dict:
+    return {
+        "pair": [a, b],
+        "status": "verified",
+        "tentative": 50,
+        "inliers": inliers,
+        "planes": 1,
+        "handed_on": True,
+        "colmap_inliers": inliers,
+        "view_graph": verdict,
+    }
+
+
+def whole(folder) -> dict:
+    """The report of a run with all parts; one image is lost."""
+    names = sorted(NAMES)
+    return {
+        "version": "0",
+        "versions": {"jaxsfm": "0"},
+        "finished": "2024-01-01",
+        "identity": {"images": dict.fromkeys(names, "0"), "config": {"octaves": 2}, "seed": 0},
+        "options": {"config": {"max_size": 640, "enlarge": 1.0, "octaves": 2}, "reference": None},
+        "images": {"folder": str(folder), "found": 5, "usable": 4, "skipped": {"e.jpg": "empty"}},
+        "pairs": {
+            "tried": 6,
+            "each": [
+                pair(names[0], names[1]),
+                pair(names[1], names[2], 30, None),
+                pair(names[2], names[3], 9, {**VERDICT, "trusted": False, "reason": "odd"}),
+                {**pair(names[0], names[3]), "inliers": 0},
+            ],
+        },
+        "models": [
+            {
+                "registered": 3,
+                "points": 20,
+                "track_length": 2.5,
+                "reprojection_error_px": 0.5,
+                "images": names[:3],
+            }
+        ],
+        "lost": [
+            {
+                "image": names[3],
+                "stage": "no plane",
+                "detail": "few",
+                "help": [{"option": "--preset robust", "reason": "small"}],
+            }
+        ],
+        "view_graph": {
+            "components": [
+                {"images": names[:2], "pairs": 1, "registered": 2, "nearest": NEAREST},
+                {"images": names[2:], "pairs": 1, "registered": 1, "nearest": None},
+            ]
+        },
+        "evaluation": {
+            "registered": 3,
+            "reference_images": 4,
+            "aligned_on": 3,
+            "position": ERRORS,
+            "rotation_deg": ERRORS,
+            "within_10deg": {"0.5": 1.0},
+            "images": {name: {"position": 0.1, "rotation_deg": 0.2} for name in names[:3]},
+        },
+        "no_model": None,
+        "refinement": [None],
+        "seconds": {"mapping": 1.5, "matching": 2},
+    }
+
+
+def report(rng, folder) -> str:
+    out = folder / "run"
+    if not out.exists():
+        write_run(out, exact_model([camera("PINHOLE")], points=20))
+    (out / "report.json").write_bytes(damaged_json(whole(folder), rng))
+    _recorded_photos(out)
+
+    def show() -> None:
+        run = read_run(out)
+        assert page(run).startswith("<!doctype html>")
+        if run.model is not None:
+            shown_scene(run)
+
+    return outcome(show, out)[0]
+
+
+def test_a_damaged_report_is_shown_or_refused_by_name(tmp_path):
+    found = run_cases("test_fuzz_reports", "report", 300, tmp_path)
+    assert found["read"] > 20 and found["refused"] > 100
+
+
+def test_what_runs_report_is_what_their_readers_need(plain, tmp_path):
+    """The shape that is checked is that of real reports, and names the place of a misfit."""
+    real = plain[1]
+    assert misfit(real, REPORT) is None and misfit(whole(tmp_path), REPORT) is None
+    assert misfit([], REPORT) == "" and misfit({**real, "lost": None}, REPORT) == "lost"
+    real = json.loads(json.dumps(real))
+    real["pairs"]["each"][1]["view_graph"]["strength"] = "0.5"
+    assert misfit(real, REPORT) == "pairs.each.1.view_graph.strength"

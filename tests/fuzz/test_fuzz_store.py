@@ -1,0 +1,239 @@
+"""Damaged files of a work folder: the right content, or none; never code that runs."""
+
+import json
+import os
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+from fuzz_children import run_cases
+from mutations import damaged, damaged_json, outcome
+
+from jaxsfm.core.types import DenseFeatures, Status
+from jaxsfm.host.colmap import write_database
+from jaxsfm.host.features import ImageFeatures
+from jaxsfm.host.images import ImageFile
+from jaxsfm.host.pairs import PairResult
+from jaxsfm.host.store import Store
+from jaxsfm.host.workfolder import open_folder
+
+PAIR = ("a.jpg", "b.jpg")
+FILES = [
+    ImageFile(name=n, path=n, size=(64, 64), sha256=64 * n[0])  # type: ignore[arg-type]
+    for n in PAIR
+]
+IDENTITY = {
+    "version": "1",
+    "weights": "w",
+    "relocalizer": None,
+    "config": {"octaves": 2},
+    "seed": 0,
+    "images": {file.name: file.sha256 for file in FILES},
+}
+
+
+def features() -> ImageFeatures:
+    rng = np.random.default_rng(0)
+    dense = DenseFeatures(
+        tuple(rng.normal(size=(n, 8)).astype(np.float16) for n in (16, 4)),
+        tuple(rng.normal(size=(n, 4)).astype(np.float16) for n in (64, 16)),
+        rng.uniform(0, 64, (64, 2)).astype(np.float32),
+        np.asarray([4, 4], np.int32),
+        np.asarray([8, 8], np.int32),
+    )
+    return ImageFeatures(FILES[0], (1.0, 2.5), dense)
+
+
+def matches(n: int = 20) -> PairResult:
+    rng = np.random.default_rng(1)
+    return PairResult(
+        pair=PAIR,
+        cells=np.stack([rng.permutation(n), rng.permutation(n)], 1).astype(np.int32),
+        keypoints0=rng.uniform(0, 64, (n, 2)).astype(np.float32),
+        keypoints1=rng.uniform(0, 64, (n, 2)).astype(np.float32),
+        plane=rng.integers(0, 2, n).astype(np.int32),
+        homographies=rng.normal(size=(2, 3, 3)),
+        num_tentative=77,
+        num_dropped=0,
+        status=Status.VERIFIED,
+    )
+
+
+def saved(folder, what: str):
+    """A store with one file, its path, and how it is read."""
+    store = Store(folder, IDENTITY)
+    if what == "features":
+        store.save_features(features())
+        return store._feature_path(FILES[0]), lambda: store.load_features(FILES[0])
+    store.save_matches(matches())
+    return store._match_path(PAIR), lambda: store.load_matches(PAIR)
+
+
+def same(a, b) -> bool:
+    """Equal, arrays to the bit."""
+    if isinstance(b, np.ndarray):
+        return (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    if hasattr(b, "_asdict") or isinstance(b, PairResult):
+        return all(same(getattr(a, name), value) for name, value in fields(b).items())
+    if isinstance(b, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a == b
+
+
+def fields(value) -> dict:
+    return value._asdict() if hasattr(value, "_asdict") else vars(value)
+
+
+def file_bytes(rng, folder) -> str:
+    """Any damage to the file: its checksums find it, or it did not touch the content."""
+    what = ["features", "matches"][rng.integers(2)]
+    path, load = saved(folder, what)
+    path.write_bytes(damaged(path.read_bytes(), rng))
+    found = load()
+    assert found is None or same(found, features() if what == "features" else matches())
+    return "none" if found is None else "same"
+
+
+def changed(array: np.ndarray, rng) -> np.ndarray:
+    """Of another type or shape, or with a value that no run writes."""
+    kind = rng.integers(6)
+    if kind == 0:
+        return array.astype(
+            [np.float64, np.int8, np.complex64, "U3", "datetime64[s]"][rng.integers(5)]
+        )
+    if kind == 1:
+        return array[rng.integers(len(array) + 1) :]
+    if kind == 2:
+        return array.reshape(-1)
+    if kind == 3:
+        return array[..., None]
+    if kind == 4:
+        return np.zeros((), array.dtype)
+    array = array.copy()
+    worst = [-1, 2**31 - 1, -(2**31)] if array.dtype.kind == "i" else [np.nan, np.inf, -np.inf]
+    array.flat[rng.integers(array.size)] = worst[rng.integers(3)]
+    return array
+
+
+def arrays(rng, folder) -> str:
+    """Whole files of wrong arrays: what is read at all is what COLMAP and the programs take."""
+    what = ["features", "matches"][rng.integers(2)]
+    path, load = saved(folder, what)
+    with np.load(path) as file:
+        content = {name: file[name] for name in file.files}
+    names = sorted(content)
+    name = names[rng.integers(len(names))]
+    if rng.random() < 0.15:
+        del content[name]
+    else:
+        content[name] = changed(content[name], rng)
+    np.savez(path, **content)
+    found = load()
+    if found is None:
+        return "none"
+    if what == "features":
+        assert found.room.num_coarse == len(found.dense.coarse[0]) >= found.dense.coarse_grid.prod()
+        assert np.isfinite(found.dense.keypoints).all()
+    else:
+        names = dict(zip(PAIR, FILES, strict=True))
+        write_database(folder / "d.db", list(names.values()), {PAIR: found}, None)
+    return "read"
+
+
+def record(rng, folder) -> str:
+    """run.json, what could not be used and what was being published."""
+    out = folder / "out"
+    out.mkdir(exist_ok=True)
+    whole = {
+        "run.json": IDENTITY,
+        "unusable.json": {"1" * 32: "photo.jpg: damaged", "2" * 32: "b"},
+        "publishing/moves.json": {"failed": False, "names": ["report.json", "sparse"]},
+    }
+    (out / "publishing").mkdir(exist_ok=True)
+    name = [*whole][rng.integers(len(whole))]
+    for each, content in whole.items():
+        data = damaged_json(content, rng) if each == name else json.dumps(content).encode()
+        (out / each).write_bytes(data)
+
+    def read():
+        with open_folder(out, IDENTITY) as store:
+            return store.why_unusable(FILES[0]), (out / "publishing").exists()
+
+    how, found = outcome(read, "--out")
+    assert how == "refused" or found == (None, False)
+    return how
+
+
+def stage(rng, folder) -> str:
+    """A stage's files: it is there as it was made, or not at all."""
+    with open_folder(folder / "out", IDENTITY) as store:
+        with store.record_stage("mapped", "key") as fresh:
+            (fresh / "sparse").mkdir()
+            (fresh / "sparse" / "points3D.bin").write_bytes(b"points" * 20)
+            (fresh / "figures.json").write_text("[1, 2, 3]")
+        made = store.stage("mapped", "key")
+        assert made is not None and store.stage("mapped", "other") is None
+        files = sorted(path for path in made.rglob("*") if path.is_file())
+        path = files[rng.integers(len(files))]
+        before = path.read_bytes()
+        path.write_bytes(damaged(before, rng))
+        found = store.stage("mapped", "key")
+        assert found is None or path.read_bytes() == before
+    return "none" if found is None else "same"
+
+
+@pytest.mark.parametrize("kind, count", [("file_bytes", 500), ("arrays", 300)])
+def test_damaged_features_and_matches_are_none_or_right(tmp_path, kind, count):
+    found = run_cases("test_fuzz_store", kind, count, tmp_path)
+    assert found["none"] > count / 2 and found.total() == count
+
+
+def test_damaged_records_of_a_folder_are_ignored_or_refused(tmp_path):
+    found = run_cases("test_fuzz_store", "record", 300, tmp_path)
+    assert found["read"] > 50 and found["refused"] > 20
+
+
+def test_a_damaged_stage_is_made_again(tmp_path):
+    found = run_cases("test_fuzz_store", "stage", 100, tmp_path)
+    assert found["none"] > 90
+
+
+class _Attack:
+    def __init__(self, proof):
+        self.proof = proof
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.proof}",)
+
+
+@pytest.mark.parametrize("what", ["features", "matches"])
+def test_a_pickled_object_in_a_file_is_never_loaded(tmp_path, what):
+    path, load = saved(tmp_path, what)
+    proof = tmp_path / "executed"
+    attack = np.empty(1, object)
+    attack[0] = _Attack(proof)
+    with np.load(path) as file:
+        content = {name: file[name] for name in file.files}
+    for name in content:
+        np.savez(path, **{**content, name: attack})
+        assert load() is None and not proof.exists()
+    path.write_bytes(pickle.dumps(attack[0]))  # numpy takes such a file for a pickle
+    assert load() is None and not proof.exists()
+    pickle.loads(pickle.dumps(attack[0]))  # the attack is real
+    assert proof.exists()
+
+
+def test_an_array_is_not_unpacked_beyond_the_length_of_its_file(tmp_path):
+    path, load = saved(tmp_path, "matches")
+    with np.load(path) as file:
+        content = {name: file[name] for name in file.files}
+    np.savez_compressed(path, **content | {"plane": np.zeros(1 << 24, np.int32)})
+    assert path.stat().st_size < 1 << 18 and load() is None
+    with zipfile.ZipFile(path, "w") as archive:  # a header that claims more than is there
+        for name in content:
+            with archive.open(f"{name}.npy", "w") as file:
+                head = {"descr": "<i4", "fortran_order": False, "shape": (1 << 40,)}
+                np.lib.format.write_array_header_1_0(file, head)
+                file.write(bytes(80))
+    assert load() is None
