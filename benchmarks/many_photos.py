@@ -25,7 +25,8 @@ from jaxsfm.synthetic import TexturedPlane, camera_matrix, look_at, photo_textur
 SIZE = (240, 180)
 STEP, SECTION, REACH = 0.35, 4.0, 9.0
 """Metres between photos, of a section of the street, and that a photo sees to either side."""
-STAGES = ("retrieval", "extraction", "matching", "mapping", "refinement")
+STAGES = ("retrieval", "extraction", "matching", "mapping")
+"""The last with the refinement, whose bar appears with it."""
 
 
 def _texture(photos: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
@@ -90,15 +91,21 @@ class Cost(NamedTuple):
     registered: int
     pairs: int
     seconds: dict[str, float]
+    """By stage."""
+    busy: dict[str, float]
+    """Seconds of all threads together: what other processes take does not count."""
     matched_mb: float
     """Peak memory until mapping begins."""
     peak_mb: float
 
 
-def _peak_mb(pid: int) -> float:
+def _used(pid: int) -> tuple[float, float]:
+    """Seconds of all its threads so far, and its peak memory, MB."""
+    ticks = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    busy = (int(ticks[11]) + int(ticks[12])) / os.sysconf("SC_CLK_TCK")
     text = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
     found = re.search(r"VmHWM:\s+(\d+)", text)
-    return int(found[1]) / 1024 if found else float("nan")
+    return busy, int(found[1]) / 1024 if found else float("nan")
 
 
 def measure(scene: Path, out: Path, count: int, options: list[str]) -> Cost:
@@ -106,13 +113,14 @@ def measure(scene: Path, out: Path, count: int, options: list[str]) -> Cost:
     command = [sys.executable, "-m", "jaxsfm", "reconstruct", str(scene / "images")]
     command += ["--out", str(out), "--intrinsics", str(scene / "K.txt"), *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    matched: list[float] = []
+    begun: dict[str, tuple[float, float]] = {}
 
     def watch() -> None:
         assert process.stderr
         while chunk := process.stderr.read1(4096):  # pyright: ignore[reportAttributeAccessIssue]
-            if b"mapping:" in chunk and not matched:
-                matched.append(_peak_mb(process.pid))
+            for stage in STAGES:
+                if f"{stage}:".encode() in chunk and stage not in begun:
+                    begun[stage] = _used(process.pid)
 
     reader = threading.Thread(target=watch)
     reader.start()
@@ -122,12 +130,17 @@ def measure(scene: Path, out: Path, count: int, options: list[str]) -> Cost:
     if process.returncode:
         raise SystemExit(f"{' '.join(command)}: exit status {process.returncode}")
     report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    ends = [begun[s][0] for s in STAGES[1:]] + [usage.ru_utime + usage.ru_stime]
+    busy = {s: end - begun[s][0] for s, end in zip(STAGES, ends, strict=True)}
+    wall = report["seconds"]
+    wall["mapping"] += wall.get("refinement", 0.0)
     return Cost(
         count=count,
         registered=report["models"][0]["registered"] if report["models"] else 0,
         pairs=report["pairs"]["tried"],
-        seconds=report["seconds"],
-        matched_mb=matched[0] if matched else float("nan"),
+        seconds=wall,
+        busy=busy,
+        matched_mb=begun["mapping"][1],
         peak_mb=usage.ru_maxrss / 1024,
     )
 
@@ -139,7 +152,8 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("options", nargs="*", help="of jaxsfm reconstruct, after --")
     given = parser.parse_args()
-    print("photos  registered  pairs  " + "  ".join(f"{s} s/photo" for s in STAGES), end="")
+    print("Per photo, by stage: seconds, and (seconds of all threads)")
+    print("photos  registered  pairs  " + "  ".join(f"{s:>15}" for s in STAGES), end="")
     print("  MB until mapping  MB at most")
     for count in given.counts:
         scene = given.work / f"street{count}"
@@ -147,7 +161,9 @@ def main() -> None:
             write_street(scene, count)
         options = ["--pairs", f"retrieval:{given.nearest}", *given.options]
         cost = measure(scene, given.work / f"out{count}", count, options)
-        each = "  ".join(f"{cost.seconds.get(stage, 0) / count:10.3f}" for stage in STAGES)
+        each = "  ".join(
+            f"{cost.seconds[s] / count:6.3f} ({cost.busy[s] / count:6.3f})" for s in STAGES
+        )
         print(f"{count:6d}  {cost.registered:10d}  {cost.pairs:5d}  {each}", end="")
         print(f"  {cost.matched_mb:16.0f}  {cost.peak_mb:10.0f}", flush=True)
 

@@ -35,6 +35,8 @@ SAMPLE = 1 << 14
 """Local descriptors that a vocabulary is fitted on, over all photos: 34 MB, however many."""
 CELLS = f"cells {SIDE}"
 """What local descriptors are called in the store."""
+GEM = f"gem {SIDE}"
+"""What its descriptors are called in the store."""
 Found = dict[str, np.ndarray]
 """Descriptors by content (SHA-256)."""
 _gem, _vlad, _netvlad, _fit = (jax.jit(f) for f in (gem, vlad, netvlad, fit_vocabulary))
@@ -74,11 +76,10 @@ class Work:
 
 def by_gem(work: Work) -> Found:
     """Generalised means of the coarse descriptors."""
-    kind = f"gem {SIDE}"
-    found = work.stored(kind)
+    found = work.stored(GEM)
     for image, rows in _noted(work, _rows(work, work.missing(found))):
         found[image.sha256] = np.asarray(_gem(_padded(rows)))
-        work.save(image, kind, found[image.sha256])
+        work.save(image, GEM, found[image.sha256])
     return found
 
 

@@ -30,6 +30,8 @@ LONG = (
     "jaxsfm.run.run_folder",
     "jaxsfm.demo.run_demo",
     "jaxsfm.retrieval.shortlist",
+    "jaxsfm.localize.localize",
+    "jaxsfm.extend.extend",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.extraction.image_features",
     "jaxsfm.datasets.fetch",

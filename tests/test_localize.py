@@ -12,6 +12,11 @@ from kept_runs import change_report
 
 from jaxsfm import localize as localize_module
 from jaxsfm.cli import main
+from jaxsfm.errors import UserError
+from jaxsfm.execution import Execution
+from jaxsfm.host.images import inspect_image
+from jaxsfm.kept import read_run
+from jaxsfm.known_run import by_similarity
 from jaxsfm.localize import LocalizeOptions, localize
 from jaxsfm.synthetic import camera_matrix, look_at, render, room
 
@@ -117,6 +122,27 @@ def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
     result = localize([photos / "photos" / "new.png"], plain[0], options=options)
     assert result["photos"][0]["shortlist"] == ["view2.png"]
     assert result["photos"][0]["status"] in ("localized", "doubtful")
+
+
+def test_the_most_similar_photos_are_shortlisted_and_described_once(
+    plain, photos, weights, tmp_path, monkeypatch
+):
+    run = read_run(Path(shutil.copytree(plain[0], tmp_path / "run")))
+    image = inspect_image(photos / "photos" / "again.png", name="photo")
+    names = ["view0.png", "view1_night.png", "view2.png"]
+
+    def shortlist(k: int, names: list[str]) -> list[str]:
+        return list(by_similarity(run, weights, k, {"photo": image}, Execution())(image, names))
+
+    assert shortlist(1, names) == ["view0.png"]  # it is that photo
+    two = shortlist(2, names)
+    assert two == shortlist(2, names[::-1]) and two[0] == "view0.png"
+    assert shortlist(3, names) == names
+    assert (run.matches.path / "descriptors").is_dir()
+    monkeypatch.setattr(run.photos, "file", None)  # nobody opens them again
+    assert shortlist(1, names) == ["view0.png"]
+    with pytest.raises(UserError, match="--shortlist"):
+        shortlist(0, names)
 
 
 # -- the command ----------------------------------------------------------------------------------

@@ -1,0 +1,128 @@
+"""The report of a run that was extended: the old one with what is new."""
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+
+import pycolmap
+
+from jaxsfm.advice import Circumstances
+from jaxsfm.core.types import Status
+from jaxsfm.errors import UserError
+from jaxsfm.evaluation import evaluate
+from jaxsfm.failures import explained
+from jaxsfm.growing import Grown
+from jaxsfm.host.images import ImageFile
+from jaxsfm.host.pairs import Pair, PairCounts
+from jaxsfm.host.poses import model_poses
+from jaxsfm.host.store import SavedMatches
+from jaxsfm.host.viewgraph import Verdict
+from jaxsfm.kept import KeptRun
+from jaxsfm.pair_outcomes import PairOutcomes
+from jaxsfm.report import model_figures, pair_figures
+
+
+class New(NamedTuple):
+    """What has been added to the folder."""
+
+    images: dict[str, ImageFile]
+    skipped: dict[str, str]
+    """Photos that cannot be used, and why."""
+
+
+def extended_report(
+    kept: KeptRun,
+    models: list[pycolmap.Reconstruction],
+    grown: Grown,
+    new: New,
+    matches: SavedMatches,
+    verified: Mapping[Pair, int],
+) -> dict[str, Any]:
+    """The run's report with what is new."""
+    report = dict(kept.report)
+    counts = {pair: result.counts for pair, result in matches.items()}
+    figures = [model_figures(model) for model in models]
+    images, pairs = report["images"], report["pairs"]
+    good = {pair for pair, each in counts.items() if each.num_inliers}
+    rows = [pair_figures(p, c, good, dict(verified), {}) for p, c in counts.items()]
+    each = sorted([*pairs["each"], *rows], key=lambda row: row["pair"])
+    report |= {
+        "images": images
+        | {
+            "folder": str(kept.photos.folder),
+            "found": images["found"] + len(new.images) + len(new.skipped),
+            "usable": images["usable"] + len(new.images),
+            "skipped": images["skipped"] | new.skipped,
+        },
+        "pairs": pairs
+        | {
+            "tried": pairs["tried"] + len(counts),
+            "verified": pairs["verified"] + len(good),
+            "handed_on": pairs["handed_on"] + len(good),
+            "overflowed": pairs["overflowed"] + sum(c.num_dropped > 0 for c in counts.values()),
+            "trusted": pairs["trusted"] and pairs["trusted"] + len(verified),
+            "each": each,
+        },
+        "models": figures,
+        **explained(
+            [each["images"] for each in figures],
+            _outcomes(each, kept.config.min_inliers),
+            Circumstances(
+                config=kept.config,
+                pairs=report["options"]["pairs"],
+                known_camera=report["options"]["intrinsics"] is not None,
+                sizes=_sizes(kept, new),
+            ),
+        ),
+        "extended": [
+            *report.get("extended", []),
+            {
+                "finished": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+                "added": sorted(new.images),
+                "placed": sorted(grown.placed),
+                "rounds": grown.rounds,
+                "pairs": len(counts),
+            },
+        ],
+    }
+    for row in report["lost"]:
+        if row["image"] in grown.located:
+            row["detail"] = grown.located[row["image"]].why or row["detail"]
+    if kept.reference is not None:
+        try:
+            found = evaluate(model_poses(models[0]), kept.reference.poses)
+            report["evaluation"] = found.as_dict()
+        except UserError as error:
+            report["evaluation_failed"] = str(error)
+    return report
+
+
+def _outcomes(rows: list[dict[str, Any]], min_inliers: int) -> PairOutcomes:
+    """What a report says of its pairs."""
+    named = {(row["pair"][0], row["pair"][1]): row for row in rows}
+    verdicts = {pair: row["view_graph"] for pair, row in named.items()}
+    return PairOutcomes(
+        results={
+            pair: PairCounts(
+                num_inliers=row["inliers"],
+                num_planes=row["planes"],
+                num_tentative=row["tentative"],
+                num_dropped=0,
+                status=Status[row["status"].upper()],
+            )
+            for pair, row in named.items()
+        },
+        handed_on={pair for pair, row in named.items() if row["handed_on"]},
+        verified={pair: n for pair, row in named.items() if (n := row["colmap_inliers"])},
+        verdicts={pair: Verdict(**verdict) for pair, verdict in verdicts.items() if verdict},
+        angles={},
+        min_inliers=min_inliers,
+    )
+
+
+def _sizes(kept: KeptRun, new: New) -> dict[str, tuple[int, int]]:
+    """Of every usable image that is still there."""
+    skipped = kept.report["images"]["skipped"]
+    old = kept.report["identity"]["images"].keys() - skipped.keys()
+    every = {name: kept.photos.file(name) for name in old} | dict(new.images)
+    return {name: image.size for name, image in sorted(every.items()) if image is not None}
