@@ -21,7 +21,7 @@ from jaxsfm.growing import Grown, Newcomer, grow
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap import colour_points, read_models, write_models
 from jaxsfm.host.colmap_extend import add_images, add_matches
-from jaxsfm.host.images import ImageFile, read_image
+from jaxsfm.host.images import ImageError, ImageFile, read_image
 from jaxsfm.host.model import build_model
 from jaxsfm.host.pairs import Pair, make_pair
 from jaxsfm.host.store import SavedMatches
@@ -85,13 +85,16 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
     )
     with open_folder(run, identity) as folder:
         shortlist = options.chosen_shortlist(kept, weights, new)
-        shortlists = {
-            name: shortlist(image, [n for n in sorted([*names, *new]) if n != name])
-            for name, image in new.items()
-        }
+        shortlists, unread = {}, {}
+        for name, image in new.items():
+            try:
+                others = [n for n in sorted([*names, *new]) if n != name]
+                shortlists[name] = shortlist(image, others)
+            except ImageError as error:
+                unread[name] = str(error)
         pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
         missing = [pair for pair in pairs if folder.load_matches(pair) is None]
-        undecoded = extract_missing(folder, weights, files, missing, config, run_options)
+        undecoded = unread | extract_missing(folder, weights, files, missing, config, run_options)
         if old_lost := undecoded.keys() & set(names):
             raise UserError(undecoded[min(old_lost)])
         new = {name: image for name, image in new.items() if name not in undecoded}
@@ -99,7 +102,9 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
         missing = [pair for pair in missing if not undecoded.keys() & set(pair)]
         for _ in match_missing(folder, weights, files, missing, config, run_options):
             pass
-        added = New(new, {n: skipped[n] for n in skipped if n not in old} | undecoded)
+        known = old.keys() | kept.report["images"]["skipped"].keys()
+        fresh_skips = {name: why for name, why in skipped.items() if name not in known}
+        added = New(new, fresh_skips | undecoded)
         with folder.publish() as fresh:
             report = _extended(kept, folder, fresh, model, added, pairs, files, options)
             report["identity"] = identity
@@ -139,7 +144,8 @@ def _extended(
             dataclasses.replace(
                 view_of(image, chosen[name], config),
                 image_id=added[name][0],
-                camera=added[name][1],
+                # The run's camera as the model has it: the database knows it unrefined.
+                camera=chosen[name].camera if chosen[name].source == "run" else added[name][1],
             ),
             chosen[name].own,
             sorted({other for pair in pairs if name in pair for other in pair} - {name}),

@@ -49,7 +49,7 @@ def extended_report(
     report |= {
         "images": images
         | {
-            "folder": str(kept.photos.folder),
+            "folder": kept.photos.folder and str(kept.photos.folder.absolute()),
             "found": images["found"] + len(new.images) + len(new.skipped),
             "usable": images["usable"] + len(new.images),
             "skipped": images["skipped"] | new.skipped,

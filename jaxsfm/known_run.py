@@ -2,6 +2,7 @@
 may show the same as a new one.
 """
 
+import contextlib
 import functools
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -156,6 +157,8 @@ def by_similarity(
     Args:
       new: photos that the run does not know, by name.
 
+    The shortlist raises ImageError for a photo that cannot be decoded.
+
     Raises:
       UserError: k is less than 1.
     """
@@ -182,7 +185,10 @@ def by_similarity(
     def shortlist(image: ImageFile, names: Sequence[str]) -> Sequence[str]:
         if k >= len(names):
             return names
-        own = of(image.name)
-        return sorted(names, key=lambda name: (-round(float(of(name) @ own) / TIE), name))[:k]
+        own, nearness = of(image.name), {}
+        for name in names:
+            with contextlib.suppress(ImageError):  # another one that cannot be decoded
+                nearness[name] = round(float(of(name) @ own) / TIE)
+        return sorted(nearness, key=lambda name: (-nearness[name], name))[:k]
 
     return shortlist

@@ -169,11 +169,15 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     shortlist = options.chosen_shortlist(kept, weights, unknown)
     for path, image in usable.items():
         own = kept.photos.called(image.sha256)
-        shortlists[path] = shortlist(image, [name for name in names if name != own])
+        try:
+            shortlists[path] = shortlist(image, [name for name in names if name != own])
+        except ImageError as error:
+            unusable[path] = str(error)
     files = run_files(kept, sorted({name for some in shortlists.values() for name in some}))
     rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
     with _features(kept, weights, files, options) as load:
-        each = tqdm(usable.items(), desc="localizing", unit="photo", disable=not options.progress)
+        todo = {path: usable[path] for path in shortlists}
+        each = tqdm(todo.items(), desc="localizing", unit="photo", disable=not options.progress)
         for path, image in each:
             row: dict[str, Any] = {
                 "photo": path,

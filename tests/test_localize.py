@@ -14,7 +14,7 @@ from jaxsfm import localize as localize_module
 from jaxsfm.cli import main
 from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
-from jaxsfm.host.images import inspect_image
+from jaxsfm.host.images import ImageError, inspect_image
 from jaxsfm.kept import read_run
 from jaxsfm.known_run import by_similarity
 from jaxsfm.localize import LocalizeOptions, localize
@@ -143,6 +143,13 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
     assert shortlist(1, names) == ["view0.png"]
     with pytest.raises(UserError, match="--shortlist"):
         shortlist(0, names)
+    cut = tmp_path / "cut.png"
+    cut.write_bytes((photos / "photos" / "new.png").read_bytes()[:2000])
+    bad = inspect_image(cut, name="bad")
+    choose = by_similarity(run, weights, 1, {"photo": image, "bad": bad}, Execution())
+    assert choose(image, [*names, "bad"]) == ["view0.png"]
+    with pytest.raises(ImageError):
+        choose(bad, names)
 
 
 # -- the command ----------------------------------------------------------------------------------
