@@ -20,7 +20,7 @@ from typing import Any
 
 os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP tells of every step
 
-from jaxsfm.host import colmap
+from jaxsfm.host import colmap, colmap_models
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
@@ -98,7 +98,7 @@ def without(
             refine_intrinsics=options.refine_intrinsics,
             threads=options.threads,
         )
-    colmap.write_models(models[:1], folder / "fresh")
+    colmap_models.write_models(models[:1], folder / "fresh")
     (folder / "fresh").rename(folder / "sparse")
     database.unlink()
 

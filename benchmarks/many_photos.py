@@ -121,6 +121,7 @@ def measure(scene: Path, out: Path, count: int, options: list[str]) -> Cost:
             for stage in STAGES:
                 if f"{stage}:".encode() in chunk and stage not in begun:
                     begun[stage] = _used(process.pid)
+                    print(f"{count} photos, {stage}: begun", *begun[stage], file=sys.stderr)
 
     reader = threading.Thread(target=watch)
     reader.start()

@@ -19,8 +19,8 @@ from jaxsfm.errors import UserError
 from jaxsfm.extend_report import New, extended_report
 from jaxsfm.growing import Grown, Newcomer, grow
 from jaxsfm.host.atomic import write_atomic
-from jaxsfm.host.colmap import colour_points, read_models, write_models
 from jaxsfm.host.colmap_extend import add_images, add_matches
+from jaxsfm.host.colmap_models import colour_points, read_models, write_models
 from jaxsfm.host.images import ImageError, ImageFile, read_image
 from jaxsfm.host.model import build_model
 from jaxsfm.host.pairs import Pair, make_pair

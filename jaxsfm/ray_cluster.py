@@ -13,15 +13,23 @@ from jaxsfm.errors import UserError
 if TYPE_CHECKING:
     from types import ModuleType
 
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_DEDUP_LOGS_SKIP_REGEX": ".",
+}
+"""Ray's reports to its makers, its advice to developers, and what it would print between the
+progress bars when a worker dies (we say so ourselves). To be set before it is imported."""
+
 
 def imported_ray() -> "ModuleType":
-    """Ray, with its reports to its makers and its advice to developers switched off.
+    """Ray, `QUIET`.
 
     Raises:
       UserError: it is not installed.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    for name, value in QUIET.items():
+        os.environ.setdefault(name, value)
     try:
         import ray
     except ImportError as error:

@@ -4,17 +4,15 @@ Each stage reads the files of the one before, so that one that is kept (`jaxsfm.
 what it would give if it were made again.
 """
 
-import contextlib
 import dataclasses
 import functools
 import json
 import logging
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +23,7 @@ from jaxsfm.host.store import digest
 from jaxsfm.host.versions import package_versions
 from jaxsfm.host.viewgraph import Verdict, trusted_pairs
 from jaxsfm.patches import gray
+from jaxsfm.stages import InScratch, Kept, made
 
 if TYPE_CHECKING:
     import pycolmap
@@ -38,42 +37,6 @@ GRAYS = 64
 DATABASE, SPARSE = "database.db", "sparse"
 _FIGURES = "figures.json"
 logger = logging.getLogger("jaxsfm")
-
-
-class Stages(Protocol):
-    """Where finished stages are kept (`jaxsfm.host.workfolder.WorkFolder`)."""
-
-    def stage(self, name: str, key: str) -> Path | None: ...
-
-    def record_stage(self, name: str, key: str) -> AbstractContextManager[Path]: ...
-
-    def forget_stage(self, name: str) -> None: ...
-
-
-class Kept(NamedTuple):
-    """Stages that may be there already."""
-
-    stages: Stages
-    matches_key: str
-    """Of all that the matches are made of."""
-
-
-class _InScratch:
-    """Stages that nothing is kept of."""
-
-    def __init__(self, scratch: str) -> None:
-        self._scratch = Path(scratch)
-
-    def stage(self, name: str, key: str) -> Path | None:
-        return None
-
-    @contextlib.contextmanager
-    def record_stage(self, name: str, key: str) -> Iterator[Path]:
-        (self._scratch / name).mkdir()
-        yield self._scratch / name
-
-    def forget_stage(self, name: str) -> None:
-        pass
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -129,7 +92,7 @@ def reconstruct(
       on_image, on_mapped, on_pass: told of every registered image, of the end of mapping, of every
         pass of the refinement.
     """
-    from jaxsfm.host import colmap, mapping
+    from jaxsfm.host import colmap, colmap_models, mapping
     from jaxsfm.host.intrinsics import check_fits
 
     if options is None:
@@ -146,30 +109,30 @@ def reconstruct(
         models, attempts = mapping.build_models(
             checked / DATABASE, two_views, options, on_image=on_image
         )
-        colmap.write_models(models, folder / SPARSE)
+        colmap_models.write_models(models, folder / SPARSE)
         _write_json(folder, [dataclasses.asdict(attempt) for attempt in attempts])
 
     def refine(folder: Path) -> None:
-        models = colmap.read_models(mapped / SPARSE, checked / DATABASE)
+        models = colmap_models.read_models(mapped / SPARSE, checked / DATABASE)
         models, figures = _refined(models, images, checked, config, options, matches, on_pass)
-        colmap.write_models(models, folder / SPARSE)
+        colmap_models.write_models(models, folder / SPARSE)
         _write_json(folder, [each and dataclasses.asdict(each) for each in figures])
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        stages, key = kept or (_InScratch(scratch), "")
+        stages, key = kept or (InScratch(scratch), "")
         by_image = [[image.name, image.sha256, image.size] for image in images]
         camera = intrinsics and dataclasses.asdict(intrinsics)
         verifying = [options.seed, options.threads, options.scale, config.view_graph]
         key = digest(key, by_image, camera, verifying, package_versions())
-        checked = _made(stages, "verified", key, verify)
+        checked = made(stages, "verified", key, verify)
         key = digest(key, dataclasses.asdict(options))
-        mapped = _made(stages, "mapped", key, build)
+        mapped = made(stages, "mapped", key, build)
         on_mapped()
         key = digest(key, config.refinement and dataclasses.asdict(config.refinement))
-        refined = _made(stages, "refined", key, refine)
+        refined = made(stages, "refined", key, refine)
         shutil.copyfile(checked / DATABASE, database)
         verification, refinement = _read_json(checked), _read_json(refined)
-        models = colmap.read_models(refined / SPARSE, database)
+        models = colmap_models.read_models(refined / SPARSE, database)
         if config.refinement is not None and None in refinement:
             stages.forget_stage("refined")  # a photo could not be read; perhaps the next time
         return Reconstructed(
@@ -180,16 +143,6 @@ def reconstruct(
             attempts=[mapping.Attempt(**_paired(row)) for row in _read_json(mapped)],
             refinement=[_figures(row) for row in refinement],
         )
-
-
-def _made(stages: Stages, name: str, key: str, make: Callable[[Path], None]) -> Path:
-    """The folder of a stage, made if it is not there."""
-    folder = stages.stage(name, key)
-    if folder is not None:
-        return folder
-    with stages.record_stage(name, key) as fresh:
-        make(fresh)
-    return stages.stage(name, key) or fresh
 
 
 def _write_json(folder: Path, value: Any) -> None:
@@ -264,6 +217,7 @@ def _refined(
 ) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
     """Refined where the config says so, and coloured."""
     from jaxsfm.host import colmap
+    from jaxsfm.host.colmap_models import colour_points
 
     by_name = {image.name: image for image in images}
 
@@ -278,7 +232,7 @@ def _refined(
             models, read, config.refinement, options, matches, cameras, on_pass
         )
     for model in models:
-        colmap.colour_points(model, read)
+        colour_points(model, read)
     return models, figures
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.host.atomic import read_json
 
@@ -42,6 +43,14 @@ def _side(value: Any) -> bool:
     return count(value) and 1 <= value < 2**31
 
 
+def _threads(value: Any) -> bool:
+    return value == -1 or _side(value)
+
+
+def _status(value: Any) -> bool:
+    return text(value) and value.upper() in Status.__members__
+
+
 _ERRORS = {"mean": number, "median": number, "max": number}
 _NEAREST = {"pair": _pair, "missed": text}
 SIZES: Shape = {"options": {"config": {"max_size": _side, "enlarge": _positive}}}
@@ -52,30 +61,44 @@ REPORT: Shape = {
     "version": text,
     "versions?": {"*": text},
     "finished?": text,
-    "identity": {"images": {"*": text}, "config": {}},
+    "identity": {"version": text, "images": {"*": text}, "config": {}},
+    "weights": {},
     "options": {
         "config": {"max_size": _side, "enlarge": _positive},
+        "seed": count,
+        "threads": _threads,
+        "pairs": text,
+        "intrinsics": (text, None),
         "reference?": (text, None),
     },
     "images": {
         "folder?": (text, None),
+        "found": count,
         "usable": count,
         "skipped": {"*": text},
     },
     "pairs": {
+        **dict.fromkeys(("tried", "verified", "handed_on", "overflowed"), count),
         "each": [
             {
                 "pair": _pair,
+                "status": _status,
+                "tentative": count,
                 "inliers": count,
                 "planes": count,
                 "handed_on": flag,
                 "colmap_inliers": count,
                 "view_graph": (
                     None,
-                    {"trusted": flag, "strength": number, "reason": text},
+                    {
+                        "trusted": flag,
+                        "strength": number,
+                        "rotation_error_deg": (number, None),
+                        "reason": text,
+                    },
                 ),
             }
-        ]
+        ],
     },
     "models": [
         {

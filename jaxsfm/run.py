@@ -18,7 +18,7 @@ from jaxsfm.evaluation import evaluate
 from jaxsfm.extraction import image_features
 from jaxsfm.host import interrupt
 from jaxsfm.host.atomic import write_atomic
-from jaxsfm.host.colmap import write_models
+from jaxsfm.host.colmap_models import write_models
 from jaxsfm.host.features import ImageFeatures, image_room
 from jaxsfm.host.given import Beside, read_given
 from jaxsfm.host.images import ImageError, ImageFile
@@ -32,10 +32,11 @@ from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import WorkFolder, open_folder
 from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pipeline import open_images
-from jaxsfm.reconstruction import Kept, Reconstructed, reconstruct
+from jaxsfm.reconstruction import Reconstructed, reconstruct
 from jaxsfm.retrieval import check_retrieval, described, nearest_pairs
 from jaxsfm.run_options import RunOptions, check_options
 from jaxsfm.run_report import Done, run_report
+from jaxsfm.stages import Kept
 
 T = TypeVar("T")
 logger = logging.getLogger("jaxsfm")

@@ -22,6 +22,12 @@ def run(scene, out, *args, images=None) -> dict:
     return json.loads((out / "report.json").read_text())
 
 
+@pytest.fixture
+def copied(plain, tmp_path) -> Path:
+    """A copy of the plain run's folder, whose matches are used again where they hold."""
+    return Path(shutil.copytree(plain[0], tmp_path / "copied"))
+
+
 def rows(out: Path, query: str) -> list[tuple]:
     with sqlite3.connect(out / "database.db") as db:
         result = db.execute(query).fetchall()
@@ -82,24 +88,24 @@ def test_refine_intrinsics_moves_a_wrong_focal_length(scene, tmp_path):
     assert focal["auto"] == focal["no"] == 340 and focal["yes"] != 340
 
 
-def test_a_pair_file_limits_what_is_tried(scene, tmp_path):
+def test_a_pair_file_limits_what_is_tried(scene, tmp_path, copied):
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("view0.png view1_night.png\nview1_night.png view2.png\n")
-    report = run(scene, tmp_path / "out", "--pairs", pairs)
+    report = run(scene, copied, "--pairs", pairs, "--refine", "0")
     assert [row["pair"] for row in report["pairs"]["each"]] == [
         ["view0.png", "view1_night.png"],
         ["view1_night.png", "view2.png"],
     ]
 
 
-def test_best_pairs_hands_on_fewer(scene, tmp_path, plain):
-    report = run(scene, tmp_path / "out", "--best-pairs", "1")
+def test_best_pairs_hands_on_fewer(scene, copied, plain):
+    report = run(scene, copied, "--best-pairs", "1", "--refine", "0")
     assert report["pairs"]["handed_on"] == 2 < plain[1]["pairs"]["handed_on"] == 3
 
 
-def test_refine_and_view_graph_switch_their_stages(scene, tmp_path, plain):
+def test_refine_and_view_graph_switch_their_stages(scene, tmp_path, copied, plain):
     args = ("--intrinsics", scene / "K.txt", "--threads", "1")
-    bare = run(scene, tmp_path / "bare", *args, "--refine", "0", "--view-graph", "no")
+    bare = run(scene, copied, *args, "--refine", "0", "--view-graph", "no")
     assert "refinement" not in bare["seconds"] and bare["refinement"] == [None]
     assert all(row["view_graph"] is None for row in bare["pairs"]["each"])
     full = plain[1]
@@ -107,36 +113,37 @@ def test_refine_and_view_graph_switch_their_stages(scene, tmp_path, plain):
     assert all(row["view_graph"]["trusted"] for row in full["pairs"]["each"])
     errors = [r["models"][0]["reprojection_error_px"] for r in (bare, full)]
     assert errors[1] < 0.5 * errors[0]
-    once = run(scene, tmp_path / "bare", *args, "--refine", "1")  # the matches stay valid
+    once = run(scene, copied, *args, "--refine", "1")  # the matches stay valid
     assert len(once["refinement"][0]["passes"]) == 1 and once["seconds"]["matching"] < 0.5
     paper = run(scene, tmp_path / "paper", "--preset", "paper")
     assert paper["refinement"] == [None] and paper["pairs"]["each"][0]["view_graph"] is None
 
 
 def test_max_size_reduces_the_working_images(scene, tmp_path, plain):
-    report = run(scene, tmp_path / "out", "--max-size", "200")
+    report = run(scene, tmp_path / "out", "--max-size", "200", "--refine", "0")
     small, full = (sum(pair_figures(r, "tentative")) for r in (report, plain[1]))
     assert 0 < small < 0.6 * full
 
 
 def test_presets_change_the_tentative_matches_seeds_the_planes_alone(scene, tmp_path, plain):
     for args in (("--preset", "paper"), ("--seed", "5")):
-        report = run(scene, tmp_path / args[0], *args)
+        report = run(scene, tmp_path / args[0], *args, "--refine", "0")
         same = pair_figures(report, "tentative") == pair_figures(plain[1], "tentative")
         assert same == (args[0] == "--seed")
         assert pair_figures(report, "inliers") != pair_figures(plain[1], "inliers")
 
 
 def test_grid_keypoints_lie_on_cell_centres_in_the_database(scene, tmp_path, plain):
-    run(scene, tmp_path / "grid", "--keypoints", "grid")
+    run(scene, tmp_path / "grid", "--keypoints", "grid", "--refine", "0")
     for out, on_grid in ((tmp_path / "grid", True), (plain[0], False)):
         blob, count = rows(out, "select data, rows from keypoints where rows > 0")[0]
         xy = np.frombuffer(blob, np.float32).reshape(count, -1)[:, :2]
         assert (xy % 8 == 4).all() == on_grid  # 8 u + 4 in COLMAP's pixels
 
 
-def test_the_global_mapper_builds_a_model_too(scene, tmp_path):
-    report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt", "--mapper", "global")
+def test_the_global_mapper_builds_a_model_too(scene, copied):
+    args = ("--intrinsics", scene / "K.txt", "--mapper", "global", "--refine", "0")
+    report = run(scene, copied, *args)
     assert report["models"] and report["models"][0]["registered"] == 3
 
 

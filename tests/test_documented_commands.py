@@ -29,9 +29,9 @@ PAGES = (
 LONG = (
     "jaxsfm.run.run_folder",
     "jaxsfm.demo.run_demo",
+    "jaxsfm.retrieval.shortlist",
     "jaxsfm.localize.localize",
     "jaxsfm.extend.extend",
-    "jaxsfm.retrieval.shortlist",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.extraction.image_features",
     "jaxsfm.datasets.fetch",

@@ -6,7 +6,7 @@ import pytest
 
 from jaxsfm import reconstruction, run
 from jaxsfm.cli import main
-from jaxsfm.host import colmap, mapping
+from jaxsfm.host import colmap, colmap_models, mapping
 
 
 @pytest.fixture
@@ -82,8 +82,8 @@ def test_cameras_keep_what_is_known_of_their_focal_length(tmp_path):
         for camera_id, camera in sorted(model.cameras.items()):
             camera.has_prior_focal_length = camera_id % 2 == 1
             assert db.write_camera(camera) == camera_id
-    colmap.write_models([model], tmp_path / "sparse")
-    (back,) = colmap.read_models(tmp_path / "sparse", database)
+    colmap_models.write_models([model], tmp_path / "sparse")
+    (back,) = colmap_models.read_models(tmp_path / "sparse", database)
     known = {k: c.has_prior_focal_length for k, c in back.cameras.items()}
     assert known == {k: k % 2 == 1 for k in model.cameras} and True in known.values()
 

@@ -1,13 +1,17 @@
 """Which Ray cluster is worked with, and how it is shared among workers."""
 
+from importlib.util import find_spec
+
 import pytest
 
 from jaxsfm.errors import UserError
 from jaxsfm.ray_cluster import connected, share
 
+# Not importorskip: it would import Ray before we have told it to be quiet.
+pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
+
 
 def test_an_address_where_nothing_answers_is_told_at_once():
-    pytest.importorskip("ray")
     for address, why in (("127.0.0.1:1", "nothing answers"), ("ray://h:1", "must be HOST:PORT")):
         with pytest.raises(UserError, match=why), connected(address):
             pass

@@ -6,6 +6,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,8 @@ from jaxsfm.host import interrupt
 from jaxsfm.ray_cluster import connected, threads
 from jaxsfm.ray_workers import AHEAD, LOSSES, Piece, crew
 
-pytest.importorskip("ray")
+# Not importorskip: it would import Ray before we have told it to be quiet.
+pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
 WORKERS = 2
 
 

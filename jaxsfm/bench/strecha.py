@@ -23,7 +23,8 @@ from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.atomic import write_atomic
-from jaxsfm.host.colmap import read_two_views, write_models
+from jaxsfm.host.colmap import read_two_views
+from jaxsfm.host.colmap_models import write_models
 from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.mapping import MapOptions, build_models
 from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses

@@ -16,6 +16,8 @@ from jaxsfm.errors import UserError
 
 PARTIAL = ".partial"
 """Ends the name of what is being written."""
+SPARE_BYTES = 4_000_000
+"""Left on the disk beside what is counted: tables' indices, poses, the page."""
 
 
 @contextlib.contextmanager

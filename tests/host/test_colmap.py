@@ -13,8 +13,8 @@ from jaxsfm.host.colmap import (
     keypoint_tables,
     read_two_views,
     write_database,
-    write_models,
 )
+from jaxsfm.host.colmap_models import write_models
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.mapping import MapOptions

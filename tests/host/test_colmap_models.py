@@ -7,11 +7,8 @@ import pycolmap
 import pytest
 from mapped import map_database
 
-from jaxsfm.host.colmap import (
-    colour_points,
-    write_database,
-    write_models,
-)
+from jaxsfm.host.colmap import write_database
+from jaxsfm.host.colmap_models import colour_points, write_models
 from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.poses import model_poses
 

@@ -125,7 +125,8 @@ def test_what_would_not_fit_on_the_disk_is_refused_before_native_code_begins(
     tmp_path, monkeypatch, what
 ):
     """COLMAP would end the process, or write a model that is cut off."""
-    from jaxsfm.host.colmap import write_database, write_models
+    from jaxsfm.host.colmap import write_database
+    from jaxsfm.host.colmap_models import write_models
 
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))

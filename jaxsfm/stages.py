@@ -1,0 +1,53 @@
+"""Stages whose files may be there from an earlier run."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+
+class Stages(Protocol):
+    """Where finished stages are kept (`jaxsfm.host.workfolder.WorkFolder`)."""
+
+    def stage(self, name: str, key: str) -> Path | None: ...
+
+    def record_stage(self, name: str, key: str) -> AbstractContextManager[Path]: ...
+
+    def forget_stage(self, name: str) -> None: ...
+
+
+class Kept(NamedTuple):
+    """Stages that may be there already."""
+
+    stages: Stages
+    matches_key: str
+    """Of all that the matches are made of."""
+
+
+class InScratch:
+    """Stages that nothing is kept of."""
+
+    def __init__(self, scratch: str) -> None:
+        self._scratch = Path(scratch)
+
+    def stage(self, name: str, key: str) -> Path | None:
+        return None
+
+    @contextlib.contextmanager
+    def record_stage(self, name: str, key: str) -> Iterator[Path]:
+        (self._scratch / name).mkdir()
+        yield self._scratch / name
+
+    def forget_stage(self, name: str) -> None:
+        pass
+
+
+def made(stages: Stages, name: str, key: str, make: Callable[[Path], None]) -> Path:
+    """The folder of a stage, made if it is not there."""
+    folder = stages.stage(name, key)
+    if folder is not None:
+        return folder
+    with stages.record_stage(name, key) as fresh:
+        make(fresh)
+    return stages.stage(name, key) or fresh
