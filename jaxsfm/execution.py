@@ -28,6 +28,9 @@ HOST_SHARE, DEVICE_SHARE = 1 / 8, 1 / 2
 """Of a machine's memory, or of an accelerator's, that joined features may take."""
 HOST_BYTES = 3 << 29
 """And at most this of a host's: ten images of 1536 x 1024 with four octaves."""
+HOST_IMAGES = 32
+"""And so many images: with them one is loaded for eight pairs of all, and what a run of a hundred
+small photos takes is what one of a thousand takes."""
 MAX_IMAGES, MAX_PAIRS = 16, 64
 """Side by side on an accelerator; more keep it no busier, but wait longer for the slowest."""
 
@@ -103,17 +106,16 @@ def joined_bytes(num_coarse: int, *, octaves: int, backbone: str = "vgg16") -> i
 
 def resident_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:
     """How many images' joined features stay on each device, at least the two of a pair."""
+    each = joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone)
     memory = _device_memory(mesh)
     if execution.memory_gb is not None:
-        budget = execution.memory_gb * 1e9
+        most = execution.memory_gb * 1e9 / each
     elif memory is not None:
-        budget = DEVICE_SHARE * memory
+        most = DEVICE_SHARE * memory / each
     else:
         budget = min(HOST_BYTES, HOST_SHARE * (total_memory() or HOST_BYTES / HOST_SHARE))
-        budget /= mesh.size
-    return max(
-        2, int(budget / joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone))
-    )
+        most = min(budget / mesh.size / each, HOST_IMAGES)
+    return max(2, int(most))
 
 
 ACCELERATOR_BYTES_PER_PIXEL = 3000

@@ -4,7 +4,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Generic, NamedTuple, TypeVar
 
+import numpy as np
 from jax.sharding import Mesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxsfm.core.sharded import join_everywhere
 from jaxsfm.core.types import JoinedFeatures
@@ -15,9 +18,17 @@ Name = TypeVar("Name")
 
 def by_tiles(pairs: Sequence[tuple[Name, Name]], side: int) -> list[tuple[Name, Name]]:
     """Pairs in an order in which 2 `side` images at a time go far: those between two blocks of
-    `side` images after each other."""
-    place = {name: k // side for k, name in enumerate(dict.fromkeys(n for p in pairs for n in p))}
-    return sorted(pairs, key=lambda pair: sorted((place[pair[0]], place[pair[1]])))
+    `side` images after each other, where images that are paired are near each other in the blocks'
+    order (reverse Cuthill-McKee), whatever their names. Of all pairs any order is as good."""
+    if not pairs:
+        return []
+    number = {name: k for k, name in enumerate(dict.fromkeys(n for p in pairs for n in p))}
+    ends = np.asarray([[number[a], number[b]] for a, b in pairs])
+    graph = coo_array((np.ones(len(ends)), ends.T), shape=2 * (len(number),)).tocsr()
+    block = np.empty(len(number), int)
+    block[reverse_cuthill_mckee(graph + graph.T, symmetric_mode=True)] = np.arange(len(number))
+    block //= side
+    return sorted(pairs, key=lambda pair: sorted(block[number[name]] for name in pair))
 
 
 class OnDevice(NamedTuple):

@@ -183,6 +183,25 @@ def test_tiles_keep_every_pair_once_and_images_at_hand(count, side, random):
         assert len(loads) == count
 
 
+def test_along_a_street_every_image_is_loaded_once_whatever_the_names():
+    names = np.random.default_rng(0).permutation(400).tolist()
+    near = [(names[k], names[k + d]) for k in range(400) for d in range(1, 8) if k + d < 400]
+    ordered = by_tiles(sorted(tuple(sorted(pair)) for pair in near), 8)
+    loads = []
+    resident = Resident(lambda name: loads.append(name) or name, ordered, 16)
+    for a, b in ordered:
+        resident.take(a)
+        resident.take(b)
+    assert len(loads) <= 1.1 * 400
+
+
+def test_a_hosts_memory_does_not_grow_with_the_number_of_small_images():
+    config = preset("default")
+    assert execution.resident_images(Execution(), MESH, 512, config=config) <= 32
+    large = execution.resident_images(Execution(), MESH, 8192, config=config)
+    assert 2 <= large <= 16
+
+
 def test_memory_is_what_the_formula_says(features):
     config = preset("default")
     (one, *_) = features.values()
