@@ -15,6 +15,10 @@ from jaxsfm.errors import UserError
 from jaxsfm.host.workfolder import WorkFolder
 
 
+QUICK = ("--preset", "paper")
+"""What is interrupted does not matter: fewer and smaller programs to compile."""
+
+
 def interrupt_after(monkeypatch, owner, name: str, calls: int) -> list[int]:
     """Let `owner.name` work `calls` times, then raise KeyboardInterrupt; counts the calls."""
     count = [0]
@@ -48,7 +52,7 @@ def test_an_interrupted_run_goes_on_where_it_was(
     function,
     calls,
 ):
-    args = ["reconstruct", str(scene / "images"), "--threads", "1", "--out"]
+    args = ["reconstruct", str(scene / "images"), *QUICK, "--threads", "1", "--out"]
     assert main([*args, str(tmp_path / "whole")]) == 0
     with monkeypatch.context() as patch:
         interrupt_after(patch, owner, function, calls)
@@ -81,7 +85,8 @@ def test_an_interrupt_that_a_callback_swallowed_still_ends_the_run(
         return original(*args, **kwargs)
 
     monkeypatch.setattr(WorkFolder, "save_features", swallowing)
-    assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == 130
+    command = ["reconstruct", str(scene / "images"), *QUICK, "--out", str(tmp_path / "out")]
+    assert main(command) == 130
     assert "interrupted" in capsys.readouterr().err
     # The photo that was saved, and the one that was on its way meanwhile.
     assert len(list((tmp_path / "out" / "features").glob("*/*"))) == 2
@@ -105,7 +110,8 @@ def test_what_has_been_started_is_saved(scene, tmp_path, monkeypatch, owner, sta
         return original(*args, **kwargs)
 
     monkeypatch.setattr(owner, name, failing)
-    assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]) == code
+    command = ["reconstruct", str(scene / "images"), *QUICK, "--out", str(tmp_path / "out")]
+    assert main(command) == code
     assert len(list((tmp_path / "out" / stage).glob("*/*.npz"))) == 1
 
 
