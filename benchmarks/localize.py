@@ -5,7 +5,7 @@
 
 The matches are the run's. They are verified once, each pair by itself; for each image a model
 is made of the pairs without it, as the run's own was (views too dark to align are not placed).
-Models and rows stay in FOLDER: the same command goes on from there.
+Models and rows stay in FOLDER: the same command goes on from there, any other one is refused.
 """
 
 import argparse
@@ -21,11 +21,12 @@ from typing import Any
 os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP tells of every step
 
 from jaxsfm.host import colmap, colmap_models
-from jaxsfm.host.atomic import write_atomic
+from jaxsfm.host.atomic import read_json, write_atomic
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics
 from jaxsfm.host.mapping import MapOptions, build_models
-from jaxsfm.host.store import SavedMatches
+from jaxsfm.host.store import SavedMatches, digest
+from jaxsfm.host.versions import versions
 from jaxsfm.host.viewgraph import trusted_pairs
 from jaxsfm.kept import KeptRun, read_run
 from jaxsfm.known_run import choose_camera, known_model, reader
@@ -135,6 +136,20 @@ def line(row: dict[str, Any]) -> str:
     )
 
 
+def check_same(folder: Path, key: dict[str, Any]) -> None:
+    """End the program if what `folder` keeps was made from something else."""
+    path = folder / "key.json"
+    if path.exists():
+        old = read_json(path)
+        kept = old if isinstance(old, dict) else {}
+        if changed := sorted(name for name in key if kept.get(name) != key[name]):
+            sys.exit(f"--out {folder}: was made with another {changed[0]}; choose another folder")
+    elif folder.exists() and any(folder.iterdir()):
+        sys.exit(f"--out {folder}: not empty, and nobody knows of what; choose another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, json.dumps(key, indent=1).encode())
+
+
 def main() -> int:
     """Print the table; 1 if more than one image is off."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -152,6 +167,13 @@ def main() -> int:
         found = run.photos.file(view.name)
         assert found is not None, f"{view.name} is gone"
         files[view.name] = found
+    key = {
+        "run": digest(run.report["identity"], run.report["options"]),
+        "reference": str(args.reference.absolute()),
+        "version": versions(),
+        "unrefined": args.unrefined,
+    }
+    check_same(args.out, key)
     rows = []
     for name in names:
         folder = args.out / name

@@ -91,13 +91,15 @@ def _camera(why: str) -> Help:
 def _more_pairs(group: Collection[str], tried: Collection[Pair], made: Circumstances) -> list[Help]:
     """A longer list of pairs, where pairs of the group with others have not been tried."""
     possible = len(group) * (len(made.sizes) - len(group))
-    if made.pairs == "exhaustive" or len(tried) >= possible:
+    if len(tried) >= possible:
         return []
+    why = f"{len(tried)} of its {possible} pairs with others were tried"
+    if made.pairs == "exhaustive":  # extend tries a new photo's shortlist alone
+        return [Help("jaxsfm reconstruct", f"again into the same folder: {why}")]
     most = len(made.sizes) - 1
     longer = _SHORTLIST.sub(lambda m: f"{m[1]}:{min(2 * int(m[2]), most)}", made.pairs)
     if longer == made.pairs:  # a file of pairs, or the shortlist is as long as it can be
         longer = "exhaustive"
-    why = f"{len(tried)} of its {possible} pairs with others were tried"
     return [Help(f"--pairs {longer}", why)]
 
 

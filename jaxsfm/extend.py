@@ -7,7 +7,7 @@ Matches are kept as a run's are, so a later reconstruct of the folder goes on fr
 
 import dataclasses
 import json
-import shutil
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,18 @@ from jaxsfm.errors import UserError
 from jaxsfm.extend_report import New, extended_report
 from jaxsfm.growing import Grown, Newcomer, grow
 from jaxsfm.host.atomic import write_atomic
-from jaxsfm.host.colmap_extend import add_images, add_matches
+from jaxsfm.host.colmap_extend import add_images, add_matches, copy_database
 from jaxsfm.host.colmap_models import colour_points, read_models, write_models
 from jaxsfm.host.images import ImageError, ImageFile, read_image
+from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.model import build_model
 from jaxsfm.host.pairs import Pair, make_pair
 from jaxsfm.host.store import SavedMatches
 from jaxsfm.host.versions import versions
-from jaxsfm.host.workfolder import WorkFolder, open_folder
+from jaxsfm.host.workfolder import RECORD, WorkFolder, locked, locked_folder
 from jaxsfm.kept import KeptRun, read_run
 from jaxsfm.known_run import (
+    ChosenCamera,
     KnownModel,
     choose_camera,
     known_model,
@@ -46,9 +48,11 @@ from jaxsfm.run_options import RunOptions
 
 
 def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
-    """Extend a finished run; returns its new report, or None if there are no new photos.
+    """Extend a finished run; returns its new report, or None if there are no new photos, not even
+    broken ones.
 
-    `report["extended"]` has a row for every extension: when, which photos were added, which placed.
+    `report["extended"]` has a row for every extension: when, which photos were added, which placed,
+    which skipped.
 
     Args:
       run: a run's OUT.
@@ -56,6 +60,14 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
     Raises:
       UserError: no finished run with a model, or its photos or weights are not at hand.
     """
+    if not (run / RECORD).exists():
+        raise UserError(f"{run}: no finished run here ({RECORD} is missing)")
+    with locked(run):  # before anything is read: another one may be publishing
+        return _extend(run, options)
+
+
+def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
+    start = time.monotonic()
     kept = read_run(run, images=options.images, reference=options.reference)
     if kept.model is None:
         raise UserError(f"{run}: this run has no model to extend")
@@ -68,14 +80,22 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
             f"{run}: was made by jaxsfm {identity['version']}, this is {versions()['jaxsfm']}; "
             "run reconstruct again"
         )
-    usable, skipped = open_images(kept.photos.folder, progress=options.progress)
-    old = identity["images"]
-    new = {image.name: image for image in usable if image.name not in old}
-    if not new:
+    usable, broken = open_images(kept.photos.folder, progress=options.progress)
+    old, skipped = identity["images"], kept.report["images"]["skipped"]
+    used = old.keys() - skipped.keys()
+    # A photo that was skipped is new once it is another file.
+    fresh = [i for i in usable if i.name not in used and old.get(i.name) != i.sha256]
+    new = {image.name: image for image in fresh}
+    newly_broken = {n: why for n, why in broken.items() if n not in used and n not in skipped}
+    if not new and not newly_broken:
         return None
     model = known_model(run / "sparse" / "0", config, seed=kept.report["options"]["seed"])
     names = [view.name for view in model.views]
-    files = run_files(kept, names) | new
+    there = {i.name: i for i in usable if i.name in used and old[i.name] == i.sha256}
+    run_files(kept, [name for name in names if name not in there])  # says what is gone
+    files = there | new
+    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
+    cameras = {name: choose_camera(i, model.views, intrinsics) for name, i in new.items()}
     identity = identity | {"images": old | {name: image.sha256 for name, image in new.items()}}
     run_options = RunOptions(
         seed=model.seed,
@@ -83,36 +103,37 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
         execution=options.execution,
         progress=options.progress,
     )
-    with open_folder(run, identity) as folder:
-        shortlist = options.chosen_shortlist(kept, weights, new)
-        shortlists, unread = {}, {}
-        for name, image in new.items():
-            try:
-                others = [n for n in sorted([*names, *new]) if n != name]
-                shortlists[name] = shortlist(image, others)
-            except ImageError as error:
-                unread[name] = str(error)
-        pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
-        missing = [pair for pair in pairs if folder.load_matches(pair) is None]
-        undecoded = unread | extract_missing(folder, weights, files, missing, config, run_options)
-        if old_lost := undecoded.keys() & set(names):
-            raise UserError(undecoded[min(old_lost)])
-        new = {name: image for name, image in new.items() if name not in undecoded}
-        pairs = [pair for pair in pairs if not undecoded.keys() & set(pair)]
-        missing = [pair for pair in missing if not undecoded.keys() & set(pair)]
-        for _ in match_missing(folder, weights, files, missing, config, run_options):
-            pass
-        known = old.keys() | kept.report["images"]["skipped"].keys()
-        fresh_skips = {name: why for name, why in skipped.items() if name not in known}
-        added = New(new, fresh_skips | undecoded)
-        with folder.publish() as fresh:
-            report = _extended(kept, folder, fresh, model, added, pairs, files, options)
-            report["identity"] = identity
-            text = json.dumps(report, indent=1, default=str)
-            write_atomic(fresh / "report.json", text.encode())
-        folder.drop_features()
-        page_after_run(run)
-        return report
+    folder = locked_folder(run, identity)
+    shortlist = options.chosen_shortlist(kept, weights, new)
+    shortlists, unread = {}, {}
+    for name, image in new.items():
+        try:
+            others = [n for n in sorted([*names, *new]) if n != name]
+            shortlists[name] = shortlist(image, others)
+        except ImageError as error:
+            unread[name] = str(error)
+    pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
+    missing = [pair for pair in pairs if folder.load_matches(pair) is None]
+    undecoded = unread | extract_missing(folder, weights, files, missing, config, run_options)
+    if old_lost := undecoded.keys() & set(names):
+        raise UserError(undecoded[min(old_lost)])
+    new = {name: image for name, image in new.items() if name not in undecoded}
+    pairs = [pair for pair in pairs if not undecoded.keys() & set(pair)]
+    missing = [pair for pair in missing if not undecoded.keys() & set(pair)]
+    for _ in match_missing(folder, weights, files, missing, config, run_options):
+        pass
+    added = New(new, newly_broken | undecoded)
+    with folder.publish() as target:
+        report = _extended(kept, folder, target, model, added, cameras, pairs, files, options)
+        report["identity"] = identity
+        seconds = report["seconds"]
+        took = seconds.get("extension", 0.0) + time.monotonic() - start
+        report["seconds"] = seconds | {"extension": took}
+        text = json.dumps(report, indent=1, default=str)
+        write_atomic(target / "report.json", text.encode())
+    folder.drop_features()
+    page_after_run(run)
+    return report
 
 
 def _extended(
@@ -121,6 +142,7 @@ def _extended(
     fresh: Path,
     model: KnownModel,
     new: New,
+    cameras: Mapping[str, ChosenCamera],
     pairs: list[Pair],
     files: Mapping[str, ImageFile],
     options: LocalizeOptions,
@@ -128,9 +150,10 @@ def _extended(
     """Database and models in `fresh`; the report."""
     home, config = folder.path, model.config
     matches = SavedMatches(folder, pairs)
-    chosen = {name: choose_camera(image, model.views, None) for name, image in new.images.items()}
+    chosen = {name: cameras[name] for name in new.images}
     database = fresh / "database.db"
-    shutil.copyfile(home / "database.db", database)
+    count = sum(result.num_inliers for result in matches.values())
+    copy_database(home / "database.db", database, count)
     added = add_images(database, {n: (new.images[n], chosen[n].camera) for n in chosen})
     verified = add_matches(
         database,
@@ -170,7 +193,8 @@ def _extended(
         )
     models = _models(home, database, grown, files, model)
     write_models(models, fresh / "sparse")
-    return extended_report(kept, models, grown, new, matches, verified)
+    sizes = {name: files[name].size for name in files.keys() - new.skipped.keys()}
+    return extended_report(kept, models, grown, new, matches, verified, sizes)
 
 
 def _models(

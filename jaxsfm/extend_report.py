@@ -37,22 +37,31 @@ def extended_report(
     new: New,
     matches: SavedMatches,
     verified: Mapping[Pair, int],
+    sizes: Mapping[str, tuple[int, int]],
 ) -> dict[str, Any]:
-    """The run's report with what is new."""
+    """The run's report with what is new.
+
+    Args:
+      sizes: of every usable image that is there, old and new.
+    """
+    now = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     report = dict(kept.report)
     counts = {pair: result.counts for pair, result in matches.items()}
     figures = [model_figures(model) for model in models]
     images, pairs = report["images"], report["pairs"]
+    skipped = {n: why for n, why in images["skipped"].items() if n not in new.images} | new.skipped
+    found = images["skipped"].keys() | new.images.keys() | new.skipped.keys()
     good = {pair for pair, each in counts.items() if each.num_inliers}
     rows = [pair_figures(p, c, good, dict(verified), {}) for p, c in counts.items()]
     each = sorted([*pairs["each"], *rows], key=lambda row: row["pair"])
     report |= {
+        "finished": now,
         "images": images
         | {
             "folder": kept.photos.folder and str(kept.photos.folder.absolute()),
-            "found": images["found"] + len(new.images) + len(new.skipped),
+            "found": images["found"] + len(found) - len(images["skipped"]),
             "usable": images["usable"] + len(new.images),
-            "skipped": images["skipped"] | new.skipped,
+            "skipped": skipped,
         },
         "pairs": pairs
         | {
@@ -60,7 +69,8 @@ def extended_report(
             "verified": pairs["verified"] + len(good),
             "handed_on": pairs["handed_on"] + len(good),
             "overflowed": pairs["overflowed"] + sum(c.num_dropped > 0 for c in counts.values()),
-            "trusted": pairs["trusted"] and pairs["trusted"] + len(verified),
+            # Nobody judges the new ones.
+            "trusted": None if pairs["trusted"] is None else pairs["trusted"] + len(verified),
             "each": each,
         },
         "models": figures,
@@ -71,15 +81,16 @@ def extended_report(
                 config=kept.config,
                 pairs=report["options"]["pairs"],
                 known_camera=report["options"]["intrinsics"] is not None,
-                sizes=_sizes(kept, new),
+                sizes=sizes,
             ),
         ),
         "extended": [
             *report.get("extended", []),
             {
-                "finished": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+                "finished": now,
                 "added": sorted(new.images),
                 "placed": sorted(grown.placed),
+                "skipped": sorted(new.skipped),
                 "rounds": grown.rounds,
                 "pairs": len(counts),
             },
@@ -88,12 +99,16 @@ def extended_report(
     for row in report["lost"]:
         if row["image"] in grown.located:
             row["detail"] = grown.located[row["image"]].why or row["detail"]
+    for stale in ("evaluation", "evaluation_failed"):  # of the model as it was
+        report.pop(stale, None)
     if kept.reference is not None:
         try:
-            found = evaluate(model_poses(models[0]), kept.reference.poses)
-            report["evaluation"] = found.as_dict()
+            errors = evaluate(model_poses(models[0]), kept.reference.poses)
+            report["evaluation"] = errors.as_dict()
         except UserError as error:
             report["evaluation_failed"] = str(error)
+    elif kept.report["options"].get("reference") is not None:
+        report["evaluation_failed"] = "the run's reference poses cannot be used any more"
     return report
 
 
@@ -118,11 +133,3 @@ def _outcomes(rows: list[dict[str, Any]], min_inliers: int) -> PairOutcomes:
         angles={},
         min_inliers=min_inliers,
     )
-
-
-def _sizes(kept: KeptRun, new: New) -> dict[str, tuple[int, int]]:
-    """Of every usable image that is still there."""
-    skipped = kept.report["images"]["skipped"]
-    old = kept.report["identity"]["images"].keys() - skipped.keys()
-    every = {name: kept.photos.file(name) for name in old} | dict(new.images)
-    return {name: image.size for name, image in sorted(every.items()) if image is not None}

@@ -5,6 +5,7 @@ may show the same as a new one.
 import contextlib
 import functools
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -76,8 +77,8 @@ def known_model(folder: Path, config: Config, *, seed: int = 0) -> KnownModel:
 def choose_camera(
     image: ImageFile, views: Sequence[View], intrinsics: Intrinsics | None
 ) -> ChosenCamera:
-    """The given camera; else the model's, if it has one for all and of this size; else one from
-    EXIF or a guess.
+    """The given camera; else the model's, if exactly one of this size is that of several views;
+    else one from EXIF or a guess.
 
     Raises:
       UserError: the given one does not fit.
@@ -85,11 +86,12 @@ def choose_camera(
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size})
         return ChosenCamera(intrinsics.camera(image.size), "given")
-    shared = {view.camera.camera_id: view.camera for view in views}
-    if len(shared) == 1 and len(views) > 1:
+    fitting = [v.camera for v in views if (v.camera.width, v.camera.height) == image.size]
+    count = Counter(camera.camera_id for camera in fitting)
+    shared = {c.camera_id: c for c in fitting if count[c.camera_id] > 1}
+    if len(shared) == 1:
         (camera,) = shared.values()
-        if (camera.width, camera.height) == image.size:
-            return ChosenCamera(camera, "run")
+        return ChosenCamera(camera, "run")
     camera = camera_for(image, None)
     return ChosenCamera(camera, "exif" if camera.has_prior_focal_length else "guess")
 
@@ -152,7 +154,7 @@ def by_similarity(
     run: KeptRun, weights: Weights, k: int, new: Mapping[str, ImageFile], execution: Execution
 ) -> Shortlist:
     """The `k` most similar photos by GeM, which describes each photo by itself; equally similar
-    ones by name. The run's photos are described once and kept in its folder.
+    ones by name. The run's photos are described once and kept in its folder, if it can be written.
 
     Args:
       new: photos that the run does not know, by name.
@@ -171,16 +173,24 @@ def by_similarity(
             raise ImageError(why)
         return found.vectors
 
+    def described_apart(image: ImageFile) -> np.ndarray:
+        with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
+            store = Store(Path(scratch), run.report["identity"])
+            return describe([image], store)[image.name]
+
     @functools.cache
     def of(name: str) -> np.ndarray:
         if name in new:
-            with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-                store = Store(Path(scratch), run.report["identity"])
-                return describe([new[name]], store)[name]
+            return described_apart(new[name])
         unread = run.photos.recorded(name)
         kept = run.matches.load_descriptor(unread, GEM)
         image = run_files(run, [name])[name] if kept is None else unread
-        return describe([image], run.matches)[name]
+        try:
+            return describe([image], run.matches)[name]
+        except ImageError:
+            raise
+        except UserError:  # the run's folder cannot be written
+            return described_apart(image)
 
     def shortlist(image: ImageFile, names: Sequence[str]) -> Sequence[str]:
         if k >= len(names):

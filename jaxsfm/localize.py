@@ -57,8 +57,8 @@ class LocalizeOptions:
     images: Path | None = None
     """Folder of the run's photos; None: where the run found them."""
     intrinsics: str | None = None
-    """K.txt or MODEL:p1,p2,.. of the photos; None: the run's camera, if it has one for all and it
-    fits, else one per photo, whose focal length is estimated."""
+    """K.txt or MODEL:p1,p2,.. of the photos; None: the run's camera, if exactly one of this size is
+    that of several photos, else one per photo, whose focal length is estimated."""
     reference: Path | None = None
     """Reference poses of the photos and of the run's."""
     network: WeightsChoice = USUAL_WEIGHTS
@@ -104,10 +104,12 @@ def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, st
 
     A photo's name becomes its content's, which no photo of a run has.
     """
-    paths = []
+    paths, usable, unusable = [], {}, {}
     for path in photos:
-        paths += [path / name for name in find_images(path)] if path.is_dir() else [path]
-    usable, unusable = {}, {}
+        try:
+            paths += [path / name for name in find_images(path)] if path.is_dir() else [path]
+        except UserError as error:
+            unusable[str(path)] = str(error)
     for path in dict.fromkeys(paths):
         try:
             image = inspect_image(path, name=str(path))

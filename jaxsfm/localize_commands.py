@@ -31,8 +31,8 @@ def localize(
       model: A run's folder.
       out: File.json for poses, what they rest on and their expected errors.
       images: Folder with the run's photos; default: where the run found them.
-      intrinsics: Of the photos, as in reconstruct; default: the run's camera, if it has one for all
-        and it fits, else one per photo, whose focal length is estimated.
+      intrinsics: Of the photos, as in reconstruct; default: the run's camera, if exactly one of
+        this size is that of several photos, else one per photo, whose focal length is estimated.
       reference: Reference poses (Strecha .camera files or a COLMAP model) of these photos and of
         the run's: errors are told.
       shortlist: How many of the run's photos, the most similar ones, a photo is matched with.
@@ -65,6 +65,7 @@ def extend(
     run: Positional[Path],
     *,
     images: Path | None = None,
+    intrinsics: str | None = None,
     shortlist: int = 20,
     network: WeightsChoice = USUAL_WEIGHTS,
 ) -> int:
@@ -78,6 +79,7 @@ def extend(
     Args:
       run: A run's folder.
       images: Folder with the photos, old and new; default: where the run found them.
+      intrinsics: Of the new photos, as in localize.
       shortlist: How many others, the most similar ones, a new photo is matched with.
       network: The network's parameters; they must be the run's.
     """
@@ -85,12 +87,20 @@ def extend(
     from jaxsfm.host.images import shown_name
     from jaxsfm.localize import LocalizeOptions
 
-    options = LocalizeOptions(images=images, shortlist=shortlist, network=network, progress=True)
+    options = LocalizeOptions(
+        images=images,
+        intrinsics=intrinsics,
+        shortlist=shortlist,
+        network=network,
+        progress=True,
+    )
     report = extend(run, options=options)
     if report is None:
         print(f"no new photos for {run}")
         return 0
     last, model = report["extended"][-1], report["models"][0]
+    for name in last["skipped"]:
+        print(f"skipped    {report['images']['skipped'][name]}")
     for row in report["lost"]:
         if row["image"] in last["added"]:
             print(f"lost       {shown_name(row['image'])}: {row['detail']}")

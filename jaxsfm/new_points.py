@@ -47,8 +47,8 @@ def matched_tracks(
     for pair in sorted(matches):
         if not (pair[0] in index and pair[1] in index and set(pair) & set(fresh)):
             continue
-        result, free = matches[pair], np.ones(matches[pair].num_inliers, bool)
-        sides = []
+        result = matches[pair]  # read from disk
+        free, sides = np.ones(result.num_inliers, bool), []
         for side, xy in enumerate((result.keypoints0, result.keypoints1)):
             k = index[pair[side]]
             at = (xy + 0.5) / views[k].scale - 0.5

@@ -16,7 +16,9 @@ from jaxsfm.cli import main
 from jaxsfm.evaluation import umeyama
 from jaxsfm.host.colmap import read_matches
 from jaxsfm.host.poses import model_poses, read_model, read_poses
+from jaxsfm.host.workfolder import RESULTS, locked
 from jaxsfm.kept import read_run
+from jaxsfm.reported import read_report
 from jaxsfm.synthetic import render, room
 
 OLD = ("view0.png", "view1_night.png", "view2.png")
@@ -133,6 +135,62 @@ def test_reconstruct_goes_on_from_what_extend_matched(extended, scene, tmp_path,
     args = ["--out", str(run), "--intrinsics", str(scene / "K.txt"), "--refine", "0"]
     assert main(["reconstruct", str(extended.photos), *args]) == 0
     assert "10 of 10 pairs have been matched before" in capsys.readouterr().err
+
+
+@pytest.fixture
+def copied(plain, scene, tmp_path) -> tuple[Path, Path]:
+    """A run and its photos, to add to."""
+    run = Path(shutil.copytree(plain[0], tmp_path / "run"))
+    photos = Path(shutil.copytree(scene / "images", tmp_path / "photos"))
+    reference = shutil.copytree(scene / "reference", tmp_path / "reference")
+    change_report(run, lambda report: report["images"].update(folder=str(photos)))
+    change_report(run, lambda report: report["options"].update(reference=str(reference)))
+    return run, photos
+
+
+def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_path, capsys):
+    run, photos = copied
+    bad = {"broken.png": b"not an image", "cut.png": b""}
+    whole = write(photos / "cut.png", render(room(), POSE, SIZE)).read_bytes()
+    bad["cut.png"] = whole[:2000]  # its size can be read
+    for name, content in bad.items():
+        (photos / name).write_bytes(content)
+    assert main(["extend", str(run)]) == 1
+    text = capsys.readouterr().out
+    assert all(f"skipped    {name}" in text for name in bad) and "0 of 0 new photos" in text
+    report = read_report(run)
+    assert set(report["images"]["skipped"]) == set(bad) and "evaluation" in report
+    assert report["images"]["found"] == 5 and report["images"]["usable"] == 3
+    assert main(["extend", str(run)]) == 0 and "no new photos" in capsys.readouterr().out
+    for name in bad:
+        (photos / name).write_bytes(whole)
+    shutil.rmtree(tmp_path / "reference")
+    focal = f"PINHOLE:{SIZE[0] + 0.5},{SIZE[0] + 0.5},{SIZE[0] / 2},{SIZE[1] / 2}"
+    assert main(["extend", str(run), "--intrinsics", focal]) == 0
+    report, model = read_report(run), read_model(run / "sparse" / "0")
+    assert report["images"]["skipped"] == {} and report["extended"][-1]["added"] == sorted(bad)
+    assert report["images"]["found"] == report["images"]["usable"] == 5
+    for image in model.images.values():
+        if image.name in bad:
+            assert model.camera(image.camera_id).params[0] == SIZE[0] + 0.5
+    assert model.num_reg_images() == 5 and report["seconds"]["extension"] > 0
+    assert "evaluation" not in report and "reference" in report["evaluation_failed"]
+
+
+def test_killed_while_publishing_or_beside_another_run_the_report_is_the_newest(
+    copied, capsys, monkeypatch
+):
+    run, _ = copied
+    (run / "publishing").mkdir()
+    (run / "report.json").rename(run / "publishing" / "report.json")
+    moves = {"failed": False, "names": RESULTS}  # the report comes last
+    (run / "publishing" / "moves.json").write_text(json.dumps(moves))
+    assert main(["extend", str(run)]) == 0
+    assert "no new photos" in capsys.readouterr().out and (run / "report.json").exists()
+    with locked(run), monkeypatch.context() as patch:
+        patch.setattr(extend_module, "read_run", None)  # what it says may be old soon
+        assert main(["extend", str(run)]) == 2
+    assert "another run" in capsys.readouterr().err
 
 
 def test_what_cannot_be_extended_is_one_sentence(plain, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """Laws of localization in a finished run, on a rendered room whose cameras are known."""
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -7,16 +8,19 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from kept_runs import change_report
 
 from jaxsfm import localize as localize_module
 from jaxsfm.cli import main
+from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
 from jaxsfm.host.images import ImageError, inspect_image
+from jaxsfm.host.store import Store
 from jaxsfm.kept import read_run
-from jaxsfm.known_run import by_similarity
+from jaxsfm.known_run import by_similarity, choose_camera, known_model
 from jaxsfm.localize import LocalizeOptions, localize
 from jaxsfm.synthetic import camera_matrix, look_at, render, room
 
@@ -151,6 +155,55 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
     assert choose(image, [*names, "bad"]) == ["view0.png"]
     with pytest.raises(ImageError):
         choose(bad, names)
+
+
+def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
+    plain, photos, weights, tmp_path, monkeypatch
+):
+    run = read_run(Path(shutil.copytree(plain[0], tmp_path / "run")))
+    home, save = run.matches.path, Store.save_descriptor
+
+    def refused(self, *args):
+        if self.path == home:
+            raise UserError("cannot be written")
+        save(self, *args)
+
+    monkeypatch.setattr(Store, "save_descriptor", refused)
+    image = inspect_image(photos / "photos" / "again.png", name="photo")
+    choose = by_similarity(run, weights, 1, {"photo": image}, Execution())
+    assert choose(image, ["view0.png", "view2.png"]) == ["view0.png"]
+    assert not list(home.glob("descriptors/*/*"))
+
+
+def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, photos):
+    model = known_model(plain[0] / "sparse" / "0", preset("default"))
+    new = inspect_image(photos / "photos" / "new.png", name="photo")
+    odd_one, wide = (
+        pycolmap.Camera(
+            model="SIMPLE_PINHOLE", width=size[0], height=size[1], params=[300, 160, 120]
+        )
+        for size in (SIZE, WIDE)
+    )
+    odd_one.camera_id, wide.camera_id = 7, 8
+    first = model.views[0]
+
+    def chosen(*more):
+        views = [*model.views, *(dataclasses.replace(first, camera=camera) for camera in more)]
+        found = choose_camera(new, views, None)
+        return found.source, found.camera.camera_id
+
+    shared = first.camera.camera_id
+    assert chosen() == chosen(odd_one) == chosen(odd_one, wide, wide) == ("run", shared)
+    assert chosen(odd_one, odd_one)[0] == "guess"  # nobody can tell which
+    assert choose_camera(new, model.views[:1], None).source == "guess"  # nobody else's
+
+
+def test_an_empty_folder_keeps_no_photo_from_its_pose(plain, photos, tmp_path):
+    (tmp_path / "empty").mkdir()
+    new = photos / "photos" / "new.png"
+    found = localize([tmp_path / "empty", new], plain[0], options=LocalizeOptions())["photos"]
+    status = {row["photo"]: row["status"] for row in found}
+    assert status == {str(tmp_path / "empty"): "unusable", str(new): "localized"}
 
 
 # -- the command ----------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
 import numpy as np
 import pycolmap
 
+from jaxsfm.host.atomic import SPARE_BYTES, check_room
 from jaxsfm.host.colmap import PIXEL_OFFSET, read_images, read_two_views, verify
 from jaxsfm.host.images import ImageFile
 from jaxsfm.host.pairs import Pair, PairResult
@@ -32,18 +33,43 @@ def add_images(
     return {name: every[name] for name in images}
 
 
+def copy_database(source: Path, target: Path, matches: int) -> None:
+    """A copy of a database to which matches will be added.
+
+    Raises:
+      UserError: the copy, that of `add_matches` and SQLite's journal would not fit on the disk.
+    """
+    # Each match: a keypoint in both images at most, itself and its verification; 8 bytes each.
+    rows = 4 * matches
+    size = source.stat().st_size
+    check_room(target.parent, SPARE_BYTES + 3 * size + 16 * rows)
+    shutil.copyfile(source, target)
+
+
+def _keys(xy: np.ndarray) -> np.ndarray:
+    """float32 pixels (n, 2 or more) as one number each, which tells them apart."""
+    return xy[:, :2].astype(np.float32, order="C").view(np.uint64)[:, 0]
+
+
 def _appended(known: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Keypoints, and behind them those of `xy` that are not among them.
 
     Args:
       known: float32 (n, 2 or more): (x, y) and what follows; kept as it is.
     """
-    there = {row.tobytes() for row in known[:, :2].copy()}
-    fresh = [row for row in np.unique(xy, axis=0) if row.tobytes() not in there]
+    fresh = np.unique(xy, axis=0)
+    fresh = fresh[~np.isin(_keys(fresh), _keys(known))]
     rest = np.zeros((len(fresh), known.shape[1] - 2), np.float32)
     if rest.shape[1] >= 4:  # an affine shape; COLMAP's for a bare point
         rest[:, [0, 3]] = 1
-    return np.concatenate([known, np.c_[np.asarray(fresh).reshape(-1, 2), rest]])
+    return np.concatenate([known, np.c_[fresh, rest]])
+
+
+def _rows_of(xy: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+    """uint32: where each pixel stands among keypoints, which have it; of equal ones the first."""
+    keys = _keys(keypoints)
+    order = np.argsort(keys, kind="stable")
+    return order[np.searchsorted(keys, _keys(xy), sorter=order)].astype(np.uint32)
 
 
 def add_matches(
@@ -63,42 +89,41 @@ def add_matches(
       scale: see `jaxsfm.host.colmap.verify`.
     """
     ids = {name: image_id for name, (image_id, _) in read_images(path).items()}
-    used: dict[str, list[np.ndarray]] = {}
-    for pair in results:
-        for name, xy in zip(pair, _sides(results[pair]), strict=True):
-            used.setdefault(name, []).append(xy)
+    own: dict[str, list[Pair]] = {}
+    for pair in sorted(results):
+        for name in pair:
+            own.setdefault(name, []).append(pair)
+    rows: dict[Pair, list[np.ndarray]] = {}
     matches: dict[Pair, np.ndarray] = {}
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        place: dict[str, dict[bytes, int]] = {}
-        for name, parts in used.items():
+        for name in sorted(own):  # the lesser name of a pair comes first
+            parts = [_side(results[pair], pair.index(name)) for pair in own[name]]
             there = db.exists_keypoints(ids[name])
             known = np.asarray(db.read_keypoints(ids[name]), np.float32) if there else _NONE
             every = _appended(known if len(known) else _NONE, np.concatenate(parts))
             (db.update_keypoints if there else db.write_keypoints)(ids[name], every)
-            rows = reversed(list(enumerate(every[:, :2].copy())))  # of equal ones the first
-            place[name] = {row.tobytes(): k for k, row in rows}
-        for pair in sorted(results):
-            columns = [
-                [place[name][row.tobytes()] for row in xy]
-                for name, xy in zip(pair, _sides(results[pair]), strict=True)
-            ]
-            rows = np.asarray(columns, np.uint32).T.reshape(-1, 2)
+            found = _rows_of(np.concatenate(parts), every)
+            ends = np.cumsum([len(xy) for xy in parts])[:-1]
+            for pair, column in zip(own[name], np.split(found, ends), strict=True):
+                rows.setdefault(pair, []).append(column)
+        for pair in sorted(rows):
+            both = np.stack(rows.pop(pair), axis=1)
             # Two cells may lie at one pixel: one match each.
             for side in (0, 1):
-                rows = rows[np.sort(np.unique(rows[:, side], return_index=True)[1])]
-            if len(rows):
-                matches[pair] = rows
-                db.write_matches(ids[pair[0]], ids[pair[1]], rows)
+                both = both[np.sort(np.unique(both[:, side], return_index=True)[1])]
+            if len(both):
+                matches[pair] = both
+                db.write_matches(ids[pair[0]], ids[pair[1]], both)
     return _verified(path, matches, ids, seed=seed, threads=threads, scale=scale)
 
 
 _NONE = np.zeros((0, 2), np.float32)
 
 
-def _sides(result: PairResult) -> tuple[np.ndarray, np.ndarray]:
+def _side(result: PairResult, side: int) -> np.ndarray:
     """Keypoints in COLMAP's pixels, as the database holds them."""
-    both = (result.keypoints0, result.keypoints1)
-    return tuple(np.asarray(xy, np.float32) + PIXEL_OFFSET for xy in both)  # pyright: ignore[reportReturnType]
+    xy = (result.keypoints0, result.keypoints1)[side]
+    return np.asarray(xy, np.float32) + PIXEL_OFFSET
 
 
 def _verified(
@@ -111,6 +136,8 @@ def _verified(
     scale: float,
 ) -> dict[Pair, int]:
     """COLMAP verifies all pairs of a database: those that are new in a copy without the others."""
+    if not matches:
+        return {}
     scratch = path.with_name("new_pairs.db")
     shutil.copyfile(path, scratch)
     with pycolmap.Database.open(scratch) as db, pycolmap.DatabaseTransaction(db):

@@ -181,6 +181,25 @@ def _check_photos(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
 
 
 @contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Create or find a run's folder, hold its lock, and finish what a killed run was publishing.
+
+    Raises:
+      UserError: a file, not a run's folder, not writable, or in use.
+    """
+    with _prepare(path) as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise UserError(f"--out {path}: another run is using this folder") from error
+        try:
+            WorkFolder(path, {}).finish_publishing()
+        except OSError as error:
+            raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
+        yield
+
+
+@contextlib.contextmanager
 def open_folder(path: Path, identity: dict[str, Any]) -> Iterator[WorkFolder]:
     """Create or reopen a run's folder and hold its lock.
 
@@ -192,31 +211,30 @@ def open_folder(path: Path, identity: dict[str, Any]) -> Iterator[WorkFolder]:
     Raises:
       UserError: a file, not writable, in use, or a run of other photos.
     """
-    with _prepare(path) as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise UserError(f"--out {path}: another run is using this folder") from error
-        new = json.loads(json.dumps(identity))
-        old = _former(path)
-        if old is not None:
-            _check_photos(path, old, new)
-            changed = differences(old, new)
-            if changed:
-                logger.info(
-                    "%s: the last run there differs (%s); what does not depend on that is used "
-                    "again",
-                    path,
-                    changed,
-                )
-            else:
-                logger.info("continuing the run in %s", path)
-        try:
-            folder = WorkFolder(path, new)
-            folder.finish_publishing()
-            folder.sweep()
-        except OSError as error:
-            raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
-        if old != new:
-            write_atomic(path / RECORD, json.dumps(new, indent=1).encode())
-        yield folder
+    with locked(path):
+        yield locked_folder(path, identity)
+
+
+def locked_folder(path: Path, identity: dict[str, Any]) -> WorkFolder:
+    """As `open_folder`, by who holds the lock (`locked`)."""
+    new = json.loads(json.dumps(identity))
+    old = _former(path)
+    if old is not None:
+        _check_photos(path, old, new)
+        changed = differences(old, new)
+        if changed:
+            logger.info(
+                "%s: the last run there differs (%s); what does not depend on that is used again",
+                path,
+                changed,
+            )
+        else:
+            logger.info("continuing the run in %s", path)
+    folder = WorkFolder(path, new)
+    try:
+        folder.sweep()
+    except OSError as error:
+        raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
+    if old != new:
+        write_atomic(path / RECORD, json.dumps(new, indent=1).encode())
+    return folder
