@@ -53,7 +53,7 @@ class Work:
     execution: Execution | None
     on_image: Callable[[], object]
     """Told of every photo that has been through the network."""
-    lost: dict[str, str] = field(default_factory=dict)
+    lost: dict[str, ImageError] = field(default_factory=dict)
     """Contents that could not be decoded, and why; grows."""
 
     def load(self, image: ImageFile, kind: str) -> np.ndarray | None:
@@ -143,7 +143,7 @@ def _noted(
     for image, rows in stream:
         interrupt.check()
         if isinstance(rows, ImageError):
-            work.lost[image.sha256] = str(rows)
+            work.lost[image.sha256] = rows
         else:
             yield image, rows
         work.on_image()

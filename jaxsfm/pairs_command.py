@@ -34,19 +34,31 @@ def pairs(
       backbone: See reconstruct.
     """
     check_writable(out, "--out", (".txt",))
+    from tqdm import tqdm
+
     from jaxsfm.host.atomic import write_atomic
     from jaxsfm.host.plan import planned_pairs, read_plan
     from jaxsfm.host.weights import chosen_weights
     from jaxsfm.pipeline import open_images
-    from jaxsfm.retrieval import shortlist
+    from jaxsfm.retrieval import described_alone, nearest_pairs
 
     plan = read_plan(pairs)
     usable, skipped = open_images(images, progress=True)
     names = [image.name for image in usable]
+    if len(names) < 2:
+        raise UserError(f"{images}: {len(names)} usable images, at least 2 are needed")
     found = set(planned_pairs(plan, names, [*names, *skipped]))
     if plan.retrieval:
         weights = chosen_weights(network, backbone)
-        found.update(shortlist(weights, usable, k=plan.retrieval, kind=retrieval))
+        with tqdm(total=len(usable), desc="retrieval", unit="image") as bar:
+            alone = described_alone(weights, usable, kind=retrieval, on_image=bar.update)
+        found.update(nearest_pairs(alone.vectors, plan.retrieval))
+        skipped |= {image.name: str(error) for image, error in alone.lost}
+        found = {pair for pair in found if not skipped.keys() & set(pair)}
+    for why in skipped.values():
+        print(f"skipped          {why}")
+    if not found:
+        raise UserError(f"{images}: there are no pairs to try")
     for name in sorted({name for pair in found for name in pair}):
         if name != name.strip() or name.startswith("#") or "\t" in name or "\n" in name:
             raise UserError(f"--out {out}: {name!r} cannot be written in such a file; rename it")

@@ -26,7 +26,7 @@ class Described(NamedTuple):
 
     vectors: dict[str, np.ndarray]
     """float32, unit length, by the photos' names."""
-    lost: list[tuple[ImageFile, str]]
+    lost: list[tuple[ImageFile, ImageError]]
     """Photos that cannot be decoded, and why."""
 
 
@@ -55,13 +55,27 @@ def shortlist(
       ImageError: an image cannot be decoded.
       UserError: `netvlad`, and the weights have no head.
     """
+    found = described_alone(weights, images, kind=kind, execution=execution)
+    for _, error in found.lost:
+        raise error
+    return nearest_pairs(found.vectors, k)
+
+
+def described_alone(
+    weights: Weights,
+    images: Iterable[ImageFile],
+    *,
+    kind: Retrieval,
+    execution: Execution | None = None,
+    on_image: Callable[[], object] = lambda: None,
+) -> Described:
+    """As `described`; nothing is kept."""
     identity = {"version": importlib.metadata.version("jaxsfm"), "weights": weights.sha256}
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         store = Store(Path(scratch), identity)
-        found = described(weights, images, kind=kind, store=store, execution=execution)
-    for _, why in found.lost:
-        raise ImageError(why)
-    return nearest_pairs(found.vectors, k)
+        return described(
+            weights, images, kind=kind, store=store, execution=execution, on_image=on_image
+        )
 
 
 def described(

@@ -21,7 +21,7 @@ from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap_models import write_models
 from jaxsfm.host.features import ImageFeatures, image_room
 from jaxsfm.host.given import Beside, read_given
-from jaxsfm.host.images import ImageError, ImageFile
+from jaxsfm.host.images import DamagedImage, ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs
@@ -77,11 +77,12 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     }
     seconds: dict[str, float] = {}
     with open_folder(out, identity) as folder:
+        skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
         if plan.retrieval:
             with _timed(seconds, "retrieval"):
-                found = _retrieve(folder, weights, usable, plan.retrieval, options)
-                pairs = sorted({*pairs, *found})
-        skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
+                tried = [image for image in usable if image.name not in skipped]
+                found, lost = _retrieve(folder, weights, tried, plan.retrieval, options)
+                pairs, skipped = sorted({*pairs, *found}), skipped | lost
         by_name = {image.name: image for image in usable if image.name not in skipped}
         pairs = [pair for pair in pairs if pair[0] in by_name and pair[1] in by_name]
         with _timed(seconds, "extraction"):
@@ -213,8 +214,8 @@ def _bar(items: Iterable[T], total: int, stage: str, unit: str, options: RunOpti
 
 def _retrieve(
     folder: WorkFolder, weights: Weights, images: list[ImageFile], k: int, options: RunOptions
-) -> list[Pair]:
-    """Each image with its k most similar ones; notes those that cannot be decoded."""
+) -> tuple[list[Pair], dict[str, str]]:
+    """Each image with its k most similar ones; why some cannot be described."""
     total, quiet = len(images), not options.progress
     with tqdm(total=total, desc="retrieval", unit="image", disable=quiet) as bar:
         found = described(
@@ -225,9 +226,16 @@ def _retrieve(
             execution=options.execution,
             on_image=bar.update,
         )
-    for image, why in found.lost:
-        folder.mark_unusable(image, why)
-    return nearest_pairs(found.vectors, k)
+    for image, error in found.lost:
+        _note(folder, image, error)
+    lost = {image.name: str(error) for image, error in found.lost}
+    return nearest_pairs(found.vectors, k), lost
+
+
+def _note(folder: WorkFolder, image: ImageFile, error: ImageError) -> None:
+    """What is damaged stays so; another failure may be over the next time."""
+    if isinstance(error, DamagedImage):
+        folder.mark_unusable(image, str(error))
 
 
 def extract_missing(
@@ -248,7 +256,7 @@ def extract_missing(
     stream = engine.extracted(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
-            folder.mark_unusable(image, str(found))
+            _note(folder, image, found)
             skipped[image.name] = str(found)
         else:
             folder.save_features(found)

@@ -1,10 +1,13 @@
 """Stages whose files may be there from an earlier run."""
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple, Protocol
+
+logger = logging.getLogger("jaxsfm")
 
 
 class Stages(Protocol):
@@ -47,6 +50,7 @@ def made(stages: Stages, name: str, key: str, make: Callable[[Path], None]) -> P
     """The folder of a stage, made if it is not there."""
     folder = stages.stage(name, key)
     if folder is not None:
+        logger.info("%s: as before, nothing it depends on has changed", name)
         return folder
     with stages.record_stage(name, key) as fresh:
         make(fresh)

@@ -14,7 +14,6 @@ from jaxsfm.cli import main
 from jaxsfm.errors import UserError
 from jaxsfm.host.workfolder import WorkFolder
 
-
 QUICK = ("--preset", "paper")
 """What is interrupted does not matter: fewer and smaller programs to compile."""
 

@@ -1,5 +1,6 @@
 """What is kept of a run is used again as far as nothing it depends on has changed."""
 
+import json
 import shutil
 
 import pytest
@@ -105,3 +106,23 @@ def test_a_refinement_that_a_lost_photo_prevented_is_tried_again(scene, tmp_path
     monkeypatch.setattr(reconstruction, "_refined", lambda *a: made.append(1) or original(*a))
     assert main([*base, "--out", str(out)]) == 0 and made == [1]
     assert main([*base, "--out", str(out)]) == 0 and made == [1]
+
+
+def test_a_photo_that_was_away_for_a_moment_is_back_in_the_next_run(scene, tmp_path, monkeypatch):
+    from jaxsfm.host import images
+
+    base = ["reconstruct", str(scene / "images"), "--preset", "paper", "--refine", "0"]
+    command = [*base, "--out", str(tmp_path / "out")]
+    original = images.image_bytes
+
+    def away(image):
+        if image.name == "view0.png":
+            raise images.ImageError("view0.png: cannot be read (Host is down)")
+        return original(image)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(images, "image_bytes", away)
+        main(command)
+    assert main(command) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["images"]["usable"] == 3 and report["images"]["skipped"] == {}

@@ -27,7 +27,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     Raises:
       UserError: it cannot be written (permission, disk full).
     """
-    partial = path.with_name(path.name + PARTIAL)
+    partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")  # nobody else's
     try:
         with partial.open("wb") as file:
             yield file

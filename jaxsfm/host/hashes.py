@@ -1,6 +1,8 @@
 """What a file's content is known by."""
 
+import contextlib
 import hashlib
+import sqlite3
 from pathlib import Path
 
 
@@ -8,3 +10,22 @@ def sha256_of(path: Path) -> str:
     """Of a file's content, hexadecimal; read in parts. Raises OSError."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def rows_sha256(database: Path) -> str:
+    """SHA-256 of every row of every table, hexadecimal: COLMAP writes into the header of a database
+    whenever it opens it.
+
+    Raises:
+      sqlite3.DatabaseError: it is damaged.
+    """
+    digest = hashlib.sha256()
+    uri = f"{database.absolute().as_uri()}?mode=ro&immutable=1"
+    with contextlib.closing(sqlite3.connect(uri, uri=True)) as db:
+        query = "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
+        for (table,) in db.execute(query).fetchall():
+            for row in db.execute(f'SELECT * FROM "{table}" ORDER BY rowid'):
+                for value in (table, *row):
+                    data = value if isinstance(value, bytes) else repr(value).encode()
+                    digest.update(b"%d:" % len(data) + data)
+    return digest.hexdigest()

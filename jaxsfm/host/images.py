@@ -40,6 +40,10 @@ class ImageError(UserError):
     """One image cannot be used; a run reports it and goes on with the others."""
 
 
+class DamagedImage(ImageError):
+    """Its very content cannot be decoded: trying again will not help."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImageFile:
     """An image on disk, checked."""
@@ -182,15 +186,18 @@ def _any_size() -> Iterator[None]:
 
 
 def image_bytes(image: ImageFile) -> bytes:
-    """The file as it is.
+    """The file as it was when it was inspected: what is made of it is kept under that content.
 
     Raises:
-      ImageError: it cannot be read.
+      ImageError: it cannot be read, or has been changed since.
     """
     try:
-        return image.path.read_bytes()
+        data = image.path.read_bytes()
     except OSError as error:
         raise ImageError(f"{shown_name(image.name)}: cannot be read ({error.strerror})") from error
+    if hashlib.sha256(data).hexdigest() != image.sha256:
+        raise ImageError(f"{shown_name(image.name)}: the file was changed meanwhile")
+    return data
 
 
 def _decode(image: ImageFile) -> np.ndarray:
@@ -209,10 +216,12 @@ def _decode(image: ImageFile) -> np.ndarray:
         flags = _REDUCED[factors[0]] | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         bgr = cv2.imdecode(np.frombuffer(image_bytes(image), np.uint8), flags)
-    except (cv2.error, MemoryError) as error:
-        raise ImageError(f"{shown}: cannot be decoded") from error
+    except MemoryError as error:
+        raise ImageError(f"{shown}: there is not enough memory to decode it") from error
+    except cv2.error as error:
+        raise DamagedImage(f"{shown}: cannot be decoded") from error
     if bgr is None:
-        raise ImageError(f"{shown}: damaged, or a format that cannot be decoded")
+        raise DamagedImage(f"{shown}: damaged, or a format that cannot be decoded")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 

@@ -58,6 +58,8 @@ class Store:
         for kind in _FOLDERS:
             for partial in (self.path / kind).glob(f"*/*{PARTIAL}"):
                 partial.unlink(missing_ok=True)
+        for partial in self.path.glob(f"*.json.*{PARTIAL}"):
+            partial.unlink(missing_ok=True)
 
     # -- features: needed until all pairs have matches -------------------------------------------
 

@@ -5,13 +5,14 @@ import fcntl
 import json
 import logging
 import shutil
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TextIO
 
 from jaxsfm.errors import UserError
 from jaxsfm.host.atomic import PARTIAL, atomic_folder, read_json, write_atomic
-from jaxsfm.host.hashes import sha256_of
+from jaxsfm.host.hashes import rows_sha256, sha256_of
 from jaxsfm.host.store import Identity, Store, digest
 
 logger = logging.getLogger(__name__)
@@ -88,6 +89,8 @@ class WorkFolder(Store):
         for name in reversed(RESULTS):
             if (made / name).exists():
                 (made / name).rename(target / name)
+        if target == self.path:
+            _remove(self.path / "failed")  # of an earlier attempt
         (made / _MOVES).unlink()
         _remove(made)
 
@@ -95,7 +98,16 @@ class WorkFolder(Store):
 def _content(folder: Path) -> str:
     """A digest of a stage's files: one that power failure tore is made again."""
     files = sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / _KEY)
-    return digest([[p.relative_to(folder).as_posix(), sha256_of(p)] for p in files])
+    return digest([[p.relative_to(folder).as_posix(), _hash(p)] for p in files])
+
+
+def _hash(file: Path) -> str:
+    if file.suffix != ".db":
+        return sha256_of(file)
+    try:
+        return rows_sha256(file)
+    except sqlite3.DatabaseError as error:
+        return f"damaged: {error}"
 
 
 def _remove(path: Path) -> None:
@@ -139,8 +151,8 @@ def _prepare(path: Path) -> TextIO:
         if path.exists() and not path.is_dir():
             raise UserError(f"--out {path}: is a file, not a folder")
         if path.is_dir() and not (path / RECORD).exists():
-            ours = {".lock", RECORD + PARTIAL}
-            strangers = sorted(p.name for p in path.iterdir() if p.name not in ours)
+            begun = {p for p in path.glob(f"{RECORD}.*{PARTIAL}")}
+            strangers = sorted(p.name for p in {*path.iterdir()} - begun if p.name != ".lock")
             if strangers:
                 raise UserError(
                     f"--out {path}: not empty and not a jaxsfm run (it holds {strangers[0]!r}); "

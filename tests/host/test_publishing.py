@@ -88,6 +88,9 @@ def test_results_without_a_model_do_not_replace_a_model(tmp_path):
                 write_results(fresh, text, names)
     assert set(content(tmp_path).values()) == {"old"}
     assert content(tmp_path / "failed") == {"report.json": "new", "database.db": "new"}
+    with open_folder(tmp_path, IDENTITY) as folder, folder.publish() as fresh:
+        write_results(fresh, "newest")
+    assert set(content(tmp_path).values()) == {"newest"} and not (tmp_path / "failed").exists()
 
 
 def test_a_failure_while_results_are_made_leaves_the_old_ones(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from jaxsfm.host import images
-from jaxsfm.host.images import ImageError, inspect_image, read_image
+from jaxsfm.host.images import DamagedImage, ImageError, inspect_image, read_image
 
 LEFT, RIGHT = (200, 30, 60), (20, 160, 240)
 
@@ -138,3 +138,27 @@ def test_what_cannot_be_decoded_reduced_is_refused_by_name(tmp_path, monkeypatch
     for image in (png, photo):  # 1/8 of the photo is still too much
         with pytest.raises(ImageError, match=f"{image.name}: 100 x 100 pixels is more than"):
             read_image(image, max_size=96)
+
+
+def test_a_photo_changed_since_it_was_inspected_is_refused(tmp_path):
+    """What is made of it would be kept under its old content."""
+    image = inspect_image(write_png(tmp_path / "a.png", two_colours()))
+    write_png(tmp_path / "a.png", two_colours()[:, ::-1])
+    with pytest.raises(ImageError, match="a.png: the file was changed meanwhile") as error:
+        read_image(image, max_size=1600)
+    assert not isinstance(error.value, DamagedImage)
+
+
+def test_what_may_pass_is_no_damage(tmp_path):
+    image = inspect_image(write_png(tmp_path / "a.png", two_colours(64, 640)))
+    with pytest.raises(ImageError, match="too narrow") as narrow:
+        read_image(image, max_size=100)
+    image.path.unlink()
+    with pytest.raises(ImageError, match="cannot be read") as gone:
+        read_image(image, max_size=1600)
+    assert not isinstance(narrow.value, DamagedImage) and not isinstance(gone.value, DamagedImage)
+    data = bytearray(write_png(tmp_path / "b.png", two_colours()).read_bytes())
+    data[-60:-20] = bytes(40)
+    (tmp_path / "b.png").write_bytes(data)
+    with pytest.raises(DamagedImage):
+        read_image(inspect_image(tmp_path / "b.png"), max_size=1600)
