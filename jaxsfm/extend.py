@@ -21,7 +21,7 @@ from jaxsfm.growing import Grown, Newcomer, grow
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap_extend import add_images, add_matches, copy_database
 from jaxsfm.host.colmap_models import colour_points, read_models, write_models
-from jaxsfm.host.images import ImageError, ImageFile, read_image
+from jaxsfm.host.images import DamagedImage, ImageError, ImageFile, read_image
 from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.model import build_model
 from jaxsfm.host.pairs import Pair, make_pair
@@ -83,8 +83,8 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
     usable, broken = open_images(kept.photos.folder, progress=options.progress)
     old, skipped = identity["images"], kept.report["images"]["skipped"]
     used = old.keys() - skipped.keys()
-    # A photo that was skipped is new once it is another file.
-    fresh = [i for i in usable if i.name not in used and old.get(i.name) != i.sha256]
+    # A photo that was skipped is new once it is another file, or if it was not for damage.
+    fresh = [i for i in usable if i.name not in used and not kept.matches.why_unusable(i)]
     new = {image.name: image for image in fresh}
     newly_broken = {n: why for n, why in broken.items() if n not in used and n not in skipped}
     if not new and not newly_broken:
@@ -112,6 +112,8 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
             shortlists[name] = shortlist(image, others)
         except ImageError as error:
             unread[name] = str(error)
+            if isinstance(error, DamagedImage):
+                folder.mark_unusable(image, str(error))
     pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
     missing = [pair for pair in pairs if folder.load_matches(pair) is None]
     undecoded = unread | extract_missing(folder, weights, files, missing, config, run_options)

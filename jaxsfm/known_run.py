@@ -169,8 +169,8 @@ def by_similarity(
 
     def describe(images: Sequence[ImageFile], store: Store) -> dict[str, np.ndarray]:
         found = described(weights, images, kind="gem", store=store, execution=execution)
-        for _, why in found.lost:
-            raise ImageError(why)
+        for _, error in found.lost:
+            raise error
         return found.vectors
 
     def described_apart(image: ImageFile) -> np.ndarray:
