@@ -304,8 +304,12 @@ def test_bad_output_folders_are_named_and_nothing_in_them_is_touched(
     write(tmp_path / "full" / "thesis.tex", "precious")
     refuse(capsys, ["reconstruct", images, "--out", tmp_path / "full"], "thesis.tex")
     assert file.read_text() == (tmp_path / "full" / "thesis.tex").read_text() == "precious"
+    (tmp_path / "others").mkdir()
+    for name in ("view0.png", "view2.png"):  # the same names, other photos
+        rgb = cv2.imread(str(images / name))
+        cv2.imwrite(str(tmp_path / "others" / name), rgb[::-1])
     before = (plain[0] / "report.json").read_bytes()
-    refuse(capsys, ["reconstruct", images, "--out", plain[0], "--seed", "1"], "another run", "seed")
+    refuse(capsys, ["reconstruct", tmp_path / "others", "--out", plain[0]], "a run of other photos")
     assert (plain[0] / "report.json").read_bytes() == before
     args = ["match", images / "view0.png", images / "view2.png", "--out"]
     refuse(capsys, [*args, tmp_path / "a.txt"], "--out", ".npz")
