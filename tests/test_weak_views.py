@@ -293,7 +293,7 @@ def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendere
     assert {pair[0] == NIGHT_NAME for pair in evidence.matches} == {True, False}
     views, tracks = read_model_arrays(before, sizes(rendered))
     normal = surface.normals(tracks, views, neighbours=16)
-    xy, points = weak_views._matched_points(
+    xy, points = weak_views.matched_points(
         rendered.views[NIGHT], views, tracks, normal, evidence.matches
     )
     off = np.linalg.norm(rendered.views[NIGHT].project(points)[0] - xy, axis=1)
