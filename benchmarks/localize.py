@@ -29,9 +29,10 @@ from jaxsfm.host.store import SavedMatches, digest
 from jaxsfm.host.versions import versions
 from jaxsfm.host.viewgraph import trusted_pairs
 from jaxsfm.kept import KeptRun, read_run
-from jaxsfm.known_run import choose_camera, known_model, reader
+from jaxsfm.known_run import choose_camera, known_model
 from jaxsfm.localize import locate_photo
 from jaxsfm.localize_report import error_against, located_figures
+from jaxsfm.patches import gray_reader
 from jaxsfm.reconstruction import pixel_scale
 from jaxsfm.refine import refine_model
 
@@ -94,7 +95,7 @@ def without(
     if refined and run.config.refinement:
         models[0], _ = refine_model(
             models[0],
-            reader(files, run.config),
+            gray_reader(files, run.config),
             config=run.config.refinement,
             refine_intrinsics=options.refine_intrinsics,
             threads=options.threads,
@@ -114,7 +115,7 @@ def localized(run: KeptRun, name: str, files: dict[str, ImageFile], folder: Path
     pairs = [pair for pair in pairs if set(pair) - {name} <= set(names)]
     matches = SavedMatches(run.matches, pairs)
     start = time.monotonic()
-    found = locate_photo(image, chosen, model, names, matches, reader(files, run.config))
+    found = locate_photo(image, chosen, model, names, matches, gray_reader(files, run.config))
     row = located_figures(found, chosen.source, matches)
     row |= {"photo": name, "seconds": time.monotonic() - start, "registered": len(names)}
     if found.view is not None and run.reference is not None:

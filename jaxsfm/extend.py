@@ -21,7 +21,7 @@ from jaxsfm.growing import Grown, Newcomer, grow
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap_extend import add_images, add_matches, copy_database
 from jaxsfm.host.colmap_models import colour_points, read_models, write_models
-from jaxsfm.host.images import DamagedImage, ImageError, ImageFile, read_image
+from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import parse_intrinsics
 from jaxsfm.host.model import build_model
 from jaxsfm.host.pairs import Pair, make_pair
@@ -34,13 +34,13 @@ from jaxsfm.known_run import (
     KnownModel,
     choose_camera,
     known_model,
-    reader,
     run_files,
     run_weights,
     view_of,
 )
 from jaxsfm.localize import LocalizeOptions
 from jaxsfm.page.after_run import page_after_run
+from jaxsfm.patches import gray_reader, rgb_reader
 from jaxsfm.pipeline import open_images
 from jaxsfm.reconstruction import pixel_scale
 from jaxsfm.run import extract_missing, match_missing
@@ -112,8 +112,7 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
             shortlists[name] = shortlist(image, others)
         except ImageError as error:
             unread[name] = str(error)
-            if isinstance(error, DamagedImage):
-                folder.mark_unusable(image, str(error))
+            folder.note_failure(image, error)
     pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
     missing = [pair for pair in pairs if folder.load_matches(pair) is None]
     undecoded = unread | extract_missing(folder, weights, files, missing, config, run_options)
@@ -188,7 +187,7 @@ def _extended(
             model.tracks,
             newcomers,
             matches,
-            reader(files, config),
+            gray_reader(files, config),
             refinement=config.refinement,
             seed=model.seed,
             on_view=on_view,
@@ -210,11 +209,5 @@ def _models(
     models = read_models(home / "sparse", database)
     if grown.placed:
         models[0] = build_model(models[0], grown.views, grown.tracks)
-
-        def read(name: str):
-            config = model.config
-            working = read_image(files[name], max_size=config.max_size, enlarge=config.enlarge)
-            return working.rgb, working.scale
-
-        colour_points(models[0], read)
+        colour_points(models[0], rgb_reader(files, model.config))
     return models

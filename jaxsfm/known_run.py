@@ -18,19 +18,15 @@ from jaxsfm.errors import UserError
 from jaxsfm.execution import Execution
 from jaxsfm.global_descriptors import GEM
 from jaxsfm.host.colmap import camera_for
-from jaxsfm.host.images import ImageError, ImageFile, read_image, shown_name, working_size
+from jaxsfm.host.images import ImageError, ImageFile, shown_name, working_size
 from jaxsfm.host.intrinsics import Intrinsics, check_fits
 from jaxsfm.host.model import Tracks, View, read_model_arrays
 from jaxsfm.host.poses import read_model
 from jaxsfm.host.store import Store
 from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.kept import KeptRun
-from jaxsfm.patches import ReadGray, gray
 from jaxsfm.retrieval import described
 from jaxsfm.weights_choice import WeightsChoice
-
-GRAYS = 64
-"""Decoded images kept in memory: 8 MB each at 1600 x 1200."""
 
 Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
 """A photo and the names of the model's photos -> those that it is matched with."""
@@ -139,17 +135,6 @@ def run_files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
     return files
 
 
-def reader(files: Mapping[str, ImageFile], config: Config) -> ReadGray:
-    """Intensities of working images by name; the last GRAYS stay in memory."""
-
-    @functools.lru_cache(maxsize=GRAYS)
-    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        working = read_image(files[name], max_size=config.max_size, enlarge=config.enlarge)
-        return gray(working.rgb), working.scale
-
-    return read
-
-
 def by_similarity(
     run: KeptRun, weights: Weights, k: int, new: Mapping[str, ImageFile], execution: Execution
 ) -> Shortlist:
@@ -184,7 +169,9 @@ def by_similarity(
             return described_apart(new[name])
         unread = run.photos.recorded(name)
         kept = run.matches.load_descriptor(unread, GEM)
-        image = run_files(run, [name])[name] if kept is None else unread
+        if kept is not None and "array" in kept:
+            return kept["array"]
+        image = run_files(run, [name])[name]
         try:
             return describe([image], run.matches)[name]
         except ImageError:

@@ -38,14 +38,13 @@ from jaxsfm.known_run import (
     by_similarity,
     choose_camera,
     known_model,
-    reader,
     run_files,
     run_weights,
     view_of,
 )
 from jaxsfm.localize_report import UNUSABLE, error_against, located_figures
 from jaxsfm.matching import matched
-from jaxsfm.patches import ReadGray
+from jaxsfm.patches import ReadGray, gray_reader
 from jaxsfm.single_view import Located, locate, part_of
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
@@ -179,6 +178,7 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
     with _features(kept, weights, files, options) as load:
         todo = {path: usable[path] for path in shortlists}
+        read = gray_reader(files | {image.name: image for image in todo.values()}, model.config)
         each = tqdm(todo.items(), desc="localizing", unit="photo", disable=not options.progress)
         for path, image in each:
             row: dict[str, Any] = {
@@ -188,7 +188,6 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
             }
             try:
                 matches = _matches(image, shortlists[path], load, weights, model, options)
-                read = reader({**files, image.name: image}, model.config)
                 found = locate_photo(image, cameras[path], model, shortlists[path], matches, read)
             except ImageError as error:
                 rows.append(row | {"status": UNUSABLE, "why": str(error)})

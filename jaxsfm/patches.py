@@ -1,14 +1,21 @@
-"""Images and keypoints in the few shapes that the compiled alignment (`jaxsfm.core.align`) is
-compiled for."""
+"""Images at working size, and with keypoints in the few shapes that the compiled alignment
+(`jaxsfm.core.align`) is compiled for."""
 
-from collections.abc import Callable, Iterator
+import functools
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
+from jaxsfm.config import Config
 from jaxsfm.host import interrupt
+from jaxsfm.host.images import ImageFile, read_image
 
+ReadRgb = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
+"""Image name -> uint8 (h, w, 3) of the working image, original pixels per pixel."""
 ReadGray = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
 """Image name -> float32 (h, w) intensities of the working image, original pixels per pixel."""
+GRAYS = 64
+"""Intensities of images kept in memory: 8 MB each at 1600 x 1200."""
 LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
 """Intensity of an RGB pixel (ITU-R BT.601)."""
 CHUNK = 4096
@@ -20,6 +27,28 @@ PAD = 128
 def gray(rgb: np.ndarray) -> np.ndarray:
     """Intensities float32 (h, w) of an image uint8 (h, w, 3)."""
     return rgb.astype(np.float32) @ LUMA
+
+
+def rgb_reader(files: Mapping[str, ImageFile], config: Config) -> ReadRgb:
+    """Working images of files by name."""
+
+    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        working = read_image(files[name], max_size=config.max_size, enlarge=config.enlarge)
+        return working.rgb, working.scale
+
+    return read
+
+
+def gray_reader(files: Mapping[str, ImageFile], config: Config) -> ReadGray:
+    """Intensities of working images by name; the last GRAYS stay in memory."""
+    read_rgb = rgb_reader(files, config)
+
+    @functools.lru_cache(maxsize=GRAYS)
+    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        rgb, scale = read_rgb(name)
+        return gray(rgb), scale
+
+    return read
 
 
 def padded(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

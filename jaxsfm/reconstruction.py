@@ -5,7 +5,6 @@ what it would give if it were made again.
 """
 
 import dataclasses
-import functools
 import json
 import logging
 import shutil
@@ -17,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsfm.config import Config, Refinement
-from jaxsfm.host.images import ImageError, ImageFile, read_image, working_size
+from jaxsfm.host.images import ImageError, ImageFile, working_size
 from jaxsfm.host.pairs import Pair, PairResult
 from jaxsfm.host.store import digest
 from jaxsfm.host.versions import package_versions
 from jaxsfm.host.viewgraph import Verdict, trusted_pairs
-from jaxsfm.patches import gray
+from jaxsfm.patches import ReadGray, gray_reader, rgb_reader
 from jaxsfm.stages import InScratch, Kept, made
 
 if TYPE_CHECKING:
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
     from jaxsfm.host.mapping import Attempt, MapOptions
     from jaxsfm.refine import RefinementFigures
 
-GRAYS = 64
-"""Decoded images kept during refinement: 8 MB each at 1600 x 1200."""
 DATABASE, SPARSE = "database.db", "sparse"
 _FIGURES = "figures.json"
 logger = logging.getLogger("jaxsfm")
@@ -220,25 +217,21 @@ def _refined(
     from jaxsfm.host.colmap_models import colour_points
 
     by_name = {image.name: image for image in images}
-
-    def read(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        working = read_image(by_name[name], max_size=config.max_size, enlarge=config.enlarge)
-        return working.rgb, working.scale
-
     figures: list[RefinementFigures | None] = [None] * len(models)
     if config.refinement is not None:
         cameras = colmap.read_images(checked / DATABASE)
+        read_gray = gray_reader(by_name, config)
         models, figures = _refine(
-            models, read, config.refinement, options, matches, cameras, on_pass
+            models, read_gray, config.refinement, options, matches, cameras, on_pass
         )
     for model in models:
-        colour_points(model, read)
+        colour_points(model, rgb_reader(by_name, config))
     return models, figures
 
 
 def _refine(
     models: "list[pycolmap.Reconstruction]",
-    read: Callable[[str], tuple[np.ndarray, tuple[float, float]]],
+    read_gray: ReadGray,
     config: Refinement,
     options: "MapOptions",
     matches: Mapping[Pair, PairResult],
@@ -248,11 +241,6 @@ def _refine(
     from jaxsfm.host.mapping import registered
     from jaxsfm.refine import refine_model
     from jaxsfm.weak_views import Evidence, LeftOut
-
-    @functools.lru_cache(maxsize=GRAYS)
-    def read_gray(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        rgb, scale = read(name)
-        return gray(rgb), scale
 
     refined, figures = [], []
     mapped = {name for model in models for name in registered(model)}

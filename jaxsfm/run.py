@@ -21,7 +21,7 @@ from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap_models import write_models
 from jaxsfm.host.features import ImageFeatures, image_room
 from jaxsfm.host.given import Beside, read_given
-from jaxsfm.host.images import DamagedImage, ImageError, ImageFile
+from jaxsfm.host.images import ImageError, ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs
@@ -227,15 +227,9 @@ def _retrieve(
             on_image=bar.update,
         )
     for image, error in found.lost:
-        _note(folder, image, error)
+        folder.note_failure(image, error)
     lost = {image.name: str(error) for image, error in found.lost}
     return nearest_pairs(found.vectors, k), lost
-
-
-def _note(folder: WorkFolder, image: ImageFile, error: ImageError) -> None:
-    """What is damaged stays so; another failure may be over the next time."""
-    if isinstance(error, DamagedImage):
-        folder.mark_unusable(image, str(error))
 
 
 def extract_missing(
@@ -256,7 +250,7 @@ def extract_missing(
     stream = engine.extracted(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
-            _note(folder, image, found)
+            folder.note_failure(image, found)
             skipped[image.name] = str(found)
         else:
             folder.save_features(found)

@@ -17,6 +17,8 @@ class Stages(Protocol):
 
     def record_stage(self, name: str, key: str) -> AbstractContextManager[Path]: ...
 
+    def stage_folder(self, name: str) -> Path: ...
+
     def forget_stage(self, name: str) -> None: ...
 
 
@@ -39,8 +41,12 @@ class InScratch:
 
     @contextlib.contextmanager
     def record_stage(self, name: str, key: str) -> Iterator[Path]:
-        (self._scratch / name).mkdir()
-        yield self._scratch / name
+        folder = self.stage_folder(name)
+        folder.mkdir()
+        yield folder
+
+    def stage_folder(self, name: str) -> Path:
+        return self._scratch / name
 
     def forget_stage(self, name: str) -> None:
         pass
@@ -54,4 +60,4 @@ def made(stages: Stages, name: str, key: str, make: Callable[[Path], None]) -> P
         return folder
     with stages.record_stage(name, key) as fresh:
         make(fresh)
-    return stages.stage(name, key) or fresh
+    return stages.stage_folder(name)

@@ -18,7 +18,7 @@ from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
 from jaxsfm.host.atomic import PARTIAL, load_arrays, read_json, save_arrays, write_atomic
 from jaxsfm.host.features import ImageFeatures
-from jaxsfm.host.images import ImageFile
+from jaxsfm.host.images import DamagedImage, ImageError, ImageFile
 from jaxsfm.host.pairs import Pair, PairResult, describe
 
 Identity = Mapping[str, Any]
@@ -122,6 +122,11 @@ class Store:
         """Why an earlier attempt could not decode the photo."""
         reason = self._unusable().get(digest(self.identity.get("version"), image.sha256))
         return reason if isinstance(reason, str) else None
+
+    def note_failure(self, image: ImageFile, error: ImageError) -> None:
+        """What is damaged stays so; another failure may be over the next time."""
+        if isinstance(error, DamagedImage):
+            self.mark_unusable(image, str(error))
 
     def mark_unusable(self, image: ImageFile, reason: str) -> None:
         """Remember a photo that cannot be decoded, so that going on does not try again."""

@@ -30,9 +30,13 @@ class WorkFolder(Store):
 
     # -- stages after matching -------------------------------------------------------------------
 
+    def stage_folder(self, name: str) -> Path:
+        """Where a stage's files lie."""
+        return self.path / "stages" / name
+
     def stage(self, name: str, key: str) -> Path | None:
         """The folder of a finished stage, if it was made from what `key` says and is whole."""
-        folder = self.path / "stages" / name
+        folder = self.stage_folder(name)
         try:
             found = (folder / _KEY).read_text(encoding="ascii")
             return folder if found == f"{key} {_content(folder)}" else None
@@ -42,13 +46,13 @@ class WorkFolder(Store):
     @contextlib.contextmanager
     def record_stage(self, name: str, key: str) -> Iterator[Path]:
         """A folder for a stage's files; it takes the place of the former one when it is whole."""
-        with atomic_folder(self.path / "stages" / name) as fresh:
+        with atomic_folder(self.stage_folder(name)) as fresh:
             yield fresh
             (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
 
     def forget_stage(self, name: str) -> None:
         """It is made again the next time."""
-        (self.path / "stages" / name / _KEY).unlink(missing_ok=True)
+        (self.stage_folder(name) / _KEY).unlink(missing_ok=True)
 
     # -- results ---------------------------------------------------------------------------------
 
