@@ -39,11 +39,11 @@ from jaxsfm.known_run import (
     view_of,
 )
 from jaxsfm.localize import LocalizeOptions
+from jaxsfm.missing import extract_missing, match_missing
 from jaxsfm.page.after_run import page_after_run
 from jaxsfm.patches import gray_reader, rgb_reader
 from jaxsfm.pipeline import open_images
 from jaxsfm.reconstruction import pixel_scale
-from jaxsfm.run import extract_missing, match_missing
 from jaxsfm.run_options import RunOptions
 
 
@@ -132,7 +132,8 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
         report["seconds"] = seconds | {"extension": took}
         text = json.dumps(report, indent=1, default=str)
         write_atomic(target / "report.json", text.encode())
-    folder.drop_features()
+    if not options.keep_features:
+        folder.drop_features()
     page_after_run(run)
     return report
 

@@ -64,6 +64,11 @@ class LocalizeOptions:
     shortlist: Shortlist | int = 20
     """Photos that a new one is matched with; a number: the most similar ones."""
 
+    execution: Execution = dataclasses.field(default_factory=Execution)
+    keep_features: bool = False
+    """Of the run's photos, in its folder, for the next time (25 MB for 1536 x 1024)."""
+    progress: bool = False
+
     def chosen_shortlist(
         self, run: KeptRun, weights: Weights, new: Mapping[str, ImageFile]
     ) -> Shortlist:
@@ -71,9 +76,6 @@ class LocalizeOptions:
         if isinstance(self.shortlist, int):
             return by_similarity(run, weights, self.shortlist, new, self.execution)
         return self.shortlist
-
-    execution: Execution = dataclasses.field(default_factory=Execution)
-    progress: bool = False
 
 
 def locate_photo(
@@ -124,9 +126,10 @@ def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, st
 def _features(
     run: KeptRun, weights: Weights, files: Mapping[str, ImageFile], options: LocalizeOptions
 ) -> Iterator[Callable[[str], ImageFeatures]]:
-    """Features of the run's photos by name: kept ones, else computed once, on disk meanwhile."""
+    """Features of the run's photos by name: kept ones, else computed once, on disk (meanwhile)."""
     with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-        fresh = Store(Path(scratch), run.report["identity"])
+        apart = Store(Path(scratch), run.report["identity"])
+        fresh = run.matches if options.keep_features else apart
         todo = [image for image in files.values() if not run.matches.has_features(image)]
         stream = extracted(weights, todo, config=run.config, execution=options.execution)
         bar = tqdm(

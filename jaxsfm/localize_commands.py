@@ -17,6 +17,7 @@ def localize(
     intrinsics: str | None = None,
     reference: Path | None = None,
     shortlist: int = 20,
+    keep_features: bool = False,
     network: WeightsChoice = USUAL_WEIGHTS,
 ) -> int:
     """Where photos were taken, in the model of a finished run, which stays as it is.
@@ -36,6 +37,8 @@ def localize(
       reference: Reference poses (Strecha .camera files or a COLMAP model) of these photos and of
         the run's: errors are told.
       shortlist: How many of the run's photos, the most similar ones, a photo is matched with.
+      keep_features: Leave the features of those in the run's folder (25 MB for a photo of
+        1536 x 1024): the next call has them at hand.
       network: The network's parameters; they must be the run's.
     """
     check_writable(out, "--out", (".json",))
@@ -48,6 +51,7 @@ def localize(
         intrinsics=intrinsics,
         reference=reference,
         shortlist=shortlist,
+        keep_features=keep_features,
         network=network,
         progress=True,
     )
@@ -67,6 +71,7 @@ def extend(
     images: Path | None = None,
     intrinsics: str | None = None,
     shortlist: int = 20,
+    keep_features: bool = False,
     network: WeightsChoice = USUAL_WEIGHTS,
 ) -> int:
     """Put photos that were added to a finished run's folder since into its model.
@@ -81,6 +86,7 @@ def extend(
       images: Folder with the photos, old and new; default: where the run found them.
       intrinsics: Of the new photos, as in localize.
       shortlist: How many others, the most similar ones, a new photo is matched with.
+      keep_features: Do not delete the folder's features in the end; see localize.
       network: The network's parameters; they must be the run's.
     """
     from jaxsfm.extend import extend
@@ -91,6 +97,7 @@ def extend(
         images=images,
         intrinsics=intrinsics,
         shortlist=shortlist,
+        keep_features=keep_features,
         network=network,
         progress=True,
     )

@@ -4,24 +4,20 @@ import importlib.metadata
 import json
 import logging
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
 from jaxsfm.config import Config
-from jaxsfm.engines import chosen_engine
 from jaxsfm.errors import UserError
 from jaxsfm.evaluation import evaluate
-from jaxsfm.extraction import image_features
-from jaxsfm.host import interrupt
 from jaxsfm.host.atomic import write_atomic
 from jaxsfm.host.colmap_models import write_models
-from jaxsfm.host.features import ImageFeatures, image_room
 from jaxsfm.host.given import Beside, read_given
-from jaxsfm.host.images import ImageError, ImageFile
+from jaxsfm.host.images import ImageFile
 from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.host.mapping import MapOptions
 from jaxsfm.host.pairs import Pair, PairCounts, PairResult, best_pairs
@@ -30,6 +26,7 @@ from jaxsfm.host.poses import model_poses, read_poses
 from jaxsfm.host.store import SavedMatches, digest
 from jaxsfm.host.weights import Weights, chosen_weights
 from jaxsfm.host.workfolder import WorkFolder, open_folder
+from jaxsfm.missing import extract_missing, match_missing
 from jaxsfm.page.after_run import page_after_run
 from jaxsfm.pipeline import open_images
 from jaxsfm.reconstruction import Reconstructed, reconstruct
@@ -38,7 +35,6 @@ from jaxsfm.run_options import RunOptions, check_options
 from jaxsfm.run_report import Done, run_report
 from jaxsfm.stages import Kept
 
-T = TypeVar("T")
 logger = logging.getLogger("jaxsfm")
 
 
@@ -131,7 +127,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                     report["evaluation_failed"] = str(error)
             text = json.dumps(report, indent=1, default=str)
             write_atomic(fresh / "report.json", text.encode())
-        folder.drop_features()
+        if not options.keep_features:
+            folder.drop_features()
         # While the folder is ours: another run there would replace what the page shows.
         page_after_run(out if made.models or not (out / "sparse").exists() else out / "failed")
         return report
@@ -206,12 +203,6 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = time.monotonic() - start
 
 
-def _bar(items: Iterable[T], total: int, stage: str, unit: str, options: RunOptions) -> Iterator[T]:
-    quiet = not options.progress or not total
-    yield from tqdm(items, total=total, desc=stage, unit=unit, disable=quiet)
-    interrupt.check()
-
-
 def _retrieve(
     folder: WorkFolder, weights: Weights, images: list[ImageFile], k: int, options: RunOptions
 ) -> tuple[list[Pair], dict[str, str]]:
@@ -230,57 +221,6 @@ def _retrieve(
         folder.note_failure(image, error)
     lost = {image.name: str(error) for image, error in found.lost}
     return nearest_pairs(found.vectors, k), lost
-
-
-def extract_missing(
-    folder: WorkFolder,
-    weights: Weights,
-    images: dict[str, ImageFile],
-    pairs: list[Pair],
-    config: Config,
-    options: RunOptions,
-) -> dict[str, str]:
-    """Features of every image of `pairs` that has none yet; why some have none."""
-    needed = sorted({name for pair in pairs for name in pair})
-    todo = [images[name] for name in needed if not folder.has_features(images[name])]
-    skipped: dict[str, str] = {}
-    if not todo:
-        return skipped
-    engine = chosen_engine(options.engine)
-    stream = engine.extracted(weights, todo, config=config, execution=options.execution)
-    for image, found in _bar(stream, len(todo), "extraction", "image", options):
-        if isinstance(found, ImageError):
-            folder.note_failure(image, found)
-            skipped[image.name] = str(found)
-        else:
-            folder.save_features(found)
-    return skipped
-
-
-def match_missing(
-    folder: WorkFolder,
-    weights: Weights,
-    images: dict[str, ImageFile],
-    pairs: list[Pair],
-    config: Config,
-    options: RunOptions,
-) -> Iterator[PairResult]:
-    """Matches of pairs, saved as they are made."""
-
-    def load(name: str) -> ImageFeatures:
-        found = folder.load_features(images[name])
-        if found is None:  # damaged or deleted under us: it is only a cache
-            found = image_features(weights, images[name], config=config)
-            folder.save_features(found)
-        return found
-
-    rooms = {name: image_room(image, config=config) for name, image in images.items()}
-    stream = chosen_engine(options.engine).matched(
-        load, rooms, pairs, config=config, seed=options.seed, execution=options.execution
-    )
-    for result in _bar(stream, len(pairs), "matching", "pair", options):
-        folder.save_matches(result)
-        yield result
 
 
 def _choose(results: dict[Pair, PairCounts], n: int | None) -> set[Pair]:

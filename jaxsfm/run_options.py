@@ -43,6 +43,8 @@ class RunOptions:
     """Devices, batches, memory."""
     engine: EngineChoice = LOCAL
     """This process, or workers on Ray."""
+    keep_features: bool = False
+    """Leave them in the folder, for `localize` and `extend` (25 MB for 1536 x 1024)."""
     progress: bool = False
     """Progress bars on standard error."""
 

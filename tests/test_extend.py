@@ -58,7 +58,8 @@ def extended(plain, scene, tmp_path_factory) -> Extended:
     assert {n: c for n, c in contents(run).items() if "/sparse/" in n and "stages" not in n} == {
         n: c for n, c in before.items() if "stages" not in n
     }
-    assert main(["extend", str(run)]) == 0
+    assert main(["extend", str(run), "--keep-features"]) == 0
+    assert len(list(run.glob("features/*/*.npz"))) == 5
     return Extended(
         run,
         photos,

@@ -122,6 +122,25 @@ def test_a_photo_alone_and_under_another_name_has_the_same_pose(localized, plain
         assert alone[key] == localized["new.png"][key], key
 
 
+def test_kept_features_spare_the_next_call_and_change_no_pose(
+    localized, plain, photos, tmp_path, monkeypatch
+):
+    run, computed = Path(shutil.copytree(plain[0], tmp_path / "run")), []
+    extracted = localize_module.extracted
+
+    def counted(weights, images, **kwargs):
+        computed.append(len(images))
+        return extracted(weights, images, **kwargs)
+
+    monkeypatch.setattr(localize_module, "extracted", counted)
+    for keep in (True, False):  # the second call neither computes nor deletes
+        options = LocalizeOptions(keep_features=keep)
+        row = localize([photos / "photos" / "new.png"], run, options=options)["photos"][0]
+        assert row["cam_from_world"] == localized["new.png"]["cam_from_world"]
+        assert len(list(run.glob("features/*/*.npz"))) == 3
+    assert computed == [3, 0]
+
+
 def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
     options = LocalizeOptions(shortlist=lambda image, names: [n for n in names if n == "view2.png"])
     result = localize([photos / "photos" / "new.png"], plain[0], options=options)
@@ -173,6 +192,15 @@ def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
     choose = by_similarity(run, weights, 1, {"photo": image}, Execution())
     assert choose(image, ["view0.png", "view2.png"]) == ["view0.png"]
     assert not list(home.glob("descriptors/*/*"))
+
+
+def test_features_that_cannot_be_kept_are_one_sentence(plain, photos, tmp_path, capsys):
+    run = Path(shutil.copytree(plain[0], tmp_path / "run"))
+    (run / "features").write_text("in the way")
+    command = ["localize", str(photos / "photos" / "new.png"), "--model", str(run)]
+    assert main([*command, "--keep-features"]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error and f"{run}" in error
 
 
 def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, photos):
