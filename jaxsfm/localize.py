@@ -132,9 +132,8 @@ def _features(
         fresh = run.matches if options.keep_features else apart
         todo = [image for image in files.values() if not run.matches.has_features(image)]
         stream = extracted(weights, todo, config=run.config, execution=options.execution)
-        bar = tqdm(
-            stream, total=len(todo), desc="extraction", unit="image", disable=not options.progress
-        )
+        quiet = not options.progress or not todo
+        bar = tqdm(stream, total=len(todo), desc="extraction", unit="image", disable=quiet)
         for _, found in bar:
             if isinstance(found, ImageError):
                 raise found

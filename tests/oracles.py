@@ -122,9 +122,11 @@ def mutual_nn(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def consensus_nn(a, b, grid0, grid1, weights) -> tuple[np.ndarray, np.ndarray]:
     """Mutual best cells under the sum of similarities over equal shifts, cell by cell."""
     radius = len(weights) // 2
+    grid0, grid1 = ([int(n) for n in grid] for grid in (grid0, grid1))
+    products = np.asarray(a, np.float64) @ np.asarray(b, np.float64).T
     s = np.full((len(a), len(b)), -np.inf)
-    for i in np.flatnonzero(a.any(1)):
-        for j in np.flatnonzero(b.any(1)):
+    for i in np.flatnonzero(a.any(1)).tolist():
+        for j in np.flatnonzero(b.any(1)).tolist():
             total = 0.0
             for dr in range(-radius, radius + 1):
                 for dc in range(-radius, radius + 1):
@@ -135,7 +137,7 @@ def consensus_nn(a, b, grid0, grid1, weights) -> tuple[np.ndarray, np.ndarray]:
                             at.append(r * columns + c)
                     if len(at) == 2:
                         w = weights[dr + radius] * weights[dc + radius]
-                        total += w * float(a[at[0]].astype(np.float64) @ b[at[1]])
+                        total += w * products[at[0], at[1]]
             s[i, j] = total
     return _mutual(s)
 
