@@ -40,8 +40,9 @@ def towards_others(
     """What could connect a group of images to the others.
 
     Args:
-      group: images that trusted pairs join, or a single one.
-      crossing: the pairs tried between them and all others; none is trusted.
+      group: images that trusted pairs join or that have a model of their own, or a single one.
+      crossing: the pairs tried between them and all others. Trusted ones did not lead the mapper
+        over.
     """
     best = pairs.best(crossing)
     found = [
@@ -116,7 +117,7 @@ def _more_handed_on(tried: Collection[Pair], pairs: PairOutcomes) -> list[Help]:
 
 
 def _more_trusted(crossing: Collection[Pair], pairs: PairOutcomes) -> list[Help]:
-    dropped = [p for p in crossing if p in pairs.verified]
+    dropped = [p for p in crossing if p in pairs.verified and not pairs.trusted(p)]
     best = pairs.best(dropped)
     if best is None:
         return []
@@ -150,6 +151,5 @@ def _photos(best: Pair | None, pairs: PairOutcomes, *, alone: bool) -> Help:
     only = "no option would help, only " * alone
     if best is None:
         return Help(None, f"{only}photos that show it together with the others")
-    return Help(
-        None, f"{only}photos between {describe(best)}, which come nearest ({pairs.missed(best)})"
-    )
+    lack = pairs.missed(best) or f"{pairs.verified[best]} inliers, too little for the mapper"
+    return Help(None, f"{only}photos between {describe(best)}, which come nearest ({lack})")

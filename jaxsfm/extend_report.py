@@ -83,6 +83,7 @@ def extended_report(
                 known_camera=report["options"]["intrinsics"] is not None,
                 sizes=sizes,
             ),
+            report["refinement"],
         ),
         "extended": [
             *report.get("extended", []),

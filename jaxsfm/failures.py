@@ -1,6 +1,6 @@
 """Why images were lost, or no model came out: where, with which numbers, and what may help."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from jaxsfm.advice import LEAST_ANGLE_DEG, Circumstances, Help, towards_others, without_pose
@@ -13,16 +13,18 @@ def explained(
     models: Sequence[Collection[str]],
     pairs: PairOutcomes,
     made: Circumstances,
+    refinement: Sequence[Mapping[str, Any] | None] = (),
 ) -> dict[str, Any]:
     """The report's `view_graph`, `lost` and `no_model`, plain JSON.
 
     Args:
       models: each one's images, the best first.
+      refinement: the report's, of each model.
     """
     groups = components(made.sizes, pairs)
     return {
         "view_graph": {"components": _component_rows(groups, models, pairs)},
-        "lost": lost_images(groups, models, pairs, made),
+        "lost": lost_images(groups, models, pairs, made, _taken_out(refinement)),
         "no_model": None if models else no_model(pairs),
     }
 
@@ -32,12 +34,18 @@ def lost_images(
     models: Sequence[Collection[str]],
     pairs: PairOutcomes,
     made: Circumstances,
+    taken_out: Mapping[str, str],
 ) -> list[dict[str, Any]]:
     """For every image without a pose in the best model, the stage that lost it and the numbers.
 
     Stages, in the pipeline's order: `pairs` (never paired), `too few matches` (no pair had enough
     tentative matches), `no plane` (no homography had enough inliers), `not connected` (no chain of
-    trusted pairs to the model), `no pose` (connected, but COLMAP found no pose).
+    trusted pairs to the model), `no pose` (connected, but COLMAP found no pose), `not confirmed`
+    (COLMAP found one, and refinement took it out of the model again), `other model` (it is in a
+    smaller one, though trusted pairs lead to the best).
+
+    Args:
+      taken_out: why refinement took images out of a model.
     """
     best_model = set(models[0]) if models else set()
     own: dict[str, list[Pair]] = {name: [] for name in made.sizes}
@@ -50,27 +58,53 @@ def lost_images(
         advice: list[Help] | None = None  # of a group that is not connected: the same for all of it
         for name in sorted(group.images - best_model):
             stage, detail = _stage(name, own[name], connected, pairs)
-            if stage != "no pose":
+            smaller = next((k for k, images in enumerate(models) if k and name in images), None)
+            if smaller is not None:
+                stage = "other model" if stage == "no pose" else stage
+                detail += f"; in the smaller model sparse/{smaller}"
+            elif name in taken_out:
+                stage, detail = "not confirmed", f"{detail}; {taken_out[name]}"
+            if stage == "no pose":
+                found = without_pose(name, own[name], pairs, made, model=bool(models))
+            elif stage == "not confirmed":
+                found = towards_others([name], own[name], pairs, made)
+            elif stage == "other model":
+                island = set(models[smaller or 0]) - best_model
+                found = towards_others(island, _leaving(island, pairs), pairs, made)
+            else:
                 advice = advice or towards_others(group.images, group.crossing, pairs, made)
                 found = advice
-            else:
-                found = without_pose(name, own[name], pairs, made, model=bool(models))
             best = pairs.best(own[name])
-            smaller = [k for k, images in enumerate(models) if k and name in images]
-            if smaller:
-                detail += f"; in the smaller model sparse/{smaller[0]}"
             rows.append(
                 {
                     "image": name,
                     "stage": stage,
                     "detail": detail,
                     "component": index,
-                    "model": smaller[0] if smaller else None,
+                    "model": smaller,
                     "best_pair": best and pairs.row(best),
                     "help": [each._asdict() for each in found],
                 }
             )
     return sorted(rows, key=lambda row: row["image"])
+
+
+def _taken_out(refinement: Sequence[Mapping[str, Any] | None]) -> dict[str, str]:
+    """Why refinement took images out of a model."""
+    return {
+        at["name"]: (
+            f"the mapper gave it a pose, but alignment finds {at['agreed']} of the "
+            f"{at['candidates']} points that it should show, and {at['held']} points hold it"
+        )
+        for each in refinement
+        for at in (each["placed"] if each else ())
+        if at.get("held") is not None
+    }
+
+
+def _leaving(images: Collection[str], pairs: PairOutcomes) -> list[Pair]:
+    """Pairs tried between some images and all others."""
+    return [pair for pair in pairs.results if (pair[0] in images) != (pair[1] in images)]
 
 
 def _stage(name: str, own: Sequence[Pair], connected: bool, pairs: PairOutcomes) -> tuple[str, str]:

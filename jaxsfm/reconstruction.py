@@ -262,4 +262,6 @@ def _refine(
         left_out = [image for image in left_out if image.name not in registered(new)]
         refined.append(new)
         figures.append(done)
-    return refined, figures
+    # Images came and went: the first is the one with most.
+    order = sorted(range(len(refined)), key=lambda k: -refined[k].num_reg_images())
+    return [refined[k] for k in order], [figures[k] for k in order]

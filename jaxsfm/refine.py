@@ -28,7 +28,7 @@ from jaxsfm.host.model import (
 )
 from jaxsfm.patches import ReadGray
 from jaxsfm.track_alignment import AlignedBlock, align_blocks
-from jaxsfm.weak_views import NO_EVIDENCE, Evidence, Placed, place_weak_views
+from jaxsfm.weak_views import NO_EVIDENCE, Evidence, Placed, place_weak_views, take_out
 
 if TYPE_CHECKING:
     import pycolmap
@@ -119,9 +119,10 @@ def refine_model(
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
     """A refined model, and what was done.
 
-    Thresholds are in pixels of the working images. The model keeps all its images: one where too
-    little agrees keeps its old observations, at four times the error limit, until it is placed on
-    the refined structure. A pass that would lose most of the points is taken back.
+    Thresholds are in pixels of the working images. An image where too little agrees keeps its old
+    observations, at four times the error limit, until it is placed on the refined structure; one
+    that cannot be placed and that hardly any observations hold is taken out. A pass that would
+    lose most of the points is taken back.
 
     Args:
       model: from the mapper; not changed.
@@ -187,6 +188,8 @@ def refine_model(
             refine_intrinsics=refine_intrinsics,
             evidence=evidence,
         )
+        if config.weak_octaves:  # else nobody has tried to confirm them
+            model, placed = take_out(model, placed, sizes)
     return model, RefinementFigures(passes=figures, placed=placed)
 
 

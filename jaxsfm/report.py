@@ -132,7 +132,7 @@ def summary_lines(report: Mapping[str, Any]) -> list[str]:
             + ("" if last["accepted"] else "; too few, taken back")
         )
         for at in refinement["placed"]:
-            if not at["registered"] and not at["octave_px"]:
+            if not at["octave_px"] and (not at["registered"] or at.get("held") is not None):
                 continue  # it is among the lost
             name, px = shown_name(at["name"]), at["octave_px"]
             lines.append(

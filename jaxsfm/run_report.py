@@ -46,6 +46,7 @@ def run_report(done: Done, *, config: Config, options: RunOptions) -> dict[str, 
     untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
     figures = [model_figures(model) for model in made.models]
     counts = done.given.counts(results)
+    refinement = [each and dataclasses.asdict(each) for each in made.refinement]
     return {
         "version": done.identity["version"],
         "versions": versions(),
@@ -78,7 +79,7 @@ def run_report(done: Done, *, config: Config, options: RunOptions) -> dict[str, 
         "given": done.given.about,
         "models": figures,
         "mapping": [dataclasses.asdict(attempt) for attempt in made.attempts],
-        "refinement": [each and dataclasses.asdict(each) for each in made.refinement],
+        "refinement": refinement,
         **explained(
             [each["images"] for each in figures],
             PairOutcomes(
@@ -95,6 +96,7 @@ def run_report(done: Done, *, config: Config, options: RunOptions) -> dict[str, 
                 known_camera=options.intrinsics is not None,
                 sizes={image.name: image.size for image in done.usable},
             ),
+            refinement,
         ),
         "seconds": done.seconds,
     }

@@ -56,6 +56,7 @@ def explain(
     pairs="exhaustive",
     known_camera=True,
     side=1600,
+    refinement=(),
 ):
     """`explained`, of images of 1600 px with a known camera, all of whose pairs were tried."""
     if handed_on is None:
@@ -71,7 +72,7 @@ def explain(
     made = Circumstances(
         config or preset("default"), pairs, known_camera, dict.fromkeys(names, (side, side // 2))
     )
-    found = explained(models, outcomes, made)
+    found = explained(models, outcomes, made, refinement)
     assert json.loads(json.dumps(found)) == found
     return found
 
@@ -142,6 +143,46 @@ def test_an_image_of_a_smaller_model_says_which():
     found = rows(explain(NAMES, RESULTS, VERIFIED, [["m0", "m1"], ["island0", "island1"]]))
     assert found["island0"]["model"] == 1 and "sparse/1" in found["island0"]["detail"]
     assert found["odd"]["model"] is None
+
+
+def test_an_image_of_a_smaller_model_that_trusted_pairs_join_to_the_best_is_told_what_is_between():
+    """COLMAP went no further: a pair of other places, or too little in common."""
+    tried = {
+        ("a", "b"): counts(Status.VERIFIED, 500, 400),
+        ("b", "c"): counts(Status.VERIFIED, 90, 60),
+        ("c", "d"): counts(Status.VERIFIED, 500, 300),
+    }
+    verified = {("a", "b"): 300, ("b", "c"): 42, ("c", "d"): 200}
+    found = rows(explain("abcd", tried, verified, [["a", "b"], ["c", "d"]], known_camera=False))
+    assert {row["stage"] for row in found.values()} == {"other model"} and set(found) == {"c", "d"}
+    for row in found.values():
+        assert "sparse/1" in row["detail"] and row["model"] == 1
+        reasons = " ".join(each["reason"] for each in row["help"])
+        assert "photos between b - c" in reasons and "42 inliers, too little" in reasons
+        assert "--intrinsics" not in options(row)  # they have poses
+
+
+def test_an_image_that_refinement_took_out_says_what_was_missing():
+    tried = {
+        ("a", "b"): counts(Status.VERIFIED, 500, 400),
+        ("b", "c"): counts(Status.VERIFIED, 90, 60),
+    }
+    placed = [
+        {"name": "a", "candidates": 9, "agreed": 1, "held": None},
+        {"name": "c", "candidates": 2541, "agreed": 12, "held": 6},
+    ]
+    found = explain(
+        "abc",
+        tried,
+        {("a", "b"): 300, ("b", "c"): 42},
+        [["a", "b"]],
+        refinement=[None, {"placed": placed}],
+    )
+    (row,) = found["lost"]
+    assert row["image"] == "c" and row["stage"] == "not confirmed"
+    for number in ("42 inliers", "12 of the 2541 points", "6 points hold it"):
+        assert number in row["detail"]
+    assert "photos between b - c" in row["help"][-1]["reason"]
 
 
 # -- groups ----------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pycolmap
 import pytest
+import tolerances
 from room_scene import (
     SIZE,
     Room,
@@ -23,12 +24,20 @@ from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.images import ImageError
+from jaxsfm.host.mapping import registered
 from jaxsfm.host.model import build_model, read_model_arrays
 from jaxsfm.host.pairs import PairResult, make_pair
 from jaxsfm.host.poses import model_poses
 from jaxsfm.refine import refine_model
 from jaxsfm.track_alignment import align_blocks
-from jaxsfm.weak_views import NO_EVIDENCE, Evidence, LeftOut, place_weak_views
+from jaxsfm.weak_views import (
+    NO_EVIDENCE,
+    Evidence,
+    LeftOut,
+    Placed,
+    place_weak_views,
+    take_out,
+)
 
 NIGHT, NIGHT_NAME = 2, "2.png"
 PHOTONS = 0.02
@@ -41,11 +50,13 @@ def by_night(scene: Room) -> Room:
     return scene._replace(images=scene.images | {NIGHT_NAME: (counts / PHOTONS).astype(np.float32)})
 
 
-def lost_view(scene: Room, *, turn_deg: float = 1.0, shift: float = 0.0) -> pycolmap.Reconstruction:
-    """The exact model, but the night view looks elsewhere and has 40 observations."""
+def lost_view(
+    scene: Room, *, turn_deg: float = 1.0, shift: float = 0.0, seen: int = 40
+) -> pycolmap.Reconstruction:
+    """The exact model, but the night view looks elsewhere and has few observations."""
     tracks = exact_tracks(scene)
     night = np.flatnonzero(tracks.view == NIGHT)
-    keep = np.delete(np.arange(len(tracks.view)), night[40:])
+    keep = np.delete(np.arange(len(tracks.view)), night[seen:])
     tracks = tracks._replace(point=tracks.point[keep], view=tracks.view[keep], xy=tracks.xy[keep])
     views = list(scene.views)
     angle = np.radians(turn_deg)
@@ -139,6 +150,56 @@ def test_a_view_of_something_else_stays_as_it_was(rendered):
     after, (placed,) = place(before, elsewhere)
     assert placed.octave_px is None and placed.error_px is None and placed.candidates > 100
     assert after is before
+
+
+@pytest.mark.parametrize(("seen", "stays"), [(30, True), (29, False), (0, False)])
+def test_a_view_that_neither_alignment_nor_observations_hold_is_taken_out(rendered, seen, stays):
+    """A photo of another place, among photos that look a little like it."""
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    before = lost_view(elsewhere, seen=seen)
+    model, placed = place(before, elsewhere)
+    after, (told,) = take_out(model, placed, sizes(elsewhere))
+    assert registered(after) == registered(before) - (set() if stays else {NIGHT_NAME})
+    assert told.held == (None if stays else seen)
+    if stays:
+        assert after is before
+        return
+    (views, tracks), (old_views, old) = (
+        read_model_arrays(m, sizes(elsewhere)) for m in (after, before)
+    )
+    for k, view in enumerate(views):  # of the others nothing changes
+        j = [v.name for v in old_views].index(view.name)
+        np.testing.assert_allclose(view.centre, old_views[j].centre, **tolerances.UNIT)
+        theirs = old.xy[old.view == j]
+        assert len(theirs) - seen <= (tracks.view == k).sum() <= len(theirs)
+
+
+def test_a_view_that_alignment_confirms_stays_however_little_held_it(rendered):
+    night = by_night(rendered)
+    model, placed = place(lost_view(night, seen=10), night)
+    after, (told,) = take_out(model, placed, sizes(night))
+    assert told.octave_px is not None and told.held is None and after is model
+
+
+def test_two_views_are_a_model_whatever_holds_them(rendered):
+    model = lost_view(rendered, seen=0)
+    weak = [
+        Placed(name=n, registered=True, octave_px=None, candidates=9, agreed=0, error_px=None)
+        for n in sorted(registered(model))
+    ]
+    few = read_model_arrays(model, sizes(rendered))
+    bare = build_model(model, few[0], few[1]._replace(points=np.zeros((0, 3))))
+    assert take_out(bare, weak, sizes(rendered)) == (bare, weak)
+
+
+def test_refinement_takes_a_photo_of_another_place_out_of_the_model(rendered):
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    after, figures = refine(lost_view(elsewhere, seen=12), elsewhere)
+    assert NIGHT_NAME not in registered(after) and after.num_reg_images() == 4
+    (told,) = figures.placed
+    assert told.held is not None and told.held <= 12
+    kept, _ = refine(lost_view(elsewhere, seen=12), elsewhere, weak_octaves=0)
+    assert NIGHT_NAME in registered(kept)  # where nobody looks, nobody refutes
 
 
 def test_a_model_of_weak_views_alone_stays_as_it_was(rendered):

@@ -25,6 +25,8 @@ ADVICE = {
     "no plane": "try --preset robust; the scene may show no surface that both photos share",
     "not connected": "take photos between it and the others, or look at the refused pairs",
     "no pose": "take more photos near it; known --intrinsics help too",
+    "not confirmed": "is it of the same place? if it is, take photos between it and the others",
+    "other model": "is it of the same place? if it is, take photos between it and the others",
 }
 """What may help an image lost at a stage, for runs of versions that did not record it."""
 
