@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxsfm import surface
 from jaxsfm.config import Refinement
@@ -107,6 +109,18 @@ def _align(
     return moved, agrees
 
 
+def neighbourhoods(tracks: Tracks, count: int) -> np.ndarray:
+    """The points (n,) in an order in which those that the same views see are near each other: by
+    their first view, where views that see the same are near each other (reverse Cuthill-McKee)."""
+    shape = (len(tracks.points), count)
+    seen = coo_array((np.ones(len(tracks.point)), (tracks.point, tracks.view)), shape=shape).tocsr()
+    place = np.empty(count, int)
+    place[reverse_cuthill_mckee((seen.T @ seen).tocsr(), symmetric_mode=True)] = np.arange(count)
+    first = np.full(len(tracks.points), count)
+    np.minimum.at(first, tracks.point, place[tracks.view])
+    return np.argsort(first, kind="stable")
+
+
 def align_blocks(
     tracks: Tracks,
     views: list[View],
@@ -116,7 +130,8 @@ def align_blocks(
     *,
     targets: Sequence[int] | None = None,
 ) -> Iterator[AlignedBlock]:
-    """Align every point's observations, so many points at a time that memory stays bounded.
+    """Align every point's observations, so many points at a time that memory stays bounded, and so
+    that few views see them: a photo is read once or twice, however many there are.
 
     Args:
       tracks: every point has an observation.
@@ -125,13 +140,19 @@ def align_blocks(
     normal = surface.normals(tracks, views, neighbours=config.neighbours)
     patch = align_core.square_patch(config.radius)
     step = max(MIN_BLOCK, min(CELLS // len(views), MAX_BLOCK))
-    order = np.argsort(tracks.point, kind="stable")
-    ends = np.searchsorted(tracks.point[order], np.arange(len(tracks.points) + 1))
-    for first in range(0, len(tracks.points), step):
-        rows = np.arange(first, min(first + step, len(tracks.points)))
-        own = order[ends[first] : ends[rows[-1] + 1]]
+    near = neighbourhoods(tracks, len(views))
+    block = np.empty(len(near), int)
+    block[near] = np.arange(len(near)) // step
+    order = np.lexsort((tracks.point, block[tracks.point]))
+    ends = np.searchsorted(block[tracks.point][order], np.arange(-(-len(near) // step) + 1))
+    for number, first in enumerate(range(0, len(near), step)):
+        rows = np.sort(near[first : first + step])
+        own = order[ends[number] : ends[number + 1]]
         part = Tracks(
-            tracks.points[rows], tracks.point[own] - first, tracks.view[own], tracks.xy[own]
+            tracks.points[rows],
+            np.searchsorted(rows, tracks.point[own]),
+            tracks.view[own],
+            tracks.xy[own],
         )
         seen = surface.visibility(part, views, normal[rows])
         reference = surface.reference_views(seen)

@@ -21,9 +21,10 @@ from room_scene import (
 from jaxsfm import surface
 from jaxsfm.config import Refinement
 from jaxsfm.evaluation import evaluate
-from jaxsfm.host.model import build_model, read_model_arrays
+from jaxsfm.host.model import Tracks, build_model, read_model_arrays
 from jaxsfm.host.poses import model_poses
 from jaxsfm.synthetic import arc, camera_matrix, room
+from jaxsfm.track_alignment import neighbourhoods
 
 # -- the whole refinement --------------------------------------------------------------------------
 
@@ -136,6 +137,19 @@ def test_blocks_of_points_change_nothing(rendered, monkeypatch):
     monkeypatch.setattr(module, "MIN_BLOCK", 100)
     parts = refine(model, rendered, passes=1)
     assert whole[1] == parts[1] and errors(whole[0], rendered) == errors(parts[0], rendered)
+
+
+def test_points_in_order_of_neighbourhoods_are_seen_by_few_views_at_a_time():
+    """A street of 60 views in no order, each point seen by 5 views that follow each other."""
+    rng = np.random.default_rng(0)
+    name = rng.permutation(60)
+    first = rng.integers(0, 56, 900)
+    point, view = np.repeat(np.arange(900), 5), name[(first[:, None] + np.arange(5)).ravel()]
+    tracks = Tracks(np.zeros((900, 3)), point, view, np.zeros((4500, 2)))
+    near = neighbourhoods(tracks, 60)
+    np.testing.assert_array_equal(np.sort(near), np.arange(900))
+    for block in np.split(near, 9):
+        assert len(np.unique(view[np.isin(point, block)])) <= 20  # 60 in the points' own order
 
 
 def test_one_thread_gives_the_same_model_to_the_last_bit(rendered):
