@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.config import Refinement
-from jaxsfm.host.model import Tracks, View
+from jaxsfm.host.model import Tracks, View, part_of
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.new_points import new_points
 from jaxsfm.patches import ReadGray
-from jaxsfm.single_view import Located, locate, part_of
+from jaxsfm.single_view import Located, locate
 
 
 class Newcomer(NamedTuple):

@@ -27,6 +27,7 @@ from jaxsfm.host.images import (
     inspect_image,
 )
 from jaxsfm.host.intrinsics import parse_intrinsics
+from jaxsfm.host.model import part_of
 from jaxsfm.host.pairs import Pair, PairResult
 from jaxsfm.host.store import Store
 from jaxsfm.host.weights import Weights
@@ -45,7 +46,7 @@ from jaxsfm.known_run import (
 from jaxsfm.localize_report import UNUSABLE, error_against, located_figures
 from jaxsfm.matching import matched
 from jaxsfm.patches import ReadGray, gray_reader
-from jaxsfm.single_view import Located, locate, part_of
+from jaxsfm.single_view import Located, locate
 from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 

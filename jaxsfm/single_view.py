@@ -6,7 +6,7 @@ the model.
 """
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -62,19 +62,6 @@ class Located:
     """Likewise, of the rotation."""
     observed: Observed | None = None
     """The points that it shows, of a trusted pose."""
-
-
-def part_of(
-    views: list[View], tracks: Tracks, names: Collection[str]
-) -> tuple[list[View], Tracks, np.ndarray]:
-    """Some views of a model, the points that they see, and which those are."""
-    chosen = [k for k, view in enumerate(views) if view.name in names]
-    place = np.full(len(views), -1)
-    place[chosen] = np.arange(len(chosen))
-    rows = np.flatnonzero(place[tracks.view] >= 0)
-    point, index = np.unique(tracks.point[rows], return_inverse=True)
-    part = Tracks(tracks.points[point], index, place[tracks.view[rows]], tracks.xy[rows])
-    return [views[k] for k in chosen], part, point
 
 
 def locate(

@@ -15,7 +15,7 @@ import pycolmap
 
 from jaxsfm import surface
 from jaxsfm.config import Refinement
-from jaxsfm.host.model import Sizes, Tracks, View, build_model, read_model_arrays
+from jaxsfm.host.model import Sizes, Tracks, View, build_model, part_of, read_model_arrays
 from jaxsfm.host.pairs import Pair, PairResult, make_pair
 from jaxsfm.host.resection import find_view
 from jaxsfm.patches import ReadGray
@@ -193,14 +193,11 @@ def take_out(
         for each in placed
         if each.registered and each.octave_px is None and held[each.name] < MIN_COUNT
     }
-    stay = [k for k, view in enumerate(views) if view.name not in refuted]
+    stay = held.keys() - refuted
     if not refuted or len(stay) < 2:
         return model, list(placed)
-    place = np.full(len(views), -1)
-    place[stay] = np.arange(len(stay))
-    rows = np.flatnonzero(place[tracks.view] >= 0)
-    left = Tracks(tracks.points, tracks.point[rows], place[tracks.view[rows]], tracks.xy[rows])
-    return build_model(model, [views[k] for k in stay], left), [
+    others, theirs, _ = part_of(views, tracks, stay)
+    return build_model(model, others, theirs), [
         dataclasses.replace(each, held=held[each.name]) if each.name in refuted else each
         for each in placed
     ]

@@ -8,8 +8,8 @@ from room_scene import Room, camera, exact_tracks, other_scene, read_of
 from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 
 from jaxsfm.config import Refinement
-from jaxsfm.host.model import Tracks, View
-from jaxsfm.single_view import Located, locate, part_of
+from jaxsfm.host.model import Tracks, View, part_of
+from jaxsfm.single_view import Located, locate
 
 
 def known(scene: Room) -> tuple[list[View], Tracks]:

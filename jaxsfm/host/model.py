@@ -5,7 +5,7 @@ undone and redone here.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.host.colmap
@@ -130,6 +130,19 @@ def errors_px(views: list[View], tracks: Tracks) -> np.ndarray:
 def select(tracks: Tracks, keep: np.ndarray) -> Tracks:
     """The tracks with only those observations; points stay."""
     return Tracks(tracks.points, tracks.point[keep], tracks.view[keep], tracks.xy[keep])
+
+
+def part_of(
+    views: list[View], tracks: Tracks, names: Collection[str]
+) -> tuple[list[View], Tracks, np.ndarray]:
+    """Some views of a model, the points that they see, and which those are."""
+    chosen = [k for k, view in enumerate(views) if view.name in names]
+    place = np.full(len(views), -1)
+    place[chosen] = np.arange(len(chosen))
+    rows = np.flatnonzero(place[tracks.view] >= 0)
+    point, index = np.unique(tracks.point[rows], return_inverse=True)
+    part = Tracks(tracks.points[point], index, place[tracks.view[rows]], tracks.xy[rows])
+    return [views[k] for k in chosen], part, point
 
 
 def build_model(
