@@ -18,7 +18,7 @@ GRAYS = 64
 """Intensities of images kept in memory: 8 MB each at 1600 x 1200."""
 LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
 """Intensity of an RGB pixel (ITU-R BT.601)."""
-CHUNK = 512
+CHUNK = 256
 """Keypoints aligned by one call of the compiled program. A keypoint takes 35 us with 128 to 1024 of
 them, 47 with 4096, and most views of a large model have a few hundred in a block of points."""
 PAD = 128

@@ -16,7 +16,7 @@ from jaxsfm.core import align as align_core
 from jaxsfm.host.model import Tracks, View
 from jaxsfm.patches import ReadGray, chunks, padded
 
-CELLS = 10_000_000
+CELLS = 5_000_000
 """Points times views looked at together; about 100 bytes each, and 2.7 kB for each point."""
 MIN_BLOCK, MAX_BLOCK = 1000, 100_000
 """Points of a block, whatever the number of views."""
