@@ -14,7 +14,7 @@ demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the tr
 	$(BIN)/jaxsfm demo --out demo
 
 test: $(VENV)/.dev ## all tests
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 lint: $(VENV)/.dev ## format, style, layers, types
 	$(BIN)/ruff format --check .
