@@ -124,7 +124,8 @@ def _observe(
 ) -> list[Observed]:
     """Where each of the target views shows the points of `tracks`, which has no observations of
     them."""
-    parts: list[list[Observed]] = [[] for _ in targets]
+    nothing = Observed(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 3)))
+    parts = [[nothing] for _ in targets]
     gate = dataclasses.replace(config, min_score=config.weak_min_score, max_sigma_px=MAX_SIGMA_PX)
     for b in align_blocks(tracks, views, read, gate, config.max_shift_px, targets=targets):
         for k, part in zip(targets, parts, strict=True):

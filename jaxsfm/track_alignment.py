@@ -22,6 +22,11 @@ MIN_BLOCK, MAX_BLOCK = 1000, 100_000
 """Points of a block, whatever the number of views."""
 
 
+SLACK = 0.25
+"""Of a view's sides, beyond its borders: points move along their reference rays before alignment,
+by at most 5 % of their depth."""
+
+
 class AlignedBlock(NamedTuple):
     """The outcome of alignment for some of the points."""
 
@@ -121,6 +126,17 @@ def neighbourhoods(tracks: Tracks, count: int) -> np.ndarray:
     return np.argsort(first, kind="stable")
 
 
+def may_show(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
+    """Whether points (n, 3) could become candidates in any of the views."""
+    shown = np.zeros(len(points), bool)
+    for view in views:
+        at, _ = view.project(points)
+        reach = SLACK * np.asarray(view.size)
+        with np.errstate(invalid="ignore"):
+            shown |= ((at >= -reach) & (at <= view.size + reach)).all(1)
+    return shown
+
+
 def align_blocks(
     tracks: Tracks,
     views: list[View],
@@ -135,16 +151,20 @@ def align_blocks(
 
     Args:
       tracks: every point has an observation.
-      targets: only observations in these views.
+      targets: only observations in these views, and only blocks of points that they may show: the
+        work is theirs, not the model's.
     """
     normal = surface.normals(tracks, views, neighbours=config.neighbours)
     patch = align_core.square_patch(config.radius)
     step = max(MIN_BLOCK, min(CELLS // len(views), MAX_BLOCK))
     near = neighbourhoods(tracks, len(views))
-    block = np.empty(len(near), int)
+    if targets is not None:
+        near = near[may_show(tracks.points, [views[k] for k in targets])[near]]
+    count = -(-len(near) // step)
+    block = np.full(len(tracks.points), count)
     block[near] = np.arange(len(near)) // step
     order = np.lexsort((tracks.point, block[tracks.point]))
-    ends = np.searchsorted(block[tracks.point][order], np.arange(-(-len(near) // step) + 1))
+    ends = np.searchsorted(block[tracks.point][order], np.arange(count + 1))
     for number, first in enumerate(range(0, len(near), step)):
         rows = np.sort(near[first : first + step])
         own = order[ends[number] : ends[number + 1]]

@@ -18,6 +18,7 @@ from room_scene import (
     sizes,
     template,
 )
+from scipy.spatial.transform import Rotation
 
 from jaxsfm import surface, weak_views
 from jaxsfm.config import Refinement
@@ -25,9 +26,10 @@ from jaxsfm.core.types import Status
 from jaxsfm.evaluation import evaluate
 from jaxsfm.host.images import ImageError
 from jaxsfm.host.mapping import registered
-from jaxsfm.host.model import build_model, read_model_arrays
+from jaxsfm.host.model import View, build_model, read_model_arrays
 from jaxsfm.host.pairs import PairResult, make_pair
 from jaxsfm.host.poses import model_poses
+from jaxsfm.placing import Followed, follow
 from jaxsfm.refine import refine_model
 from jaxsfm.track_alignment import align_blocks
 from jaxsfm.weak_views import (
@@ -346,6 +348,32 @@ def test_targets_are_a_part_of_all_views(rendered):
         )
     np.testing.assert_array_equal(some.moved, every.moved[mine])
     np.testing.assert_array_equal(some.agrees, every.agrees[mine])
+
+
+def test_only_points_that_a_target_may_show_are_looked_at(rendered):
+    """A view that looks aside: what it shows is the same, the rest of the model costs nothing."""
+    tracks, config, views = exact_tracks(rendered), Refinement(), list(rendered.views)
+
+    def turned(degrees: float) -> View:
+        turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+        return dataclasses.replace(views[1], rotation=turn @ views[1].rotation)
+
+    def aligned(view: View, targets):
+        some = [*views, dataclasses.replace(view, image_id=99)]
+        read = read_of(rendered)
+        return list(align_blocks(tracks, some, read, config, config.max_shift_px, targets=targets))
+
+    (every,) = aligned(turned(35), None)
+    (some,) = aligned(turned(35), [len(views)])
+    assert 0 < len(some.rows) < 0.8 * len(every.rows)
+    mine = every.found.view == len(views)
+    assert mine.any()
+    np.testing.assert_array_equal(some.rows[some.found.point], every.rows[every.found.point][mine])
+    np.testing.assert_array_equal(some.moved, every.moved[mine])
+    assert aligned(turned(180), [len(views)]) == []
+    behind = Followed(view=turned(180), own_camera=False)
+    follow([behind], views, tracks, read_of(rendered), config)
+    assert behind.best is None and behind.agreed == 0
 
 
 def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendered):
