@@ -146,8 +146,8 @@ def align_blocks(
     *,
     targets: Sequence[int] | None = None,
 ) -> Iterator[AlignedBlock]:
-    """Align every point's observations, so many points at a time that memory stays bounded, and so
-    that few views see them: a photo is read once or twice, however many there are.
+    """Align every point's observations, so many points at a time that memory stays bounded, and
+    those together that the same views see.
 
     Args:
       tracks: every point has an observation.

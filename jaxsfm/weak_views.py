@@ -185,9 +185,8 @@ def take_out(
       placed: what became of the weak views.
       sizes: as in `refine_model`.
     """
-    views, tracks = read_model_arrays(model, sizes)
-    seen = np.bincount(tracks.view, minlength=len(views))
-    held = {view.name: int(count) for view, count in zip(views, seen, strict=True)}
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    held = {image.name: image.num_points3D for image in images}
     refuted = {
         each.name
         for each in placed
@@ -196,7 +195,7 @@ def take_out(
     stay = held.keys() - refuted
     if not refuted or len(stay) < 2:
         return model, list(placed)
-    others, theirs, _ = part_of(views, tracks, stay)
+    others, theirs, _ = part_of(*read_model_arrays(model, sizes), stay)
     return build_model(model, others, theirs), [
         dataclasses.replace(each, held=held[each.name]) if each.name in refuted else each
         for each in placed
