@@ -8,56 +8,56 @@ import zlib  # noqa: F401  before anyone loads pycolmap, whose own zlib else cor
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxsfm.colmap.intrinsics import parse_intrinsics as parse_intrinsics
+    from jaxsfm.colmap.mapper import MapOptions as MapOptions
+    from jaxsfm.colmap.poses import model_poses as model_poses
+    from jaxsfm.colmap.poses import read_poses as read_poses
     from jaxsfm.config import Config as Config
     from jaxsfm.config import PairShape as PairShape
     from jaxsfm.config import preset as preset
     from jaxsfm.errors import UserError as UserError
-    from jaxsfm.evaluation import Evaluation as Evaluation
-    from jaxsfm.evaluation import evaluate as evaluate
-    from jaxsfm.execution import Execution as Execution
-    from jaxsfm.host.intrinsics import parse_intrinsics as parse_intrinsics
-    from jaxsfm.host.mapping import MapOptions as MapOptions
-    from jaxsfm.host.pairs import PairResult as PairResult
-    from jaxsfm.host.pairs import best_pairs as best_pairs
-    from jaxsfm.host.pairs import exhaustive_pairs as exhaustive_pairs
-    from jaxsfm.host.poses import model_poses as model_poses
-    from jaxsfm.host.poses import read_poses as read_poses
-    from jaxsfm.host.weights import Weights as Weights
-    from jaxsfm.host.weights import load_weights as load_weights
-    from jaxsfm.pair_alignment import align as align
-    from jaxsfm.pipeline import extract as extract
-    from jaxsfm.pipeline import match as match
-    from jaxsfm.pipeline import open_images as open_images
-    from jaxsfm.reconstruction import reconstruct as reconstruct
-    from jaxsfm.retrieval import shortlist as shortlist
-    from jaxsfm.run import run_folder as run_folder
-    from jaxsfm.run_options import RunOptions as RunOptions
+    from jaxsfm.io.pairs import PairResult as PairResult
+    from jaxsfm.io.pairs import best_pairs as best_pairs
+    from jaxsfm.io.pairs import exhaustive_pairs as exhaustive_pairs
+    from jaxsfm.io.weights import Weights as Weights
+    from jaxsfm.io.weights import load_weights as load_weights
+    from jaxsfm.matching.execution import Execution as Execution
+    from jaxsfm.matching.pipeline import extract as extract
+    from jaxsfm.matching.pipeline import match as match
+    from jaxsfm.matching.pipeline import open_images as open_images
+    from jaxsfm.matching.retrieval import shortlist as shortlist
+    from jaxsfm.runs.reconstruct import run_folder as run_folder
+    from jaxsfm.runs.run_options import RunOptions as RunOptions
+    from jaxsfm.sfm.evaluation import Evaluation as Evaluation
+    from jaxsfm.sfm.evaluation import evaluate as evaluate
+    from jaxsfm.sfm.reconstruction import reconstruct as reconstruct
+    from jaxsfm.sfm.refine.pair_alignment import align as align
 
 _HOME = {
     "Config": "config",
     "PairShape": "config",
     "preset": "config",
     "UserError": "errors",
-    "Evaluation": "evaluation",
-    "evaluate": "evaluation",
-    "Execution": "execution",
-    "MapOptions": "host.mapping",
-    "parse_intrinsics": "host.intrinsics",
-    "PairResult": "host.pairs",
-    "best_pairs": "host.pairs",
-    "exhaustive_pairs": "host.pairs",
-    "model_poses": "host.poses",
-    "read_poses": "host.poses",
-    "Weights": "host.weights",
-    "load_weights": "host.weights",
-    "align": "pair_alignment",
-    "extract": "pipeline",
-    "match": "pipeline",
-    "open_images": "pipeline",
-    "reconstruct": "reconstruction",
-    "RunOptions": "run_options",
-    "shortlist": "retrieval",
-    "run_folder": "run",
+    "Evaluation": "sfm.evaluation",
+    "evaluate": "sfm.evaluation",
+    "Execution": "matching.execution",
+    "MapOptions": "colmap.mapper",
+    "parse_intrinsics": "colmap.intrinsics",
+    "PairResult": "io.pairs",
+    "best_pairs": "io.pairs",
+    "exhaustive_pairs": "io.pairs",
+    "model_poses": "colmap.poses",
+    "read_poses": "colmap.poses",
+    "Weights": "io.weights",
+    "load_weights": "io.weights",
+    "align": "sfm.refine.pair_alignment",
+    "extract": "matching.pipeline",
+    "match": "matching.pipeline",
+    "open_images": "matching.pipeline",
+    "reconstruct": "sfm.reconstruction",
+    "RunOptions": "runs.run_options",
+    "shortlist": "matching.retrieval",
+    "run_folder": "runs.reconstruct",
 }
 
 

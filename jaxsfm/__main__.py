@@ -2,6 +2,6 @@
 
 import sys
 
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
 
 sys.exit(main())

@@ -8,10 +8,11 @@ recompile. Imports neither jax nor cv2.
 import dataclasses
 from typing import Literal, get_args
 
+from jaxsfm.core.pair_shape import PairShape as PairShape
+
 Keypoints = Literal["relocalized", "learned", "grid"]
 Convolutions = Literal["float32", "bfloat16"]
 BackboneName = Literal["vgg16", "vgg19", "alexnet"]
-OneToOne = Literal["first", "similarity"]
 
 
 EXTRACTED_BY = (
@@ -27,62 +28,8 @@ EXTRACTED_BY = (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PairShape:
-    """Static part of the pair program; changing any field recompiles it."""
-
-    max_planes: int = 5
-    """Homographies peeled from one pair (paper, section 4)."""
-    max_hypotheses: int = 10_000
-    """Upper bound of minimal samples per plane."""
-    hypotheses_per_step: int = 64
-    """Samples solved and scored together before the stopping rule is looked at."""
-    two_way: bool = False
-    """Inlier test in both images instead of image 1 only."""
-    local_refits: int = 1
-    """Least-squares refits on the inliers of each new best hypothesis."""
-    plane_rounds: int = 0
-    """Rounds in which the peeled planes compete for their correspondences (one-way errors)."""
-    one_to_one: OneToOne = "first"
-    """Which of a cell's several matches survives: the first in index order, or the most similar."""
-    consensus: int = 0
-    """Radius, coarse cells, of the neighbourhood that votes on coarse matches; 0: none."""
-    coarse_columns: int = 128
-    """Widest coarse grid the votes reach across: 2048 px; widened for wider images."""
-    coarse_tile: int = 1024
-    """Rows of the coarse similarity matrix held at once."""
-    fine_chunk: int = 16
-    """Coarse matches whose windows are compared at once."""
-    score_chunk: int = 2048
-    """Correspondences scored at once: small enough to stay in cache."""
-    correspondences_per_cell: float = 2.0
-    """Capacity of the correspondence list, per fine cell."""
-
-    def __post_init__(self) -> None:
-        for name in (
-            "max_planes",
-            "max_hypotheses",
-            "hypotheses_per_step",
-            "local_refits",
-            "coarse_columns",
-            "coarse_tile",
-            "fine_chunk",
-            "score_chunk",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"PairShape.{name} must be at least 1; got {getattr(self, name)}")
-        for name in ("consensus", "plane_rounds"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"PairShape.{name} must be at least 0; got {getattr(self, name)}")
-        if self.correspondences_per_cell <= 0:
-            raise ValueError(
-                "PairShape.correspondences_per_cell must be positive; "
-                f"got {self.correspondences_per_cell}"
-            )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Refinement:
-    """Multi-view keypoint refinement after mapping (`jaxsfm.refine`)."""
+    """Multi-view keypoint refinement after mapping (`jaxsfm.sfm.refine.passes`)."""
 
     passes: int = 2
     """Alignment, bundle adjustment and filtering, this many times."""
@@ -106,7 +53,8 @@ class Refinement:
     """3-D points that give a point its surface normal."""
     weak_octaves: int = 4
     """Sizes (working size, half of it, ...) at which views are placed that have too little to
-    align, as a night among days (`jaxsfm.weak_views`); 0: they keep what the mapper gave them."""
+    align, as a night among days (`jaxsfm.sfm.refine.weak_views`); 0: they keep what the
+    mapper gave them."""
     weak_min_score: float = 0.6
     """`min_score` in those views."""
 
@@ -145,7 +93,7 @@ class Config:
     (where no gain has been measured yet); CPUs round and gain nothing."""
     keypoints: Keypoints = "relocalized"
     """Where a fine cell's keypoint lies: at the pixel it walks to by the largest norms (the paper's
-    rule), or by learned scores (`jaxsfm.host.relocalizer`), or at the cell's centre."""
+    rule), or by learned scores (`jaxsfm.io.relocalizer`), or at the cell's centre."""
     threshold_px: float = 10.0
     """Inlier radius of a homography, pixels of the working image."""
     min_inliers: int = 26
@@ -155,10 +103,10 @@ class Config:
     pair: PairShape = dataclasses.field(default_factory=PairShape)
     aligned_octaves: int = 0
     """Sizes (working size, half of it, ...) at which the matches of a single pair are aligned to a
-    fraction of a pixel (`jaxsfm.pair_alignment`); 0: they stay as they were verified. Models have
-    aligned tracks instead."""
+    fraction of a pixel (`jaxsfm.sfm.refine.pair_alignment`); 0: they stay as they were
+    verified. Models have aligned tracks instead."""
     view_graph: bool = False
-    """Hand on only pairs that the view graph trusts (`jaxsfm.host.viewgraph`)."""
+    """Hand on only pairs that the view graph trusts (`jaxsfm.sfm.view_graph`)."""
     refinement: Refinement | None = None
     """None: the mapper's model is the last."""
 

@@ -40,7 +40,7 @@ def data_folder() -> Path:
 
 @pytest.fixture(scope="session")
 def weights():
-    from jaxsfm.host.weights import load_weights
+    from jaxsfm.io.weights import load_weights
 
     return load_weights()
 
@@ -48,7 +48,7 @@ def weights():
 @pytest.fixture(scope="session")
 def photos() -> list[np.ndarray]:
     """Real photographs, uint8 RGB, from a package."""
-    from jaxsfm.synthetic import photo_textures
+    from jaxsfm.bench.synthetic import photo_textures
 
     return photo_textures()
 
@@ -65,7 +65,7 @@ def rendered():
 def scene(tmp_path_factory) -> Path:
     """Three small views of the room, the middle one at night; K.txt and reference beside them."""
     folder = tmp_path_factory.mktemp("scene")
-    from jaxsfm.synthetic import write_scene
+    from jaxsfm.bench.synthetic import write_scene
 
     write_scene(folder, num_views=3, size=(320, 240))
     return folder
@@ -87,7 +87,7 @@ def server(monkeypatch):
 @pytest.fixture(scope="session")
 def plain(scene, tmp_path_factory) -> tuple[Path, dict]:
     """A run of the scene with known intrinsics and its report; tests do not write to it."""
-    from jaxsfm.cli import main
+    from jaxsfm.cli.main import main
 
     out = tmp_path_factory.mktemp("plain") / "out"
     args = [str(scene / "images"), "--out", str(out), "--intrinsics", str(scene / "K.txt")]

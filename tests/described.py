@@ -6,10 +6,10 @@ import numpy as np
 from jaxsfm.config import Config
 from jaxsfm.core.features import extract
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.extraction import extraction_settings
-from jaxsfm.host.features import padded_size, room_of
-from jaxsfm.host.images import WorkingImage
-from jaxsfm.host.weights import Weights
+from jaxsfm.io.features import padded_size, room_of
+from jaxsfm.io.images import WorkingImage
+from jaxsfm.io.weights import Weights
+from jaxsfm.matching.extraction import extraction_settings
 
 
 def compute_features(weights: Weights, working: WorkingImage, *, config: Config) -> DenseFeatures:

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.database import write_database
 from jaxsfm.core.types import Status
-from jaxsfm.host.colmap import write_database
-from jaxsfm.host.images import ImageFile
-from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 
 NAMES = ["a.jpg", "sub/b.jpg", "sub/c.png", "z/sub/d.jpg"]
 SIZE = (1024, 768)

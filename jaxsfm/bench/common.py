@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxsfm.config import PRESETS, Config, Keypoints, preset
 from jaxsfm.errors import UserError
-from jaxsfm.host.atomic import write_atomic
-from jaxsfm.host.images import ImageFile, inspect_image
+from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.images import ImageFile, inspect_image
 
 Keep = Callable[[dict[str, Any]], None]
 """Takes the figures so far, after every row: nothing measured is lost."""

@@ -18,20 +18,21 @@ from jaxsfm.bench import scenes
 from jaxsfm.bench.common import RUN_ABLATED, Keep, method_config
 from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene, Subset
+from jaxsfm.colmap.database import drop_pairs
+from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.poses import Poses, model_poses
+from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.errors import UserError
-from jaxsfm.evaluation import evaluate
-from jaxsfm.extraction import image_features
-from jaxsfm.host.colmap import drop_pairs, read_two_views
-from jaxsfm.host.features import ImageFeatures, image_room
-from jaxsfm.host.mapping import MapOptions, build_models
-from jaxsfm.host.pairs import Pair, PairResult, exhaustive_pairs
-from jaxsfm.host.poses import Poses, model_poses
-from jaxsfm.host.rootsift import write_rootsift_database
-from jaxsfm.host.versions import package_versions
-from jaxsfm.host.weights import chosen_weights
-from jaxsfm.matching import matched
-from jaxsfm.reconstruction import reconstruct
-from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.io.features import ImageFeatures, image_room
+from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.io.versions import package_versions
+from jaxsfm.io.weights import chosen_weights
+from jaxsfm.matching.extraction import image_features
+from jaxsfm.matching.pair_matching import matched
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.sfm.evaluation import evaluate
+from jaxsfm.sfm.reconstruction import reconstruct
 
 METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", "paper-learned", *RUN_ABLATED)
 """paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has

@@ -23,9 +23,9 @@ from jaxsfm.bench.common import (
 )
 from jaxsfm.bench.matches import Matcher, pair_figures
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import SUFFIXES, ImageFile
-from jaxsfm.host.two_view import homography
-from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.io.images import SUFFIXES, ImageFile
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.sfm.two_view import homography
 
 ACCURACY_PX = (1, 3, 5, 10)
 CORNER_PX = (3, 5, 10)

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsfm.bench.common import KEYPOINTS, PAIR_ABLATED, method_config
+from jaxsfm.colmap.database import read_matches
+from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.config import BackboneName, Config
-from jaxsfm.extraction import image_features
-from jaxsfm.host.colmap import read_matches
-from jaxsfm.host.features import ImageFeatures
-from jaxsfm.host.images import ImageFile
-from jaxsfm.host.rootsift import write_rootsift_database
-from jaxsfm.host.versions import package_versions
-from jaxsfm.host.weights import Weights, chosen_weights
-from jaxsfm.matching import match_features
-from jaxsfm.pair_alignment import align
-from jaxsfm.weights_choice import WeightsChoice
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.versions import package_versions
+from jaxsfm.io.weights import Weights, chosen_weights
+from jaxsfm.matching.extraction import image_features
+from jaxsfm.matching.pair_matching import match_features
+from jaxsfm.options import WeightsChoice
+from jaxsfm.sfm.refine.pair_alignment import align
 
 PAIR_METHODS = (
     "rootsift",

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.bench.scenes import Scene, Subset
-from jaxsfm.host.colmap import rays_of, read_matches
-from jaxsfm.host.poses import CameraPose
+from jaxsfm.colmap.database import read_matches
+from jaxsfm.colmap.poses import CameraPose
+from jaxsfm.colmap.two_views import rays_of
 
 CORRECT_PX = 4.0
 """From the true epipolar line. A wrong match lies that close by chance in 1 of 100 cases where the

@@ -18,8 +18,8 @@ from jaxsfm.bench.common import Keep, check_root, choose_sets, read_rows, spread
 from jaxsfm.config import Config, preset
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.errors import UserError
-from jaxsfm.host.versions import package_versions
-from jaxsfm.matching import thresholds
+from jaxsfm.io.versions import package_versions
+from jaxsfm.matching.pair_matching import thresholds
 
 SUFFIX = "_pts.txt"
 POINT_PX = 2.0

@@ -18,13 +18,13 @@ import cv2
 import numpy as np
 
 from jaxsfm.bench.common import check_root, choose_sets, usable_image
+from jaxsfm.bench.night import synthetic_night
 from jaxsfm.bench.strecha import strecha_intrinsics
+from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, parse_intrinsics
+from jaxsfm.colmap.poses import Poses, read_poses
 from jaxsfm.errors import UserError
-from jaxsfm.evaluation import pair_names
-from jaxsfm.host.images import ImageFile, find_images, inspect_image, read_image
-from jaxsfm.host.intrinsics import Intrinsics, check_fits, parse_intrinsics
-from jaxsfm.host.poses import Poses, read_poses
-from jaxsfm.night import synthetic_night
+from jaxsfm.io.images import ImageFile, find_images, inspect_image, read_image
+from jaxsfm.sfm.evaluation import pair_names
 
 AACHEN_PAIRS = "image_pairs_to_match.txt"
 NIGHT = "night/"

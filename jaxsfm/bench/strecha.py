@@ -19,22 +19,22 @@ from jaxsfm.bench.common import (
     method_config,
     read_rows,
 )
+from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.models import write_models
+from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
-from jaxsfm.evaluation import evaluate
-from jaxsfm.host.atomic import write_atomic
-from jaxsfm.host.colmap import read_two_views
-from jaxsfm.host.colmap_models import write_models
-from jaxsfm.host.intrinsics import parse_intrinsics
-from jaxsfm.host.mapping import MapOptions, build_models
-from jaxsfm.host.poses import Poses, model_poses, read_model, read_poses
-from jaxsfm.host.rootsift import write_rootsift_database
-from jaxsfm.host.versions import package_versions
-from jaxsfm.pipeline import open_images
-from jaxsfm.report import model_figures
-from jaxsfm.run import run_folder
-from jaxsfm.run_options import RunOptions
-from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.versions import package_versions
+from jaxsfm.matching.pipeline import open_images
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.report.summary import model_figures
+from jaxsfm.runs.reconstruct import run_folder
+from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.evaluation import evaluate
 
 METHODS = ("rootsift", "grid", "reloc", "learned", "default", "robust", *RUN_ABLATED)
 USUAL = ("rootsift", "grid", "reloc", "default")

@@ -15,12 +15,12 @@ import jax
 
 from jaxsfm.bench.common import Keep, spread
 from jaxsfm.errors import UserError
-from jaxsfm.host.versions import package_versions
-from jaxsfm.host.weights import chosen_weights
-from jaxsfm.pipeline import open_images
+from jaxsfm.io.versions import package_versions
+from jaxsfm.io.weights import chosen_weights
+from jaxsfm.matching.pipeline import open_images
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.training.objective import mean_shares, shares, warped_examples
 from jaxsfm.training.photos import Crops
-from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
 
 METHODS = ("norm", "learned")
 VIEW, CROP, BATCH = 192, 400, 8

@@ -20,9 +20,9 @@ from jaxsfm.bench.common import (
 )
 from jaxsfm.bench.matches import Matcher, pair_figures
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import SUFFIXES, ImageFile
-from jaxsfm.host.two_view import epipolar_residuals, fundamental_matrix
-from jaxsfm.weights_choice import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.io.images import SUFFIXES, ImageFile
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.sfm.two_view import epipolar_residuals, fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)
 

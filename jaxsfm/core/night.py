@@ -1,4 +1,4 @@
-"""A synthetic night in JAX: the light, blur and photons of `jaxsfm.night`, for training.
+"""A synthetic night in JAX: the light, blur and photons of `jaxsfm.bench.night`, for training.
 
 The same model without what cameras do afterwards (denoising, JPEG). It is a model, not a night.
 """

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsfm.config import PairShape
 from jaxsfm.core import coarse_to_fine as c2f
 from jaxsfm.core.consensus import consensus_nn
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.numerics import one_by_one
+from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.core.types import JoinedFeatures, PairMatches, PRNGKey, Status, Thresholds
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsfm.config import PairShape
 from jaxsfm.core import homography as hg
 from jaxsfm.core.numerics import compact
+from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.planes import settle
 from jaxsfm.core.types import Planes, PRNGKey, Thresholds
 

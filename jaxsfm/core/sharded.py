@@ -14,11 +14,11 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, UInt8, UInt32
 
-from jaxsfm.config import PairShape
 from jaxsfm.core.features import Extraction, extract, stored
 from jaxsfm.core.numerics import one_by_one
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pairs, pair_key
+from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.types import DenseFeatures, JoinedFeatures, PairMatches, PRNGKey, Thresholds
 
 AXIS = "items"

@@ -10,7 +10,7 @@ import safetensors
 import safetensors.numpy
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.atomic import write_atomic
+from jaxsfm.io.atomic import write_atomic
 
 State = TypeVar("State")
 FORMAT = "jaxsfm training 1"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import ImageFile, read_image
+from jaxsfm.io.images import ImageFile, read_image
 
 MAX_SIZE = 1024
 """Longer side of the photos, pixels: views of 192 pixels then show more than a patch of wall."""

@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
+from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.config import preset
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.core.losses import CellPairs
 from jaxsfm.core.soft_matching import fundamental_matrix
 from jaxsfm.errors import UserError
-from jaxsfm.host.images import ImageFile, read_image, working_size
-from jaxsfm.host.intrinsics import Intrinsics, check_fits
-from jaxsfm.host.poses import CameraPose, Poses
-from jaxsfm.host.two_view import sampson_error
-from jaxsfm.host.weights import Weights
-from jaxsfm.pipeline import extract, match
+from jaxsfm.io.images import ImageFile, read_image, working_size
+from jaxsfm.io.weights import Weights
+from jaxsfm.matching.pipeline import extract, match
+from jaxsfm.sfm.two_view import sampson_error
 from jaxsfm.training.objective import Examples, walked_maps
 from jaxsfm.training.photos import DECODED, MAX_SIZE
 

@@ -17,10 +17,10 @@ from tqdm import tqdm
 
 from jaxsfm.core.scores import HIDDEN, init_scores
 from jaxsfm.errors import UserError
-from jaxsfm.host import interrupt
-from jaxsfm.host.images import ImageFile
-from jaxsfm.host.relocalizer import save_relocalizer
-from jaxsfm.host.weights import Weights
+from jaxsfm.io import interrupt
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.relocalizer import save_relocalizer
+from jaxsfm.io.weights import Weights
 from jaxsfm.training.checkpoint import load_checkpoint, save_checkpoint
 from jaxsfm.training.objective import (
     Examples,

@@ -11,15 +11,15 @@ from jaxsfm.bench import scenes
 from jaxsfm.bench.daynight import Made, judge, summary
 from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
 from jaxsfm.bench.scenes import Subset
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
+from jaxsfm.colmap.poses import CameraPose, read_poses
 from jaxsfm.errors import UserError
-from jaxsfm.host.poses import CameraPose, read_poses
 
 
 @pytest.fixture(scope="module")
 def simple(tmp_path_factory):
     """Four day views and a night view of the room, rendered."""
-    from jaxsfm.synthetic import camera_matrix, write_scene
+    from jaxsfm.bench.synthetic import camera_matrix, write_scene
 
     source = tmp_path_factory.mktemp("rendered")
     write_scene(source, num_views=5, size=(320, 240))

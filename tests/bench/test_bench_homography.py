@@ -16,7 +16,7 @@ from jaxsfm.bench.homography import (
     read_sequence,
     warp,
 )
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 
 SIZE = (320, 256)

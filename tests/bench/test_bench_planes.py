@@ -11,7 +11,7 @@ from strategies import rng_of
 
 from jaxsfm.bench.homography import warp
 from jaxsfm.bench.planes import misclassification, read_points
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
 
 
 def brute_force(found, truth):

@@ -7,7 +7,7 @@ import pytest
 
 from jaxsfm.bench.common import method_config
 from jaxsfm.bench.strecha import USUAL, find_sets, ratios
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
 from jaxsfm.config import preset
 
 

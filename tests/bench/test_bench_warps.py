@@ -6,9 +6,9 @@ import cv2
 import jax
 import pytest
 
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
 from jaxsfm.core.scores import init_scores
-from jaxsfm.host.relocalizer import save_relocalizer
+from jaxsfm.io.relocalizer import save_relocalizer
 
 
 @pytest.fixture

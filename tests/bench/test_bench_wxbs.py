@@ -12,9 +12,9 @@ from strategies import rng_of
 
 from jaxsfm.bench.common import ABLATED, method_config
 from jaxsfm.bench.wxbs import mean_average_accuracy, means, symmetric_epipolar_error
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
+from jaxsfm.colmap.poses import read_poses
 from jaxsfm.config import preset
-from jaxsfm.host.poses import read_poses
 
 
 @pytest.mark.parametrize("seed", range(5))

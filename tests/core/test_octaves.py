@@ -14,8 +14,8 @@ from strategies import random_features, rng_of, seeds
 from jaxsfm.config import Config, preset
 from jaxsfm.core.octaves import OCTAVE_WEIGHT, halve, join_octaves
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.host.features import pad_features
-from jaxsfm.host.images import WorkingImage
+from jaxsfm.io.features import pad_features
+from jaxsfm.io.images import WorkingImage
 
 join = jax.jit(join_octaves)
 SHAPES = [(8, 12), (5, 7), (9, 4), (1, 6), (3, 3)]

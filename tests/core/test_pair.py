@@ -18,9 +18,9 @@ from jaxsfm.core import pair
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pairs, pair_key
 from jaxsfm.core.types import Status, Thresholds
-from jaxsfm.host.features import ImageFeatures, capacity, pad_features
-from jaxsfm.host.images import ImageFile, WorkingImage
-from jaxsfm.matching import match_features
+from jaxsfm.io.features import ImageFeatures, capacity, pad_features
+from jaxsfm.io.images import ImageFile, WorkingImage
+from jaxsfm.matching.pair_matching import match_features
 
 join = jax.jit(join_octaves)
 THRESHOLDS = Thresholds(np.float32(10), np.int32(26), np.float32(0.999))

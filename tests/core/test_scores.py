@@ -12,7 +12,7 @@ from strategies import rng_of, seeds
 from jaxsfm.core.numerics import squared_norm
 from jaxsfm.core.scores import PLACES, WALKED, Scores, heads_of, init_scores, score
 from jaxsfm.core.vgg import VGG16
-from jaxsfm.host.weights import load_weights
+from jaxsfm.io.weights import load_weights
 
 
 def random_maps(seed: int) -> tuple[jax.Array, ...]:

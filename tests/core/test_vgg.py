@@ -13,7 +13,7 @@ from jaxsfm.core import blocks
 from jaxsfm.core.types import Pyramid
 from jaxsfm.core.vgg import LAYERS, VGG16, Preprocessing, init_shapes, preprocess
 from jaxsfm.core.winograd import conv3x3
-from jaxsfm.host.weights import TORCHVISION
+from jaxsfm.io.weights import TORCHVISION
 
 
 def apply(params, images, sizes):

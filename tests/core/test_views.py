@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import seeds
 
+from jaxsfm.bench.synthetic import photo_textures
 from jaxsfm.core import views
 from jaxsfm.core.night import blur, night
 from jaxsfm.core.views import change_light, random_homography, sample_view, view_pair, warp_points
-from jaxsfm.synthetic import photo_textures
 
 pair_of = jax.jit(functools.partial(view_pair, size=96))
 

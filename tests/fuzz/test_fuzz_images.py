@@ -9,7 +9,7 @@ from fuzz_children import run_cases
 from mutations import damaged, outcome
 
 from jaxsfm.config import MIN_SIDE
-from jaxsfm.host.images import inspect_image, read_image
+from jaxsfm.io.images import inspect_image, read_image
 
 FORMATS = ("jpg", "png", "tif", "bmp", "webp", "ppm", "pgm", "jp2")
 

@@ -6,11 +6,11 @@ from foreign_model import NAMES, camera, exact_model, write_run
 from fuzz_children import run_cases
 from mutations import damaged_json, outcome
 
-from jaxsfm.export_commands import _recorded_photos
-from jaxsfm.kept import read_run
-from jaxsfm.page.write import page
-from jaxsfm.reported import REPORT, misfit
-from jaxsfm.scene import shown_scene
+from jaxsfm.cli.export_commands import _recorded_photos
+from jaxsfm.report.finished_run import read_run
+from jaxsfm.report.page.write import page
+from jaxsfm.report.scene import shown_scene
+from jaxsfm.report.schema import REPORT, misfit
 
 ERRORS = {"mean": 0.01, "median": 0.02, "max": 0.03}
 VERDICT = {"trusted": True, "strength": 0.5, "rotation_error_deg": 0.1, "reason": ""}

@@ -10,13 +10,13 @@ import pytest
 from fuzz_children import run_cases
 from mutations import damaged, damaged_json, outcome
 
+from jaxsfm.colmap.database import write_database
 from jaxsfm.core.types import DenseFeatures, Status
-from jaxsfm.host.colmap import write_database
-from jaxsfm.host.features import ImageFeatures
-from jaxsfm.host.images import ImageFile
-from jaxsfm.host.pairs import PairResult
-from jaxsfm.host.store import Store
-from jaxsfm.host.workfolder import open_folder
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import PairResult
+from jaxsfm.io.store import Store
+from jaxsfm.io.work_folder import open_folder
 
 PAIR = ("a.jpg", "b.jpg")
 FILES = [

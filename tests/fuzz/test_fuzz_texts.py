@@ -4,10 +4,10 @@ import numpy as np
 from fuzz_children import run_cases
 from mutations import damaged_text, outcome
 
-from jaxsfm.host.intrinsics import check_fits, parse_intrinsics
-from jaxsfm.host.pairs import read_pairs
-from jaxsfm.host.poses import read_poses
-from jaxsfm.synthetic import camera_matrix
+from jaxsfm.bench.synthetic import camera_matrix
+from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.colmap.poses import read_poses
+from jaxsfm.io.pairs import read_pairs
 
 NAMES = ["a.jpg", "b c.jpg", "sub/d.jpg", "\u65e5.png", "#e.jpg"]
 PAIRS = "# pairs\na.jpg sub/d.jpg\na.jpg b c.jpg\n\u65e5.png\ta.jpg\n\nb c.jpg\tsub/d.jpg\n"

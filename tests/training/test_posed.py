@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.poses import read_poses
 from jaxsfm.errors import UserError
-from jaxsfm.host.intrinsics import parse_intrinsics
-from jaxsfm.host.poses import read_poses
-from jaxsfm.host.two_view import sampson_error
-from jaxsfm.pipeline import open_images
+from jaxsfm.matching.pipeline import open_images
+from jaxsfm.sfm.two_view import sampson_error
 from jaxsfm.training import posed
 from jaxsfm.training.objective import Objective, loss
 from jaxsfm.training.photos import Crops

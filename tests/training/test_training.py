@@ -8,15 +8,15 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsfm.cli import main
+from jaxsfm.cli.main import main
 from jaxsfm.config import preset
 from jaxsfm.core.scores import init_scores
 from jaxsfm.errors import UserError
-from jaxsfm.extraction import image_features
-from jaxsfm.host.images import inspect_image
-from jaxsfm.host.relocalizer import load_relocalizer, save_relocalizer
-from jaxsfm.host.weights import load_weights
-from jaxsfm.pipeline import open_images
+from jaxsfm.io.images import inspect_image
+from jaxsfm.io.relocalizer import load_relocalizer, save_relocalizer
+from jaxsfm.io.weights import load_weights
+from jaxsfm.matching.extraction import image_features
+from jaxsfm.matching.pipeline import open_images
 from jaxsfm.training import relocalizer
 from jaxsfm.training.checkpoint import load_checkpoint, save_checkpoint
 from jaxsfm.training.objective import Objective

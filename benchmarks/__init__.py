@@ -1,1 +1,0 @@
-"""Speed, with accuracy beside it: `python -m benchmarks` (docs/performance.md)."""

@@ -1,0 +1,230 @@
+"""Public data sets that the benchmarks read: where they are, what they weigh, under which terms."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path, PurePosixPath
+
+import platformdirs
+
+from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.download import download, progress_bar, unpack
+from jaxsfm.io.hashes import sha256_of
+
+_STRECHA = (
+    "https://raw.githubusercontent.com/openMVG/SfM_quality_evaluation/"
+    "e2772f8163e7a945f87557949c7d3afd520b7351/Benchmarking_Camera_Calibration_2008/"
+)
+"""One commit of openMVG's repository: what it names cannot change."""
+_STRECHA_SETS = {
+    "Herz-Jesus-P8": 8,
+    "Herz-Jesus-P25": 25,
+    "castle-P19": 19,
+    "castle-P30": 30,
+    "entry-P10": 10,
+    "fountain-P11": 11,
+}
+_AACHEN = "https://data.ciirc.cvut.cz/public/projects/2020VisualLocalization/Aachen-Day-Night/"
+_AACHEN_IMAGES = "images/database_and_query_images.zip"
+_AACHEN_PAIRS = (
+    "https://raw.githubusercontent.com/tsattler/visuallocalizationbenchmark/"
+    "fcdf4b33f3af73e0bd8b240308332b3bc8a27480/local_feature_evaluation/data/aachen-day-night/"
+    "image_pairs_to_match_v1_1.txt"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class RemoteFile:
+    """One file of a data set."""
+
+    url: str
+    name: str
+    """In the data set's folder."""
+    known_hash: str | None = None
+    """None: published by nobody."""
+    archive: bool = False
+    """Unpacked into the data set's folder; the archive goes then."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DataSet:
+    """What a benchmark reads."""
+
+    title: str
+    page: str
+    terms: str
+    size: str
+    files: tuple[RemoteFile, ...]
+    root: str
+    """What `--root` wants, below the data set's folder."""
+    expects: tuple[str, ...]
+    """Below the data set's folder: by these it is known where somebody else put it there."""
+    bench: str
+
+
+def _strecha_files() -> tuple[RemoteFile, ...]:
+    names = []
+    for folder, count in _STRECHA_SETS.items():
+        names.append(f"{folder}/images/K.txt")
+        for k in range(count):
+            names += [
+                f"{folder}/images/{k:04d}.jpg",
+                f"{folder}/gt_dense_cameras/{k:04d}.jpg.camera",
+            ]
+    return tuple(RemoteFile(_STRECHA + name, name) for name in names)
+
+
+DATA_SETS: dict[str, DataSet] = {
+    "strecha": DataSet(
+        "Multi-view stereo sets with laser-scanned ground truth (Strecha et al., CVPR 2008), "
+        "103 photos of 3072 x 2048",
+        "https://github.com/openMVG/SfM_quality_evaluation",
+        "research; cite Strecha et al. 2008",
+        "0.3 GB (about)",
+        _strecha_files(),
+        ".",
+        tuple(
+            f"{name}/{part}" for name in _STRECHA_SETS for part in ("images", "gt_dense_cameras")
+        ),
+        "strecha, daynight",
+    ),
+    "aachen": DataSet(
+        "Aachen Day-Night 1.1: localization by day and night (Sattler et al., CVPR 2018)",
+        "https://www.visuallocalization.net/datasets",
+        "non-commercial research; CC BY-NC-SA 4.0",
+        "7 GB (about)",
+        (
+            RemoteFile(_AACHEN + _AACHEN_IMAGES, Path(_AACHEN_IMAGES).name, archive=True),
+            RemoteFile(_AACHEN + "aachen_v1_1.zip", "aachen_v1_1.zip", archive=True),
+            RemoteFile(_AACHEN_PAIRS, "image_pairs_to_match.txt"),
+        ),
+        ".",
+        ("images_upright", "3D-models", "image_pairs_to_match.txt"),
+        "daynight",
+    ),
+    "hpatches": DataSet(
+        "HPatches sequences: 116 planar scenes under changes of light and viewpoint (Balntas et "
+        "al., CVPR 2017)",
+        "https://github.com/hpatches/hpatches-dataset",
+        "MIT; cite Balntas et al. 2017",
+        "1.3 GB",
+        (
+            RemoteFile(
+                "https://huggingface.co/datasets/vbalnt/hpatches/resolve/main/"
+                "hpatches-sequences-release.tar.gz",
+                "hpatches-sequences-release.tar.gz",
+                "md5:c9d94e72b85182ba744534db0aca9c94",
+                archive=True,
+            ),
+        ),
+        "hpatches-sequences-release",
+        ("hpatches-sequences-release",),
+        "homography",
+    ),
+    "wxbs": DataSet(
+        "WxBS 1.1: pairs under changes of viewpoint, light, season and sensor (Mishkin et al., "
+        "BMVC 2015)",
+        "http://cmp.felk.cvut.cz/wbs",
+        "none stated; cite Mishkin et al. 2015",
+        "40 MB (about)",
+        (
+            RemoteFile(
+                "http://cmp.felk.cvut.cz/wbs/datasets/WxBS_v1.1.zip",
+                "WxBS_v1.1.zip",
+                "md5:66da037e7d20487e86db147307615870",
+                archive=True,
+            ),
+        ),
+        "v1.1",
+        ("v1.1",),
+        "wxbs",
+    ),
+}
+_FETCHED = "fetched.json"
+"""In a data set's folder: the hashes of the files that came; those of archives, unpacked too."""
+
+
+def data_folder() -> Path:
+    """Where data sets lie: $JAXSFM_DATA, or the user's data folder."""
+    own = os.environ.get("JAXSFM_DATA")
+    return Path(own) if own else platformdirs.user_data_path("jaxsfm") / "data"
+
+
+def find(name: str) -> DataSet:
+    """The data set of that name; UserError names the ones there are."""
+    if name not in DATA_SETS:
+        raise UserError(f"no data set '{name}'; there are {', '.join(DATA_SETS)}")
+    return DATA_SETS[name]
+
+
+def is_complete(name: str, folder: Path | None = None) -> bool:
+    """Whether all of it is there: all that was to be fetched has been, or somebody put it there."""
+    home, data_set = (folder or data_folder()) / name, find(name)
+    fetched = _read_fetched(home / _FETCHED)
+    if fetched is not None and not all(file.name in fetched for file in data_set.files):
+        return False
+    return all((home / path).exists() for path in data_set.expects)
+
+
+def path_of(name: str, folder: Path | None = None) -> Path:
+    """What to give to `--root`.
+
+    Raises:
+      UserError: it is not there, or not all of it.
+    """
+    home = (folder or data_folder()) / name
+    if not is_complete(name, folder):
+        raise UserError(f"{home}: not there, or not all of it: jaxsfm data fetch {name}")
+    return home / PurePosixPath(find(name).root)
+
+
+def fetch(name: str, folder: Path | None = None, *, progress: bool = False) -> Path:
+    """Download what is missing; returns what to give to `--root`. Interrupted, it goes on from
+    there; what is there already is not asked for.
+
+    Raises:
+      UserError: something cannot be had, written or unpacked, or has another hash than published.
+    """
+    if is_complete(name, folder):
+        return path_of(name, folder)
+    home, files = (folder or data_folder()) / name, find(name).files
+    fetched = _read_fetched(home / _FETCHED) or {}
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+        write_atomic(home / _FETCHED, _text(fetched))
+    except OSError as error:
+        raise UserError(f"{home}: cannot be written ({error.strerror or error})") from error
+    for k, file in enumerate(files):
+        if file.name in fetched:
+            continue
+        path = home / file.name
+        with progress_bar(f"{path.name} ({k + 1} of {len(files)})", shown=progress) as on_bytes:
+            download(file.url, path, known_hash=file.known_hash, on_bytes=on_bytes)
+        fetched[file.name] = sha256_of(path)
+        if file.archive:
+            try:
+                unpack(path, home)
+            except UserError:
+                path.unlink()  # the same command asks for it again
+                raise
+        write_atomic(home / _FETCHED, _text(fetched))
+        if file.archive:
+            path.unlink()
+    return path_of(name, folder)
+
+
+def _text(fetched: dict[str, str]) -> bytes:
+    return json.dumps(fetched, indent=1).encode()
+
+
+def _read_fetched(path: Path) -> dict[str, str] | None:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not readable ({error}); remove it to fetch anew") from error
+    if not isinstance(found, dict):
+        raise UserError(f"{path}: not a list of hashes; remove it to fetch anew")
+    return found

@@ -1,0 +1,202 @@
+"""Localizing every image of a run in a model made without it.
+
+    jaxsfm reconstruct PHOTOS --out RUN --intrinsics K.txt --reference SET
+    python -m jaxsfm.bench.speed.localize RUN --reference SET --out FOLDER
+
+The matches are the run's. They are verified once, each pair by itself; for each image a model
+is made of the pairs without it, as the run's own was (views too dark to align are not placed).
+Models and rows stay in FOLDER: the same command goes on from there, any other one is refused.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP tells of every step
+
+from jaxsfm.colmap import database as colmap
+from jaxsfm.colmap import models as colmap_models
+from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.io.atomic import read_json, write_atomic
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.store import SavedMatches, digest
+from jaxsfm.io.versions import versions
+from jaxsfm.report.finished_run import KeptRun, read_run
+from jaxsfm.runs.finished_model import choose_camera, known_model
+from jaxsfm.runs.localize import locate_photo
+from jaxsfm.runs.localize_report import error_against, located_figures
+from jaxsfm.sfm.reconstruction import pixel_scale
+from jaxsfm.sfm.refine.image_readers import gray_reader
+from jaxsfm.sfm.refine.passes import refine_model
+from jaxsfm.sfm.view_graph import trusted_pairs
+
+LIMITS = (0.3, 1.0)
+"""Units of the reference, degrees."""
+
+
+def verified(run: KeptRun, files: dict[str, ImageFile], scratch: Path) -> Path:
+    """A database of all the run's pairs, verified: each by itself, whatever the others."""
+    database = scratch / "verified.db"
+    if database.exists():
+        return database
+    assert run.model is not None
+    known = None
+    if run.report["options"]["intrinsics"] is not None:  # its file may be gone
+        camera = run.model.views[0].camera
+        known = Intrinsics(model=camera.model_name, params=tuple(camera.params))
+    rows = run.report["pairs"]["each"]
+    pairs = [tuple(row["pair"]) for row in rows if row["handed_on"]]
+    partial, options = scratch / "partial.db", map_options(run, files)
+    colmap.write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
+    colmap.verify(
+        partial,
+        seed=options.seed,
+        threads=options.threads,
+        scale=options.scale,
+        relative_poses=run.config.view_graph,
+    )
+    return partial.rename(database)
+
+
+def map_options(run: KeptRun, files: dict[str, ImageFile]) -> MapOptions:
+    """The run's."""
+    options = run.report["options"]
+    refines = options["refine_intrinsics"]
+    return MapOptions(
+        mapper=options["mapper"],
+        refine_intrinsics=options["intrinsics"] is None if refines == "auto" else refines == "yes",
+        seed=options["seed"],
+        threads=options["threads"],
+        scale=pixel_scale(list(files.values()), config=run.config),
+    )
+
+
+def without(
+    run: KeptRun, name: str, files: dict[str, ImageFile], scratch: Path, refined: bool
+) -> None:
+    """The model without an image, in `scratch`/NAME/sparse, from its pairs' verification on."""
+    folder, options = scratch / name, map_options(run, files)
+    database = folder / "database.db"
+    shutil.copy(verified(run, files, scratch), database)
+    pairs = read_two_views(database)
+    dropped = [pair for pair in pairs if name in pair]
+    kept = {pair: view for pair, view in pairs.items() if name not in pair}
+    if run.config.view_graph:
+        verdicts = trusted_pairs({pair: view.geometry for pair, view in kept.items()})
+        dropped += [pair for pair, verdict in verdicts.items() if not verdict.trusted]
+    colmap.drop_pairs(database, dropped)
+    models, _ = build_models(database, {p: kept[p] for p in kept.keys() - set(dropped)}, options)
+    if refined and run.config.refinement:
+        models[0], _ = refine_model(
+            models[0],
+            gray_reader(files, run.config),
+            config=run.config.refinement,
+            refine_intrinsics=options.refine_intrinsics,
+            threads=options.threads,
+        )
+    colmap_models.write_models(models[:1], folder / "fresh")
+    (folder / "fresh").rename(folder / "sparse")
+    database.unlink()
+
+
+def localized(run: KeptRun, name: str, files: dict[str, ImageFile], folder: Path) -> dict[str, Any]:
+    """The image's row."""
+    seed = run.report["options"]["seed"]
+    model, image = known_model(folder / "sparse" / "0", run.config, seed=seed), files[name]
+    chosen = choose_camera(image, model.views, None)
+    names = [view.name for view in model.views]
+    pairs = [tuple(row["pair"]) for row in run.report["pairs"]["each"] if name in row["pair"]]
+    pairs = [pair for pair in pairs if set(pair) - {name} <= set(names)]
+    matches = SavedMatches(run.matches, pairs)
+    start = time.monotonic()
+    found = locate_photo(image, chosen, model, names, matches, gray_reader(files, run.config))
+    row = located_figures(found, chosen.source, matches)
+    row |= {"photo": name, "seconds": time.monotonic() - start, "registered": len(names)}
+    if found.view is not None and run.reference is not None:
+        row["error"] = error_against(name, found.view, model.views, run.reference.poses)
+    return row
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row of the table."""
+    error, expected = row.get("error"), row["confidence"]
+    if not error:
+        return f"{row['photo']:12s} {row['status']:9s} {row['why']}"
+    return (
+        f"{row['photo']:12s} {row['status']:9s} {error['position']:8.4f} "
+        f"{error['rotation_deg']:8.4f}  expected {expected['centre_error'] or 0:8.4f} units "
+        f"{expected['rotation_error_deg'] or 0:7.4f} deg  "
+        f"{row['inliers']:5d} of {row['on_surface']:5d} matches  "
+        f"{row['agreed']:5d} of {row['candidates']:5d} points  {row['seconds']:.0f} s"
+    )
+
+
+def check_same(folder: Path, key: dict[str, Any]) -> None:
+    """End the program if what `folder` keeps was made from something else."""
+    path = folder / "key.json"
+    if path.exists():
+        old = read_json(path)
+        kept = old if isinstance(old, dict) else {}
+        if changed := sorted(name for name in key if kept.get(name) != key[name]):
+            sys.exit(f"--out {folder}: was made with another {changed[0]}; choose another folder")
+    elif folder.exists() and any(folder.iterdir()):
+        sys.exit(f"--out {folder}: not empty, and nobody knows of what; choose another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, json.dumps(key, indent=1).encode())
+
+
+def main() -> int:
+    """Print the table; 1 if more than one image is off."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--reference", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--unrefined", action="store_true", help="models as the mapper made them")
+    parser.add_argument("--only", nargs="*", help="these images alone")
+    args = parser.parse_args()
+    run = read_run(args.run, reference=args.reference)
+    assert run.model is not None
+    names = args.only or sorted(view.name for view in run.model.views)
+    files = {}
+    for view in run.model.views:
+        found = run.photos.file(view.name)
+        assert found is not None, f"{view.name} is gone"
+        files[view.name] = found
+    key = {
+        "run": digest(run.report["identity"], run.report["options"]),
+        "reference": str(args.reference.absolute()),
+        "version": versions(),
+        "unrefined": args.unrefined,
+    }
+    check_same(args.out, key)
+    rows = []
+    for name in names:
+        folder = args.out / name
+        folder.mkdir(parents=True, exist_ok=True)
+        if not (folder / "sparse").exists():
+            without(run, name, files, args.out, not args.unrefined)
+        if not (folder / "row.json").exists():
+            row = localized(run, name, files, folder)
+            write_atomic(folder / "row.json", json.dumps(row, indent=1).encode())
+        rows.append(json.loads((folder / "row.json").read_text()))
+        print(line(rows[-1]), flush=True)
+    errors = [row["error"] for row in rows if row.get("error")]
+    good = sum(e["position"] <= LIMITS[0] and e["rotation_deg"] <= LIMITS[1] for e in errors)
+    print(
+        f"{good} of {len(rows)} within {LIMITS[0]} and {LIMITS[1]} deg; median "
+        f"{statistics.median(e['position'] for e in errors):.4f}, "
+        f"{statistics.median(e['rotation_deg'] for e in errors):.4f} deg"
+    )
+    return 0 if good >= len(rows) - 1 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,158 @@
+"""What a larger job costs: pairs, pixels, the start, and COLMAP's SIFT on the same photos."""
+
+import dataclasses
+import itertools
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+import jaxsfm
+from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
+from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.config import Config, preset
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.weights import load_weights
+from jaxsfm.matching.extraction import extracted
+from jaxsfm.matching.pair_matching import matched
+
+SMALL = 384
+"""Longer side for a thousand pairs in a minute; the programs are those of any other size."""
+PHOTOS, FEW = 45, 5
+"""990 pairs, and 10."""
+
+
+def _photos(data: Path) -> list[ImageFile]:
+    folders = sorted((data / "strecha").glob("*/images"))
+    return [
+        dataclasses.replace(image, name=f"{folder.parent.name}/{image.name}")
+        for folder in folders
+        for image in jaxsfm.open_images(folder)[0]
+    ]
+
+
+def measure_pairs(data: Path) -> Iterator[Metric]:
+    """Seconds per pair of all pairs of 45 photos over those of five: of each of the nine fives that
+    the 45 are dealt into, because pairs that overlap take less than others."""
+    photos = _photos(data)[:PHOTOS]
+    if len(photos) < PHOTOS:
+        print(f"skipped: scaling (not {PHOTOS} photos in {data}/strecha)")
+        return
+    config = dataclasses.replace(preset("default"), max_size=SMALL)
+    features = jaxsfm.extract(load_weights(), photos, config=config)
+    rooms = {name: each.room for name, each in features.items()}
+    names = [str(name) for name in np.random.default_rng(0).permutation(sorted(features))]
+
+    def per_pair(some: list[str]) -> float:
+        pairs = list(itertools.combinations(some, 2))
+        start = time.perf_counter()
+        for _ in matched(features.__getitem__, rooms, pairs, config=config):
+            pass
+        return (time.perf_counter() - start) / len(pairs)
+
+    fives = [names[k : k + FEW] for k in range(0, PHOTOS, FEW)]
+    per_pair(fives[0])
+    # Half of the fives before and half after, should the machine's mood change meanwhile.
+    before = [per_pair(five) for five in fives[::2]]
+    many = per_pair(names)
+    few = before + [per_pair(five) for five in fives[1::2]]
+    yield Metric("scaling.pair.seconds", many, "s", "lower")
+    yield Metric("scaling.pair.990_over_10", many / float(np.mean(few)), "x", "lower", 0.1)
+
+
+def measure_pixels(data: Path) -> Iterator[Metric]:
+    """Seconds per pixel from 384 x 256 to 2304 x 1536, the largest over the smallest."""
+    config = preset("default")
+    weights = load_weights()
+    photos = _photos(data)[:1]
+    if not photos:
+        print(f"skipped: pixels (no photos in {data}/strecha)")
+        return
+
+    def work(longer: int) -> Callable[[], list]:
+        # Enlarged where the photo is smaller: only its size matters here.
+        sized = dataclasses.replace(config, max_size=longer, enlarge=2.0)
+        return lambda: [found for _, found in extracted(weights, photos[:1], config=sized)][0].dense
+
+    sizes = (384, 768, 1536, 2304)
+    turns = seconds(*(work(longer) for longer in sizes), repeat=3)
+    costs = [median(times) / (n * n * 2 / 3) for n, times in zip(sizes, turns, strict=True)]
+    for longer, cost in zip(sizes, costs, strict=True):
+        yield Metric(f"scaling.pixels.{longer}", cost * 1e6, "s per megapixel", "lower")
+    yield Metric("scaling.pixels.largest_over_least", max(costs) / min(costs), "x", "lower", 0.2)
+
+
+SCRIPT = """
+import json, sys, time
+from jaxsfm.io.compiled_programs import keep_compiled
+keep_compiled()
+from pathlib import Path
+import jaxsfm
+from jaxsfm.matching.extraction import extracted
+images, _ = jaxsfm.open_images(Path(sys.argv[1]))
+weights = jaxsfm.load_weights()
+times = []
+for _ in range(3):
+    start = time.time()
+    list(extracted(weights, images[:1], config=jaxsfm.preset("default")))
+    times.append((start, time.time()))
+print(json.dumps(times))
+"""
+
+
+def measure_start(data: Path) -> Iterator[Metric]:
+    """From the start of a process to its first image's features, less what an image takes: the
+    interpreter, imports, weights, the photos' headers, and the compiled program from the cache."""
+    folder = data / "strecha" / "fountain-P11" / "images"
+    if not folder.is_dir():
+        print(f"skipped: start (no {folder})")
+        return
+    waits = []
+    for _ in range(4):  # the first fills the cache
+        begin = time.time()
+        done = subprocess.run(
+            [sys.executable, "-c", SCRIPT, str(folder)], capture_output=True, text=True, check=True
+        )
+        times = json.loads(done.stdout.splitlines()[-1])
+        image = min(end - start for start, end in times[1:])
+        waits.append(times[0][1] - begin - image)
+    yield Metric("start.seconds", median(waits[1:]), "s", "lower")
+
+
+def measure_stage(data: Path) -> Iterator[Metric]:
+    """Five photos of 1536 x 1024, extraction and all ten pairs: COLMAP's SIFT on the CPU, verified,
+    and ours."""
+    folder = data / "strecha" / "fountain-P11" / "images"
+    photos = jaxsfm.open_images(folder)[0][3:8] if folder.is_dir() else []
+    if len(photos) < 5:
+        print(f"skipped: stage (no five photos in {folder})")
+        return
+    weights = load_weights()
+
+    def sift() -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            database = Path(scratch) / "database.db"
+            write_rootsift_database(database, folder, photos, None, seed=0, threads=-1)
+
+    def ours(config: Config) -> None:
+        features = jaxsfm.extract(weights, photos, config=config)
+        jaxsfm.match(features, jaxsfm.exhaustive_pairs(features), config=config)
+
+    configs = {name: preset(name) for name in ("paper", "default")}
+    for config in configs.values():
+        ours(config)
+    times: dict[str, list[float]] = {"sift": [], **{name: [] for name in configs}}
+    for _ in range(2):
+        for name, own in times.items():
+            start = time.perf_counter()
+            ours(configs[name]) if name in configs else sift()
+            own.append(time.perf_counter() - start)
+    yield Metric("stage.sift.seconds", median(times["sift"]), "s", "lower")
+    for name in configs:
+        yield Metric(f"stage.{name}.seconds", median(times[name]), "s", "lower")
+        yield ratio(f"stage.{name}.over_colmap_sift", times[name], times["sift"], "lower", 0.25)

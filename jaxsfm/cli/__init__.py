@@ -1,0 +1,1 @@
+"""Turns arguments into calls."""

@@ -1,0 +1,64 @@
+"""`jaxsfm evaluate` and `jaxsfm demo`: models against the truth."""
+
+from json import dumps
+from pathlib import Path
+
+import tyro
+
+from jaxsfm.cli.run_commands import check_writable
+
+Positional = tyro.conf.Positional
+
+
+def evaluate(
+    out: Positional[Path],
+    *,
+    reference: Path,
+    align_on: Path | None = None,
+    json: Path | None = None,
+) -> int:
+    """Compare a model's cameras with reference poses.
+
+    For example
+        $ jaxsfm evaluate OUT --reference POSES
+
+    Args:
+      out: A run's folder, or a COLMAP model's.
+      reference: Folder of Strecha .camera files or of a COLMAP model.
+      align_on: Text file: align on these images only (the paper's night protocol).
+      json: Write all figures here.
+    """
+    check_writable(json, "--json", (".json",))
+    from jaxsfm.colmap.poses import find_model, model_poses, read_model, read_poses
+    from jaxsfm.io.atomic import write_atomic
+    from jaxsfm.report.summary import evaluation_lines
+    from jaxsfm.sfm import evaluation
+
+    truth = read_poses(reference)
+    names = evaluation.read_names(align_on) if align_on else None
+    poses = model_poses(read_model(find_model(out)))
+    result = evaluation.evaluate(poses, truth, align_on=names).as_dict()
+    for name, error in result["images"].items():
+        print(f"{name!s:40s} {error['position']:10.4f} {error['rotation_deg']:9.4f} deg")
+    for name in result["missing"]:
+        print(f"{name!s:40s} not in the model")
+    print("\n".join(evaluation_lines(result)))
+    if json is not None:
+        write_atomic(json, dumps(result, indent=1).encode())
+    return 0
+
+
+def demo(*, out: Path | None = None, seed: int = 0) -> int:
+    """Render a small scene with known cameras, reconstruct it, compare with the truth.
+
+    Ends with 1 if a camera is missing or the mean errors exceed the stated ones.
+
+    Args:
+      out: Folder for the scene and the results; default: a new one under the temporary folder.
+      seed: Of the scene's noise and of the reconstruction.
+    """
+    from jaxsfm.bench.demo import run_demo
+
+    lines, passed = run_demo(out, seed=seed)
+    print("\n".join(lines))
+    return 0 if passed else 1

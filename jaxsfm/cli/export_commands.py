@@ -1,0 +1,218 @@
+"""The command `export`: a run's model and matches in other tools' formats."""
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from jaxsfm.cli.run_commands import check_writable
+from jaxsfm.errors import UserError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from jaxsfm.colmap.formats.tables import Tables
+
+Format = Literal["hloc", "colmap", "colmap-text", "ply", "bundler", "nvm", "openmvg", "nerfstudio"]
+FILES = {"ply": ".ply", "nvm": ".nvm"}
+"""Formats of one file, and how its name ends; the others are folders."""
+
+
+def export(
+    run: tyro.conf.Positional[Path],
+    *,
+    to: Format,
+    out: Path,
+    images: Path | None = None,
+    copy_images: bool = False,
+    matches: Literal["all", "verified"] = "all",
+) -> int:
+    """A run's model or matches in another tool's format (docs/formats.md).
+
+    For example
+        $ jaxsfm export OUT --to nerfstudio --out NERF --copy-images
+        $ jaxsfm export OUT --to hloc --out HLOC
+
+    Args:
+      run: A run's folder; for formats of models also a COLMAP model's.
+      to: hloc: features.h5, matches.h5 and pairs.txt. colmap, colmap-text: the model. ply: its
+        points. bundler, nvm: cameras, points, observations. openmvg: sfm_data.json, features,
+        matches. nerfstudio: transforms.json and points.
+      out: File (ply, nvm) or new folder to write.
+      images: The photos' folder, for nerfstudio and openmvg, which refer to them; default: the one
+        that the run was made of, if it is still there.
+      copy_images: Copy the photos beside nerfstudio's transforms.json (into images).
+      matches: Which of them hloc gets: all handed to COLMAP, or the verified ones of trusted pairs.
+    """
+    if copy_images and to != "nerfstudio":
+        raise UserError("--copy-images: goes with --to nerfstudio")
+    if images is not None and not images.is_dir():
+        raise UserError(f"--images {images}: no such folder")
+    if not run.is_dir():
+        raise UserError(f"{run}: no such folder")
+    images = images or _recorded_photos(run)
+    if copy_images and images is None:
+        raise UserError(f"--copy-images: {run} does not say where its photos are; --images does")
+    if to in FILES:
+        check_writable(out, "--out", (FILES[to],))
+        _export_file(run, to, out)
+    else:
+        with _new_folder(out) as folder:
+            _export_folder(run, to, folder, images, copy_images, matches)
+    print(f"{to}: {out}")
+    return 0
+
+
+@contextlib.contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """A folder to fill, that appears at `path` whole or not at all.
+
+    Raises:
+      UserError: something is there already, or it cannot be written.
+    """
+    try:
+        if path.exists() and not path.is_dir():
+            raise UserError(f"--out {path}: is a file, not a folder")
+        if path.is_dir() and any(path.iterdir()):
+            raise UserError(f"--out {path}: not empty; choose an empty or new folder")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch = tempfile.TemporaryDirectory(dir=path.parent, prefix=".jaxsfm-")
+    except OSError as error:
+        raise UserError(f"--out {path}: cannot be written ({error.strerror or error})") from error
+    with scratch:
+        fresh = Path(scratch.name) / "export"
+        fresh.mkdir()
+        yield fresh
+        os.replace(fresh, path)
+
+
+def _recorded_photos(run: Path) -> Path | None:
+    """The photos' folder of a run, if it says and they are still there."""
+    from jaxsfm.report.schema import PHOTOS, read_report
+
+    try:
+        folder = Path(read_report(run, PHOTOS)["images"]["folder"])
+    except UserError:  # a model of COLMAP's, or an older run
+        return None
+    return folder if folder.is_dir() else None
+
+
+def _model(run: Path) -> "pycolmap.Reconstruction":
+    from jaxsfm.colmap.poses import find_model, read_model
+
+    return read_model(find_model(run))
+
+
+def _tables(run: Path) -> "Tables | None":
+    """Keypoints and matches of a run's database, if there is one."""
+    from jaxsfm.colmap.formats.database import read_database
+
+    path = run / "database.db"
+    return read_database(path, where=str(path)) if path.is_file() else None
+
+
+def _export_file(run: Path, to: Format, out: Path) -> None:
+    from jaxsfm.io.atomic import write_atomic
+
+    if to == "nvm":
+        from jaxsfm.colmap.formats.nvm import nvm_text
+
+        write_atomic(out, nvm_text(_model(run)).encode())
+        return
+    model = _model(run)
+    with tempfile.TemporaryDirectory() as scratch:
+        made = Path(scratch) / "points.ply"
+        model.export_PLY(made)
+        write_atomic(out, made.read_bytes())
+
+
+def _export_folder(
+    run: Path,
+    to: Format,
+    folder: Path,
+    images: Path | None,
+    copy_images: bool,
+    matches: Literal["all", "verified"],
+) -> None:
+    if to == "hloc":
+        _export_hloc(run, folder, matches)
+    elif to == "colmap":
+        _model(run).write_binary(folder)
+    elif to == "colmap-text":
+        from jaxsfm.colmap.formats.lens import check_no_blanks
+
+        model = _model(run)
+        check_no_blanks([image.name for image in model.images.values()], to)
+        model.write_text(folder)
+    elif to == "bundler":
+        from jaxsfm.colmap.formats.bundler import write_bundler
+
+        write_bundler(folder, _model(run))
+    elif to == "openmvg":
+        _export_openmvg(run, folder, images)
+    else:
+        _export_nerfstudio(run, folder, images, copy_images)
+
+
+def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -> None:
+    from jaxsfm.colmap.formats.hloc import write_hloc
+    from jaxsfm.io.images import working_size
+    from jaxsfm.report.schema import SIZES, read_report
+
+    tables = _tables(run)
+    if tables is None:
+        raise UserError(f"{run}: no database.db here, whose matches hloc would get")
+    try:
+        config = read_report(run, SIZES)["options"]["config"]
+        limits = config["max_size"], float(config["enlarge"])
+    except UserError:  # not a run of ours: the photos' own pixels
+        limits = 2**31, 1.0
+    scales = {s: max(s) / max(working_size(s, *limits)) for s in set(tables.sizes.values())}
+    chosen = tables.matches if matches == "all" else tables.inliers
+    write_hloc(folder, tables, chosen, {name: scales[s] for name, s in tables.sizes.items()})
+
+
+def _export_openmvg(run: Path, folder: Path, images: Path | None) -> None:
+    from jaxsfm.colmap.formats.lens import camera_of
+    from jaxsfm.colmap.formats.openmvg import sfm_data, write_openmvg
+    from jaxsfm.colmap.poses import find_model, read_model
+
+    tables = _tables(run)
+    cameras, model = {}, None
+    if tables is not None:
+        cameras = {
+            name: camera_of(row, tables.sizes[name], f"{run / 'database.db'}")
+            for name, row in tables.cameras.items()
+        }
+    try:
+        found = find_model(run)
+    except UserError:  # views and matches are enough for OpenMVG to start from
+        if tables is None:
+            raise
+    else:
+        model = read_model(found)
+        cameras |= {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    root = None if images is None else images.absolute()
+    write_openmvg(folder, sfm_data(cameras, model, root), tables)
+
+
+def _export_nerfstudio(run: Path, folder: Path, images: Path | None, copy_images: bool) -> None:
+    from jaxsfm.colmap.formats.lens import registered_images
+    from jaxsfm.colmap.formats.nerfstudio import IMAGES, write_nerfstudio
+
+    model = _model(run)
+    referred = None if copy_images or images is None else images.absolute()
+    write_nerfstudio(folder, model, referred)
+    if not copy_images or images is None:
+        return
+    for image in registered_images(model):
+        source, target = images / image.name, folder / IMAGES / image.name
+        if not source.is_file():
+            raise UserError(f"--images {images}: no {image.name} in it")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, target)

@@ -1,0 +1,127 @@
+"""The command line: parses, runs a command, turns failures into one sentence."""
+
+import logging
+import os
+import sys
+import threading
+
+import tyro
+
+from jaxsfm.cli.bench_commands import daynight, homography, planes, strecha, warps, wxbs
+from jaxsfm.cli.data_commands import data
+from jaxsfm.cli.evaluate_commands import demo, evaluate
+from jaxsfm.cli.export_commands import export
+from jaxsfm.cli.localize_commands import extend, localize
+from jaxsfm.cli.pairs_command import pairs
+from jaxsfm.cli.run_commands import match, reconstruct
+from jaxsfm.cli.subcommands import one_of, unwrapped
+from jaxsfm.cli.train_commands import train
+from jaxsfm.cli.view_commands import report, view
+from jaxsfm.cli.weights_commands import weights, with_action
+from jaxsfm.errors import UserError
+from jaxsfm.io import interrupt
+from jaxsfm.io.compiled_programs import keep_compiled
+from jaxsfm.io.versions import package_versions
+
+BENCHMARKS = {
+    "strecha": strecha,
+    "daynight": daynight,
+    "wxbs": wxbs,
+    "homography": homography,
+    "planes": planes,
+    "warps": warps,
+}
+_Benchmark = one_of(BENCHMARKS)
+
+
+def bench(result: _Benchmark) -> int:  # pyright: ignore[reportInvalidTypeForm]
+    """Benchmarks on public data sets."""
+    return result
+
+
+DESCRIPTION = """Structure-from-Motion from dense VGG-16 features with relocalization.
+
+For example
+    $ jaxsfm demo
+    $ jaxsfm reconstruct PHOTOS --out OUT
+
+jaxsfm --version tells versions; jaxsfm --tyro-print-completion bash (or zsh, tcsh) prints a script
+that completes commands and options."""
+COMMANDS = {
+    "reconstruct": reconstruct,
+    "match": match,
+    "pairs": pairs,
+    "localize": localize,
+    "extend": extend,
+    "evaluate": evaluate,
+    "report": report,
+    "view": view,
+    "export": export,
+    "demo": demo,
+    "weights": weights,
+    "train": train,
+    "data": data,
+    "bench": bench,
+}
+
+
+def version_lines() -> list[str]:
+    """jaxsfm's own version and those of what its results depend on."""
+    found = package_versions()
+    lines = [f"jaxsfm {found.pop('jaxsfm')}"]
+    return lines + [f"  {name} {version}" for name, version in found.items()]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns the exit status (2: what was given cannot be used)."""
+    if (sys.argv[1:] if argv is None else argv) == ["--version"]:
+        print("\n".join(version_lines()))
+        return 0
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("jaxsfm: %(message)s"))
+    logger = logging.getLogger("jaxsfm")
+    logger.handlers, logger.propagate = [handler], False
+    logger.setLevel(logging.INFO)
+    keep_compiled()
+    try:
+        with interrupt.noted():
+            return tyro.extras.subcommand_cli_from_dict(
+                {name: unwrapped(command) for name, command in COMMANDS.items()},
+                prog="jaxsfm",
+                description=DESCRIPTION,
+                args=with_action(sys.argv[1:] if argv is None else argv),
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
+            )
+    except UserError as error:
+        print(f"jaxsfm: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(
+            "jaxsfm: interrupted; what reconstruct had finished is kept: the same command goes on "
+            "from there (bench: finished rows are in --json)",
+            file=sys.stderr,
+        )
+        if any(thread.name == "jaxsfm-colmap" for thread in threading.enumerate()):
+            # Native code that did not stop (the global mapper cannot) must not meet the
+            # interpreter's shutdown: it would abort.
+            sys.stdout.flush()
+            os._exit(130)
+        return 130
+    except OSError as error:
+        named = f"{error.filename}: " if error.filename else ""
+        print(f"jaxsfm: {named}{error.strerror or error}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        # XLA's allocator raises its own type; the rest is a fault of ours and keeps its traceback.
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        print(
+            "jaxsfm: out of memory; a smaller --max-size needs less, and reconstruct goes on with "
+            "a smaller --memory-gb, --images-at-once or --pairs-at-once",
+            file=sys.stderr,
+        )
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

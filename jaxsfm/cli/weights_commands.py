@@ -1,0 +1,147 @@
+"""`jaxsfm weights`: show, convert, verify and fetch VGG-16 weights."""
+
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from jaxsfm.cli.run_commands import check_writable
+from jaxsfm.cli.subcommands import one_of
+from jaxsfm.config import BackboneName
+from jaxsfm.errors import UserError
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+
+Positional = tyro.conf.Positional
+Family = Literal["auto", "torchvision", "keras", "caffe", "netvlad"]
+Kernels = Literal["auto", "tensorflow", "theano"]
+
+
+def show(*, backbone: BackboneName = "vgg16", network: WeightsChoice = USUAL_WEIGHTS) -> int:
+    """Show which weights are in use, and check them.
+
+    Args:
+      backbone: The network.
+      network: The network's parameters.
+    """
+    from jaxsfm.io.weights import chosen_weights
+
+    loaded = chosen_weights(network, backbone)
+    p = loaded.preprocessing
+    print(f"weights          {loaded.backbone}, {loaded.source}")
+    print(f"file             {loaded.path}")
+    print(f"family           {loaded.family}")
+    print(f"preprocessing    RGB / {p.scale:g}, minus {p.mean}, divided by {p.std}")
+    print(f"sha256           {loaded.sha256} (checked)")
+    for name in ("source_sha256", "converter", "jaxsfm"):
+        if name in loaded.about:
+            print(f"  {name:14s} {loaded.about[name]}")
+    try:
+        learned = loaded.learned
+    except UserError as error:
+        print(f"relocalizer      none: {error}")
+        return 0
+    print(f"relocalizer      {network.relocalizer or 'of jaxsfm'}, for learned keypoints")
+    print(f"sha256           {learned.sha256}")
+    for name, value in learned.about.items():
+        if name != "history":
+            print(f"  {name:14s} {value}")
+    return 0
+
+
+def convert(
+    source: Positional[Path],
+    target: Positional[Path],
+    *,
+    family: Family = "auto",
+    kernels: Kernels = "auto",
+) -> int:
+    """Convert VGG-16 weights of another framework (torchvision's VGG-19 too), for --weights.
+
+    For example
+        $ jaxsfm weights convert vgg16.h5 vgg16.safetensors
+
+    Args:
+      source: torchvision's vgg16 .pth or .safetensors, Keras' VGG16 .h5, MatConvNet's
+        imagenet-vgg-verydeep-16.mat, NetVLAD's .mat. Nothing in it is executed.
+      target: File.safetensors for the converted weights.
+      family: What it must be; auto: whatever its content is.
+      kernels: Of Keras' files: whether kernels are turned by 180 degrees (theano); auto: what the
+        file says.
+    """
+    check_writable(target, "TARGET", (".safetensors",))
+    from weights_conversion.convert import read_source, write_converted
+
+    found = read_source(source, family=family, kernels=kernels)
+    write_converted(found, target)
+    for note in found.notes:
+        print(f"note             {note}")
+    other = "" if found.architecture == "vgg16" else f" --backbone {found.architecture}"
+    print(f"{target}: {found.family}, use it with --weights {target}{other}")
+    return 0
+
+
+def verify(
+    source: Positional[Path],
+    target: Positional[Path],
+    *,
+    family: Family = "auto",
+    kernels: Kernels = "auto",
+    size: int = 80,
+) -> int:
+    """Compare a conversion with its source, layer by layer; ends with 1 if they differ.
+
+    The source is run in its own convention by an independent numpy network in float64.
+
+    Args:
+      source: The file that was converted.
+      target: The converted one.
+      family: See convert.
+      kernels: See convert.
+      size: Longer side of the image that both see, pixels.
+    """
+    if not 40 <= size <= 2048:  # pool5 is 1/32 of four fifths of it
+        raise UserError(f"--size must lie in 40 .. 2048; got {size}")
+    from weights_conversion.convert import read_source
+    from weights_conversion.verify import agrees, compare, table_lines
+
+    found = read_source(source, family=family, kernels=kernels)
+    rows = compare(found, target, size=(size * 4 // 5, size))
+    print("\n".join(table_lines(rows)))
+    return 0 if agrees(rows) else 1
+
+
+def fetch(name: Positional[str] = "list", *, out: Path | None = None) -> int:
+    """Download public weights, check their hash, convert them.
+
+    Args:
+      name: list: what there is.
+      out: File.safetensors for the converted weights; default: a file of that name in the user's
+        data folder.
+    """
+    check_writable(out, "--out", (".safetensors",))
+    from weights_conversion.fetch import fetch_weights, public_lines
+
+    if name == "list":
+        print("\n".join(public_lines()))
+        return 0
+    path = fetch_weights(name, out=out, progress=True)
+    print(f"{path}: use it with --weights {path}")
+    return 0
+
+
+ACTIONS = {"show": show, "convert": convert, "verify": verify, "fetch": fetch}
+_Action = one_of(ACTIONS)
+
+
+def weights(result: _Action) -> int:  # pyright: ignore[reportInvalidTypeForm]
+    """Show, convert, verify and fetch VGG-16 weights; alone: show."""
+    return result
+
+
+def with_action(argv: list[str]) -> list[str]:
+    """`jaxsfm weights` and its options alone mean `show`."""
+    if argv[:1] != ["weights"] or (len(argv) > 1 and argv[1] in (*ACTIONS, "-h", "--help")):
+        return argv
+    if len(argv) > 1 and not argv[1].startswith("-"):
+        return argv  # a misspelt action is tyro's to name
+    return ["weights", "show", *argv[1:]]

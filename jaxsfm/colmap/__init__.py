@@ -1,0 +1,1 @@
+"""The one door to pycolmap and to the files of other tools."""

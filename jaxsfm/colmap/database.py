@@ -1,0 +1,209 @@
+"""COLMAP's database and two-view verification (pycolmap 4.2); the mapper is in `mapping`.
+
+Everything is checked here first: a match index out of range ends the process in native code, and
+unset options fail silently. Pixels get their +0.5 here and nowhere else.
+
+zlib and cv2 are imported before pycolmap on purpose: pycolmap 4.2.1 brings a zlib of its own, and
+where it is loaded first every later deflate (zlib.compress, PNG by OpenCV or Pillow) corrupts the
+heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so; it is not used.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+import cv2  # noqa: F401  must precede pycolmap, see above
+import numpy as np
+import pycolmap
+
+from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.native import native
+from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import SPARE_BYTES, check_room
+from jaxsfm.io.images import ImageFile, shown_name
+from jaxsfm.io.pairs import Pair, PairResult, describe
+
+pycolmap.logging.minloglevel = 3
+
+PIXEL_OFFSET = np.float32(0.5)
+"""COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
+
+
+def keypoint_tables(results: Iterable[PairResult]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Per image the cells used by any pair, ascending, and their (x, y).
+
+    A cell is the same keypoint in every pair, so tracks join by index.
+    """
+    parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for result in results:
+        for side, xy in enumerate((result.keypoints0, result.keypoints1)):
+            rows = parts.setdefault(result.pair[side], [])
+            rows.append((result.cells[:, side], xy))
+            if len(rows) > UNITED:  # a cell comes back in most pairs
+                rows[:] = [_united(rows)]
+    return {name: _united(rows) for name, rows in parts.items()}
+
+
+UNITED = 16
+"""Pairs of an image whose keypoints are held apart: all would be gigabytes for 500 images."""
+
+
+def _united(rows: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Every cell once, ascending, with its first (x, y)."""
+    cells, xy = (np.concatenate(column) for column in zip(*rows, strict=True))
+    cells, first = np.unique(cells, return_index=True)
+    return cells, xy[first]
+
+
+def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
+    """The results; ValueError for what COLMAP dies of."""
+    for pair, result in results.items():
+        if pair != result.pair:
+            raise ValueError(f"pair {describe(pair)} holds the result of {describe(result.pair)}")
+        n = result.num_inliers
+        if not (result.cells.shape == result.keypoints0.shape == result.keypoints1.shape == (n, 2)):
+            raise ValueError(f"pair {describe(pair)}: cells and keypoints must be {n} x 2")
+        if any(len(np.unique(column)) != n for column in result.cells.T):
+            raise ValueError(f"pair {describe(pair)}: a keypoint is matched twice")
+        yield result
+
+
+def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Camera:
+    """The given camera, or one from the photo's EXIF focal length (else 1.2 x the longer side)."""
+    if intrinsics is not None:
+        camera = intrinsics.camera(image.size)
+    else:
+        try:
+            camera = pycolmap.infer_camera_from_image(image.path)
+        except Exception:  # COLMAP reads fewer formats than we do; it raises RuntimeError or more
+            camera = None
+        if camera is None or (camera.width, camera.height) != image.size:
+            width, height = image.size
+            camera = pycolmap.Camera(
+                model="SIMPLE_RADIAL",
+                width=width,
+                height=height,
+                params=[1.2 * max(width, height), width / 2, height / 2, 0.0],
+            )
+    if not camera.verify_params():
+        raise UserError(
+            f"{shown_name(image.name)}: COLMAP does not accept the camera {camera.model_name} "
+            f"{camera.params}"
+        )
+    return camera
+
+
+def write_database(
+    path: Path,
+    images: list[ImageFile],
+    results: Mapping[Pair, PairResult],
+    intrinsics: Intrinsics | None,
+) -> None:
+    """A new COLMAP database with cameras, images, keypoints and matches.
+
+    Args:
+      results: the pairs handed on, each read twice and none held; images without any stay in the
+        database without keypoints.
+
+    Raises:
+      ValueError: inconsistent results (nothing is written).
+    """
+    matched = 0
+
+    def counted() -> Iterator[PairResult]:
+        nonlocal matched
+        for result in _consistent(results):
+            matched += result.num_inliers
+            yield result
+
+    tables = keypoint_tables(counted())
+    names = {image.name: image for image in images}
+    if unknown := sorted(tables.keys() - names.keys()):
+        raise ValueError(f"results name images that are not given: {unknown[0]!r}")
+    for name, (_, xy) in tables.items():
+        if not np.isfinite(xy).all():
+            raise ValueError(f"{name}: keypoints must be finite")
+        if (xy < -0.5).any() or (xy > np.asarray(names[name].size) - 0.5).any():
+            raise ValueError(f"{name}: keypoints outside the image {names[name].size}")
+    rows = sum(len(xy) for _, xy in tables.values()) + 2 * matched
+    check_room(path.parent, SPARE_BYTES + 2 * 8 * rows)  # and as much for SQLite's journal
+    empty = np.zeros((0, 2), np.float32)
+    path.unlink(missing_ok=True)
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        ids = {}
+        camera_id = None
+        for image in sorted(images, key=lambda i: i.name):
+            if camera_id is None or intrinsics is None:
+                camera_id = db.write_camera(camera_for(image, intrinsics))
+            ids[image.name] = db.write_image(pycolmap.Image(name=image.name, camera_id=camera_id))
+            xy = tables[image.name][1] if image.name in tables else empty
+            db.write_keypoints(ids[image.name], (xy + PIXEL_OFFSET).astype(np.float32))
+        for a, b in sorted(results):
+            cells = results[a, b].cells
+            if len(cells):
+                columns = zip((a, b), cells.T, strict=True)
+                index = [np.searchsorted(tables[name][0], column) for name, column in columns]
+                db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
+
+
+def verify(path: Path, *, seed: int, threads: int, scale: float, relative_poses: bool) -> None:
+    """COLMAP's own two-view verification of all pairs (paper, section 4).
+
+    Cameras with a known or prior focal length are verified calibrated (essential matrices).
+
+    Args:
+      scale: original pixels per working pixel; COLMAP's 4 px are multiplied by it.
+      relative_poses: also find the relative pose of every pair, for the view graph.
+    """
+    two_view = pycolmap.TwoViewGeometryOptions()
+    two_view.ransac.random_seed = seed
+    two_view.ransac.max_error *= scale
+    two_view.compute_relative_pose = relative_poses
+    verifier = pycolmap.GeometricVerifierOptions()
+    verifier.num_threads = threads
+    native(
+        lambda token: pycolmap.geometric_verification(
+            path,
+            verifier_options=verifier,
+            two_view_geometry_options=two_view,
+            cancellation_token=token,
+        ),
+        path,
+    )
+
+
+def read_matches(
+    path: Path, names: tuple[str, str], *, verified: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """A pair's matches, float64 (n, 2) each, centre of the top-left pixel (0, 0).
+
+    Args:
+      names: of the two images, in the order wanted.
+      verified: the two-view inliers; else the matches before verification.
+    """
+    with pycolmap.Database.open(path) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        a, b = ids[names[0]], ids[names[1]]
+        if not verified:
+            matches = db.read_matches(a, b)
+        elif db.exists_two_view_geometry(a, b):
+            matches = db.read_two_view_geometry(a, b).inlier_matches
+        else:
+            matches = []
+        rows = np.asarray(matches).reshape(-1, 2).astype(np.int64)
+        xy = [np.asarray(db.read_keypoints(i), np.float64)[:, :2] - PIXEL_OFFSET for i in (a, b)]
+    return xy[0][rows[:, 0]], xy[1][rows[:, 1]]
+
+
+def read_images(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:
+    """Id and camera of every image in a database, by name."""
+    with pycolmap.Database.open(path) as db:
+        cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
+        return {i.name: (i.image_id, cameras[i.camera_id]) for i in db.read_all_images()}
+
+
+def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
+    """Take pairs' verified geometries out of a database; their matches stay."""
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        for a, b in pairs:
+            db.delete_two_view_geometry(ids[a], ids[b])

@@ -1,0 +1,161 @@
+"""A COLMAP database that gets more images; what is in it keeps its numbers."""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
+import numpy as np
+import pycolmap
+
+from jaxsfm.colmap.database import PIXEL_OFFSET, read_images, verify
+from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.io.atomic import SPARE_BYTES, check_room
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import Pair, PairResult
+
+
+def add_images(
+    path: Path, images: Mapping[str, tuple[ImageFile, pycolmap.Camera]]
+) -> dict[str, tuple[int, pycolmap.Camera]]:
+    """Write images and their cameras; their ids and cameras, by name.
+
+    Args:
+      images: by name. A camera whose id the database knows is that one; others are new.
+    """
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        known = {camera.camera_id for camera in db.read_all_cameras()}
+        for name, (_, camera) in sorted(images.items()):
+            camera_id = camera.camera_id
+            if camera_id not in known:
+                camera_id = db.write_camera(camera)
+            db.write_image(pycolmap.Image(name=name, camera_id=camera_id))
+    every = read_images(path)
+    return {name: every[name] for name in images}
+
+
+def copy_database(source: Path, target: Path, matches: int) -> None:
+    """A copy of a database to which matches will be added.
+
+    Raises:
+      UserError: the copy, that of `add_matches` and SQLite's journal would not fit on the disk.
+    """
+    # Each match: a keypoint in both images at most, itself and its verification; 8 bytes each.
+    rows = 4 * matches
+    size = source.stat().st_size
+    check_room(target.parent, SPARE_BYTES + 3 * size + 16 * rows)
+    shutil.copyfile(source, target)
+
+
+def _keys(xy: np.ndarray) -> np.ndarray:
+    """float32 pixels (n, 2 or more) as one number each, which tells them apart."""
+    return xy[:, :2].astype(np.float32, order="C").view(np.uint64)[:, 0]
+
+
+def _appended(known: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Keypoints, and behind them those of `xy` that are not among them.
+
+    Args:
+      known: float32 (n, 2 or more): (x, y) and what follows; kept as it is.
+    """
+    fresh = np.unique(xy, axis=0)
+    fresh = fresh[~np.isin(_keys(fresh), _keys(known))]
+    rest = np.zeros((len(fresh), known.shape[1] - 2), np.float32)
+    if rest.shape[1] >= 4:  # an affine shape; COLMAP's for a bare point
+        rest[:, [0, 3]] = 1
+    return np.concatenate([known, np.c_[fresh, rest]])
+
+
+def _rows_of(xy: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+    """uint32: where each pixel stands among keypoints, which have it; of equal ones the first."""
+    keys = _keys(keypoints)
+    order = np.argsort(keys, kind="stable")
+    return order[np.searchsorted(keys, _keys(xy), sorter=order)].astype(np.uint32)
+
+
+def add_matches(
+    path: Path,
+    results: Mapping[Pair, PairResult],
+    *,
+    seed: int,
+    threads: int,
+    scale: float,
+) -> dict[Pair, int]:
+    """Write matches and COLMAP's verification of them; inliers, by pair that has any.
+
+    An image's keypoints stay and get those that are new behind them.
+
+    Args:
+      results: of images that are in the database, pairs that have no matches in it.
+      scale: see `jaxsfm.colmap.database.verify`.
+    """
+    ids = {name: image_id for name, (image_id, _) in read_images(path).items()}
+    own: dict[str, list[Pair]] = {}
+    for pair in sorted(results):
+        for name in pair:
+            own.setdefault(name, []).append(pair)
+    rows: dict[Pair, list[np.ndarray]] = {}
+    matches: dict[Pair, np.ndarray] = {}
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        for name in sorted(own):  # the lesser name of a pair comes first
+            parts = [_side(results[pair], pair.index(name)) for pair in own[name]]
+            there = db.exists_keypoints(ids[name])
+            known = np.asarray(db.read_keypoints(ids[name]), np.float32) if there else _NONE
+            every = _appended(known if len(known) else _NONE, np.concatenate(parts))
+            (db.update_keypoints if there else db.write_keypoints)(ids[name], every)
+            found = _rows_of(np.concatenate(parts), every)
+            ends = np.cumsum([len(xy) for xy in parts])[:-1]
+            for pair, column in zip(own[name], np.split(found, ends), strict=True):
+                rows.setdefault(pair, []).append(column)
+        for pair in sorted(rows):
+            both = np.stack(rows.pop(pair), axis=1)
+            # Two cells may lie at one pixel: one match each.
+            for side in (0, 1):
+                both = both[np.sort(np.unique(both[:, side], return_index=True)[1])]
+            if len(both):
+                matches[pair] = both
+                db.write_matches(ids[pair[0]], ids[pair[1]], both)
+    return _verified(path, matches, ids, seed=seed, threads=threads, scale=scale)
+
+
+_NONE = np.zeros((0, 2), np.float32)
+
+
+def _side(result: PairResult, side: int) -> np.ndarray:
+    """Keypoints in COLMAP's pixels, as the database holds them."""
+    xy = (result.keypoints0, result.keypoints1)[side]
+    return np.asarray(xy, np.float32) + PIXEL_OFFSET
+
+
+def _verified(
+    path: Path,
+    matches: Mapping[Pair, np.ndarray],
+    ids: Mapping[str, int],
+    *,
+    seed: int,
+    threads: int,
+    scale: float,
+) -> dict[Pair, int]:
+    """COLMAP verifies all pairs of a database: those that are new in a copy without the others."""
+    if not matches:
+        return {}
+    scratch = path.with_name("new_pairs.db")
+    shutil.copyfile(path, scratch)
+    with pycolmap.Database.open(scratch) as db, pycolmap.DatabaseTransaction(db):
+        db.clear_matches()
+        db.clear_two_view_geometries()
+        for (a, b), rows in matches.items():
+            db.write_matches(ids[a], ids[b], rows)
+    verify(scratch, seed=seed, threads=threads, scale=scale, relative_poses=True)
+    found = {pair: view.geometry.num_inliers for pair, view in read_two_views(scratch).items()}
+    with (
+        pycolmap.Database.open(scratch) as new,
+        pycolmap.Database.open(path) as db,
+        pycolmap.DatabaseTransaction(db),
+    ):
+        for a, b in matches:
+            if new.exists_two_view_geometry(ids[a], ids[b]):
+                geometry = new.read_two_view_geometry(ids[a], ids[b])
+                db.write_two_view_geometry(ids[a], ids[b], geometry)
+    scratch.unlink()
+    return found

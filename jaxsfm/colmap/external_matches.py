@@ -1,0 +1,209 @@
+"""Matches that somebody else made of the same photos, mapped beside ours in one model."""
+
+import dataclasses
+import logging
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsfm.colmap.formats.database import read_database
+from jaxsfm.colmap.formats.tables import CameraRow, Tables, one_to_one
+from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.core.types import Status
+from jaxsfm.errors import UserError
+from jaxsfm.io.hashes import sha256_of
+from jaxsfm.io.images import ImageFile, shown_name
+from jaxsfm.io.pairs import Pair, PairCounts, PairResult, describe
+
+logger = logging.getLogger("jaxsfm")
+
+BORDER_PX = 1.0
+"""Keypoints this far outside are pulled in: float16 and detectors' half pixels put them there."""
+FOCAL_RATIO = 1.1
+"""Focal lengths may differ as much: EXIF knows them to a few percent."""
+
+
+class Given(NamedTuple):
+    """Matches beside ours."""
+
+    keypoints: dict[str, np.ndarray]
+    """float32 (n, 2), original pixels, centre of the top-left pixel (0, 0)."""
+    matches: dict[Pair, np.ndarray]
+    """int32 (m, 2): indices of keypoints, one to one."""
+    about: dict[str, Any] | None
+    """For the report; None where nothing was given."""
+
+    def counts(self, ours: Mapping[Pair, PairCounts]) -> dict[Pair, PairCounts]:
+        """What is known of every pair: ours where it has inliers, else what was given."""
+        theirs = {pair: _result(pair, rows, self).counts for pair, rows in self.matches.items()}
+        return theirs | {p: c for p, c in ours.items() if c.num_inliers or p not in theirs}
+
+
+NOTHING = Given({}, {}, None)
+
+
+def read_given(
+    database: Path | None,
+    hloc: tuple[Path, Path] | None,
+    images: Collection[ImageFile],
+    intrinsics: Intrinsics | None,
+) -> Given:
+    """The matches of `--with-database` or `--with-hloc`, checked against the photos.
+
+    Of a verified database the two-view inliers count, of another one its matches. Cameras are
+    not taken over.
+
+    Raises:
+      UserError: unreadable, inconsistent, of other photos, sizes or cameras.
+    """
+    if database is not None and hloc is not None:
+        raise UserError("--with-database and --with-hloc: one of them")
+    if database is not None:
+        where, files = f"--with-database {database}", [database]
+        tables = read_database(database, where=where)
+    elif hloc is not None:
+        from jaxsfm.colmap.formats.hloc import read_hloc
+
+        where, files = "--with-hloc", list(hloc)
+        tables = read_hloc(*hloc, [image.name for image in images], where=where)
+    else:
+        return NOTHING
+    return _checked(tables, images, intrinsics, where, files)
+
+
+def _checked(
+    tables: Tables,
+    images: Collection[ImageFile],
+    intrinsics: Intrinsics | None,
+    where: str,
+    files: list[Path],
+) -> Given:
+    known = {image.name: image for image in images}
+    ignored = sorted(tables.keypoints.keys() - known.keys())
+    keypoints = {}
+    for name in sorted(tables.keypoints.keys() & known.keys()):
+        size = known[name].size
+        if tables.sizes.get(name, size) != size:
+            raise UserError(
+                f"{where}: {shown_name(name)} is {_by(tables.sizes[name])} pixels there, "
+                f"but the photo {_by(size)}"
+            )
+        if intrinsics is not None and name in tables.cameras:
+            _check_focal(tables.cameras[name], intrinsics, where, name)
+        inside = np.clip(
+            tables.keypoints[name], -0.5, np.asarray(size, np.float32) - np.float32(0.5)
+        )
+        if (np.abs(inside - tables.keypoints[name]) > BORDER_PX).any():
+            raise UserError(f"{where}: {shown_name(name)} has keypoints outside its {_by(size)}")
+        keypoints[name] = inside
+    if not keypoints:
+        raise UserError(f"{where}: none of its images is among the photos")
+    if ignored:
+        logger.warning(
+            "%s: %d images are not among the photos and are ignored, first %s",
+            where,
+            len(ignored),
+            shown_name(ignored[0]),
+        )
+    matches = {
+        pair: one_to_one(rows)
+        for pair, rows in sorted((tables.inliers or tables.matches).items())
+        if pair[0] in keypoints and pair[1] in keypoints
+    }
+    about = {
+        "files": [str(path.absolute()) for path in files],
+        "sha256": [sha256_of(path) for path in files],
+        "verified": bool(tables.inliers),
+        "images": len(keypoints),
+        "ignored": ignored,
+        "pairs": len(matches),
+        "matches": sum(map(len, matches.values())),
+    }
+    return Given(keypoints, matches, about)
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]} x {size[1]}"
+
+
+def _check_focal(camera: CameraRow, intrinsics: Intrinsics, where: str, name: str) -> None:
+    if not (camera.known and camera.params):
+        return
+    focal, ours = camera.params[0], intrinsics.params[0]
+    if not ours / FOCAL_RATIO < focal < ours * FOCAL_RATIO:
+        raise UserError(
+            f"{where}: {shown_name(name)} has a focal length of {focal:g} pixels there, "
+            f"but --intrinsics say {ours:g}"
+        )
+
+
+def _result(pair: Pair, rows: np.ndarray, given: Given) -> PairResult:
+    return PairResult(
+        pair=pair,
+        cells=rows,
+        keypoints0=given.keypoints[pair[0]][rows[:, 0]],
+        keypoints1=given.keypoints[pair[1]][rows[:, 1]],
+        plane=np.full(len(rows), -1, np.int32),
+        homographies=np.zeros((0, 3, 3)),
+        num_tentative=len(rows),
+        num_dropped=0,
+        status=Status.VERIFIED,
+    )
+
+
+def _joined(theirs: PairResult, ours: PairResult) -> PairResult:
+    """One list of matches; planes stay ours."""
+
+    def both(name: str) -> np.ndarray:
+        return np.concatenate([getattr(theirs, name), getattr(ours, name)])
+
+    return dataclasses.replace(
+        ours,
+        cells=both("cells"),
+        keypoints0=both("keypoints0"),
+        keypoints1=both("keypoints1"),
+        plane=both("plane"),
+        num_tentative=theirs.num_tentative + ours.num_tentative,
+        status=Status.VERIFIED,
+    )
+
+
+class Beside(Mapping[Pair, PairResult]):
+    """Our matches and those given, as one: theirs first in every image's list of keypoints, our
+    cells counted on from there. Pairs are joined when they are asked for.
+
+    Args:
+      names: the images that are mapped.
+    """
+
+    def __init__(
+        self, ours: Mapping[Pair, PairResult], given: Given, names: Collection[str]
+    ) -> None:
+        self._ours, self._given = ours, given
+        theirs = (pair for pair in given.matches if pair[0] in names and pair[1] in names)
+        self._pairs = dict.fromkeys(sorted({*ours, *theirs}))
+
+    def __getitem__(self, pair: Pair) -> PairResult:
+        if pair not in self._pairs:
+            raise KeyError(describe(pair))
+        parts = []
+        if pair in self._given.matches:
+            parts.append(_result(pair, self._given.matches[pair], self._given))
+        if pair in self._ours:
+            first = np.asarray(
+                [len(self._given.keypoints.get(name, ())) for name in pair], np.int32
+            )
+            ours = self._ours[pair]
+            parts.append(dataclasses.replace(ours, cells=ours.cells + first))
+        return parts[0] if len(parts) == 1 else _joined(*parts)
+
+    def __contains__(self, pair: object) -> bool:
+        return pair in self._pairs
+
+    def __iter__(self) -> Iterator[Pair]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)

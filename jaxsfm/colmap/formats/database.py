@@ -1,0 +1,117 @@
+"""COLMAP's database, read only.
+
+Read with sqlite3, not by COLMAP: that opens a file for writing, brings its tables up to date, and
+ends the process on what is damaged. Tables and blobs: https://colmap.github.io/database.html.
+"""
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from jaxsfm.colmap.formats.tables import (
+    MAX_KEYPOINTS,
+    CameraRow,
+    Tables,
+    checked_keypoints,
+    checked_matches,
+)
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import shown_name
+from jaxsfm.io.pairs import Pair
+
+MAX_IMAGES = 2**31 - 1
+"""An id of a pair is this times the lesser image's id, plus the other's."""
+PIXEL_OFFSET = np.float32(0.5)
+"""COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
+_DAMAGED = (sqlite3.Error, TypeError, ValueError, OverflowError, KeyError)
+
+
+def _blob(rows: int, columns: int, data: Any, dtype: type, where: str) -> np.ndarray:
+    """A table of a blob; COLMAP leaves it out where it has no rows."""
+    if data is None or rows == 0:
+        return np.zeros((0, max(int(columns), 2)), dtype)
+    if not isinstance(data, bytes) or rows > MAX_KEYPOINTS:
+        raise UserError(f"{where}: damaged")
+    table = np.frombuffer(data, dtype)
+    if rows < 0 or columns < 2 or table.size != rows * columns:
+        raise UserError(f"{where}: {rows} x {columns} values expected; got {table.size}")
+    return table.reshape(rows, columns)
+
+
+def _pairs(
+    db: sqlite3.Connection,
+    table: str,
+    names: dict[int, str],
+    keypoints: dict[str, np.ndarray],
+    where: str,
+) -> Iterator[tuple[Pair, np.ndarray]]:
+    query = f"SELECT pair_id, rows, cols, data FROM {table}"
+    for pair_id, count, columns, data in db.execute(query):
+        a, b = divmod(pair_id, MAX_IMAGES)
+        for image_id in (a, b):
+            if image_id not in names:
+                raise UserError(f"{where}: {table} name image {image_id}, which is not in it")
+        own = f"{where}: {table} of {shown_name(names[a])} and {shown_name(names[b])}"
+        rows = _blob(count, columns, data, np.uint32, own)[:, :2].astype(np.int64)
+        if len(rows):
+            yield checked_matches(rows, (names[a], names[b]), keypoints, where)
+
+
+def read_database(path: Path, *, where: str) -> Tables:
+    """Everything in a COLMAP database that was matched.
+
+    Args:
+      where: how messages begin: an option, the file.
+
+    Raises:
+      UserError: not a database, damaged, or inconsistent: an index out of range, two images of one
+        name, a match of an image that is not there.
+    """
+    if not path.is_file():
+        raise UserError(f"{where}: no such file")
+    # COLMAP's databases keep a log beside them: sqlite3 would make one even to read, unless told
+    # that nobody writes. A log that is there already holds what is not in the file yet.
+    how = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
+    try:
+        address = f"file:{quote(str(path.absolute()), errors='surrogateescape')}?{how}"
+        with closing(sqlite3.connect(address, uri=True)) as db:
+            return _read(db, where)
+    except _DAMAGED as error:
+        raise UserError(f"{where}: not a readable COLMAP database ({error})") from error
+
+
+def _read(db: sqlite3.Connection, where: str) -> Tables:
+    cameras = {
+        camera_id: (
+            (int(width), int(height)),
+            CameraRow(int(model), tuple(np.frombuffer(params).tolist()), bool(known)),
+        )
+        for camera_id, model, width, height, params, known in db.execute(
+            "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras"
+        )
+    }
+    names, sizes, own_cameras = {}, {}, {}
+    for image_id, name, camera_id in db.execute("SELECT image_id, name, camera_id FROM images"):
+        if not isinstance(name, str) or name in sizes:
+            raise UserError(f"{where}: damaged: two images {name!r}")
+        names[image_id] = name
+        sizes[name], own_cameras[name] = cameras[camera_id]
+    keypoints = {}
+    for image_id, rows, columns, data in db.execute(
+        "SELECT image_id, rows, cols, data FROM keypoints"
+    ):
+        if image_id not in names:
+            raise UserError(f"{where}: keypoints of image {image_id}, which is not in it")
+        own = f"{where}: {shown_name(names[image_id])}"
+        table = _blob(rows, columns, data, np.float32, own)
+        keypoints[names[image_id]] = checked_keypoints(table, own) - PIXEL_OFFSET
+    tables = [
+        dict(_pairs(db, table, names, keypoints, where))
+        for table in ("matches", "two_view_geometries")
+    ]
+    return Tables(sizes, own_cameras, keypoints, tables[0], tables[1])

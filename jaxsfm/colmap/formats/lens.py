@@ -1,0 +1,162 @@
+"""COLMAP's cameras in the terms that other formats share, and what a format cannot express."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import PurePosixPath
+from typing import NamedTuple
+
+import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
+import numpy as np
+import pycolmap
+
+from jaxsfm.colmap.formats.tables import CameraRow
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import shown_name
+
+TOLERANCE_PX = 0.01
+"""What may be lost at an image's corner."""
+_PERSPECTIVE = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 2}
+_FISHEYE = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4}
+"""Their numbers of radial terms."""
+
+
+class Lens(NamedTuple):
+    """A camera as OpenCV writes it, in COLMAP's pixels (centre of the top-left one (0.5, 0.5)).
+
+    Perspective: x (1 + k1 r^2 + k2 r^4) and the tangential terms p1, p2, r the distance from the
+    axis at depth 1. Fisheye: the angle t to the axis becomes t (1 + k1 t^2 + .. + k4 t^8).
+    """
+
+    model: str
+    """COLMAP's name of it."""
+    size: tuple[int, int]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    radial: tuple[float, float, float, float]
+    tangential: tuple[float, float]
+    fisheye: bool
+
+    @property
+    def corner_px(self) -> float:
+        """From the principal point to the farthest corner."""
+        width, height = self.size
+        return float(np.hypot(max(self.cx, width - self.cx), max(self.cy, height - self.cy)))
+
+
+def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Camera:
+    """A database's camera.
+
+    Args:
+      where: how messages begin.
+
+    Raises:
+      UserError: no such model, or other parameters than it has.
+    """
+    try:
+        model = pycolmap.CameraModelId(row.model)
+        camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=row.params)
+        if camera.verify_params():
+            return camera
+    except (ValueError, TypeError):
+        pass
+    raise UserError(f"{where}: a camera of model {row.model} with {len(row.params)} parameters")
+
+
+def lens_of(camera: pycolmap.Camera, to: str) -> Lens:
+    """Raises UserError where neither of the two formulas is the camera's, naming its model."""
+    model = camera.model_name
+    fisheye = model in _FISHEYE
+    if not fisheye and model not in _PERSPECTIVE:
+        raise UserError(f"--to {to}: it has no camera like COLMAP's {model}")
+    terms = _FISHEYE[model] if fisheye else _PERSPECTIVE[model]
+    extra = [camera.params[k] for k in camera.extra_params_idxs()]
+    k = [*map(float, extra[:terms]), 0.0, 0.0, 0.0, 0.0]
+    p = [*map(float, extra[terms:]), 0.0, 0.0]
+    return Lens(
+        model=model,
+        size=(camera.width, camera.height),
+        fx=float(camera.focal_length_x),
+        fy=float(camera.focal_length_y),
+        cx=float(camera.principal_point_x),
+        cy=float(camera.principal_point_y),
+        radial=(k[0], k[1], k[2], k[3]),
+        tangential=(p[0], p[1]),
+        fisheye=fisheye,
+    )
+
+
+def check_one_focal(lens: Lens, to: str) -> None:
+    """Raises UserError where the two focal lengths differ."""
+    if abs(lens.fx / lens.fy - 1) * lens.corner_px > TOLERANCE_PX:
+        raise UserError(
+            f"--to {to}: it has one focal length, but the {lens.model} camera has "
+            f"{lens.fx:g} and {lens.fy:g}"
+        )
+
+
+def check_centred(lens: Lens, to: str) -> None:
+    """Raises UserError where the principal point is not the image's centre."""
+    off = np.hypot(lens.cx - lens.size[0] / 2, lens.cy - lens.size[1] / 2)
+    if off > TOLERANCE_PX:
+        raise UserError(
+            f"--to {to}: its principal point is the image's centre, but the {lens.model} camera's "
+            f"lies {off:.2f} pixels off"
+        )
+
+
+def check_no_tangential(lens: Lens, to: str) -> None:
+    """Raises UserError for fisheye and tangential distortion."""
+    if lens.fisheye or any(lens.tangential):
+        raise UserError(f"--to {to}: it has no camera like COLMAP's {lens.model}")
+
+
+def check_no_blanks(names: Iterable[str], to: str) -> None:
+    """Raises UserError for names that a format would cut in two."""
+    for name in names:
+        if len(name.split()) != 1 or name != name.strip():
+            raise UserError(
+                f"--to {to}: {shown_name(name)!r} has a blank in it, where {to} ends a name"
+            )
+
+
+class Observed(NamedTuple):
+    """A 3-D point and where images see it."""
+
+    xyz: np.ndarray
+    colour: tuple[int, int, int]
+    seen: list[tuple[int, int, np.ndarray]]
+    """Index of the image, of its keypoint, and (x, y) in COLMAP's pixels; each image once."""
+
+
+def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """Images with a pose, by name.
+
+    Raises:
+      UserError: a name that leads out of the photos' folder.
+    """
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    for image in images:
+        path = PurePosixPath(image.name)
+        if path.is_absolute() or ".." in path.parts:
+            raise UserError(f"{shown_name(image.name)}: an image outside the photos' folder")
+    return sorted(images, key=lambda image: image.name)
+
+
+def observed(
+    model: pycolmap.Reconstruction, images: list[pycolmap.Image]
+) -> Iterator[tuple[int, Observed]]:
+    """The points by id; indices of images are those in `images`."""
+    index = {image.image_id: k for k, image in enumerate(images)}
+    pixels = [
+        np.asarray([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
+        for image in images
+    ]
+    for point_id in sorted(model.point3D_ids()):
+        point = model.point3D(point_id)
+        seen = {}
+        for element in point.track.elements:
+            k = index[element.image_id]
+            seen.setdefault(k, (k, element.point2D_idx, pixels[k][element.point2D_idx]))
+        red, green, blue = (int(c) for c in point.color)
+        yield point_id, Observed(point.xyz, (red, green, blue), list(seen.values()))

@@ -1,0 +1,203 @@
+"""COLMAP's mappers: from verified pairs to models, with second tries before giving up.
+
+Every model that the mapper makes is kept: the one with most images is the best, the others are the
+parts of the scene that nothing connects to it.
+"""
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Literal
+
+import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
+import pycolmap
+
+from jaxsfm.colmap.native import native
+from jaxsfm.colmap.two_views import TwoView
+from jaxsfm.io.pairs import Pair, component_of
+
+Mapper = Literal["incremental", "global"]
+MISSING = 0.1
+"""Share of the connected images up to which an absence is no reason to start again: one of ten
+lacks matches, not another start, and further starts are two more runs of the mapper."""
+MAX_RETRIES = 2
+"""Further initial pairs tried when the mapper's own choice leaves connected images out."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MapOptions:
+    """How verified matches become a model."""
+
+    mapper: Mapper = "incremental"
+    refine_intrinsics: bool = True
+    seed: int = 0
+    threads: int = -1
+    """Threads of verification and bundle adjustment; -1: all. One makes the model repeatable to
+    the last byte."""
+    scale: float = 1.0
+    """Original pixels per working pixel: COLMAP's pixel thresholds grow with it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """One run of a mapper."""
+
+    mapper: Mapper
+    initial_pair: Pair | None
+    """None: the mapper's own choice."""
+    registered: list[int]
+    """Images of every model."""
+
+
+def _incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOptions:
+    p = pycolmap.IncrementalPipelineOptions()
+    p.ba_refine_focal_length = p.ba_refine_extra_params = options.refine_intrinsics
+    p.ba_refine_principal_point = False
+    p.num_threads = p.mapper.num_threads = options.threads
+    p.random_seed = p.mapper.random_seed = options.seed
+    p.min_model_size = 2
+    p.extract_colors = False  # coloured by `colour_points`, from our own reader
+    p.mapper.init_max_error *= options.scale
+    p.mapper.abs_pose_max_error *= options.scale
+    p.mapper.filter_max_reproj_error *= options.scale
+    p.triangulation.complete_max_reproj_error *= options.scale
+    p.triangulation.merge_max_reproj_error *= options.scale
+    return p
+
+
+def _global_options(options: MapOptions) -> pycolmap.GlobalPipelineOptions:
+    p = pycolmap.GlobalPipelineOptions()
+    p.num_threads = options.threads
+    p.random_seed = options.seed
+    p.mapper.num_threads = options.threads
+    p.mapper.random_seed = options.seed
+    ba = p.mapper.bundle_adjustment
+    ba.refine_focal_length = ba.refine_extra_params = options.refine_intrinsics
+    ba.refine_principal_point = False
+    return p
+
+
+def initial_pairs(two_views: Mapping[Pair, TwoView]) -> list[Pair]:
+    """Pairs to start from, best first: many inliers, a wide angle, not one plane.
+
+    A plane leaves the relative pose two-fold ambiguous, a narrow angle leaves depth unknown: COLMAP
+    asks for 16 degrees at first.
+    """
+
+    def score(view: TwoView) -> float:
+        angle = min(view.tri_angle_deg / 16.0, 1.0)
+        return view.geometry.num_inliers * angle * (0.25 if view.planar else 1.0)
+
+    return sorted(
+        (p for p, v in two_views.items() if v.geometry.rotation is not None and score(v) > 0),
+        key=lambda p: (-score(two_views[p]), p),
+    )
+
+
+def _order(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    return sorted(
+        models, key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids()))
+    )
+
+
+def registered(model: pycolmap.Reconstruction) -> set[str]:
+    """Names of the images that have a pose."""
+    return {model.image(i).name for i in model.reg_image_ids()}
+
+
+def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:
+    """Whether the best model holds (nearly) all images that a chain of pairs connects to it."""
+    if not models:
+        return not pairs
+    names = registered(models[0])
+    connected = component_of(names, pairs)
+    return len(connected - names) <= MISSING * len(connected)
+
+
+def build_models(
+    database: Path,
+    two_views: Mapping[Pair, TwoView],
+    options: MapOptions,
+    *,
+    on_image: Callable[[], None] = lambda: None,
+) -> tuple[list[pycolmap.Reconstruction], list[Attempt]]:
+    """Map a verified database; the models, the one with most registered images first.
+
+    If the mapper leaves out more than `MISSING` of the images that verified pairs connect to its
+    best model, or finds no model, it is started again from other initial pairs (`initial_pairs`,
+    each image once, lower demands on them), and where there is still none, the global mapper is
+    tried. An attempt that registers more images takes the place of the former ones; their models of
+    other images stay.
+
+    Args:
+      two_views: the database's pairs.
+      on_image: called for every image registered (incremental mapper).
+    """
+    pairs = sorted(two_views)
+    models = _run(database, options, None, on_image)
+    attempts = [_attempt(options.mapper, None, models)]
+    if options.mapper == "incremental":
+        used: set[str] = set()
+        for pair in initial_pairs(two_views):
+            if _complete(models, pairs) or len(attempts) > MAX_RETRIES:
+                break
+            if used & set(pair):
+                continue
+            used |= set(pair)
+            other = _run(database, options, pair, on_image)
+            attempts.append(_attempt("incremental", pair, other))
+            if other and (not models or other[0].num_reg_images() > models[0].num_reg_images()):
+                apart = [m for m in models if not registered(m) <= registered(other[0])]
+                models = _order([other[0], *apart])
+        if not models and pairs:
+            other = _run(database, dataclasses.replace(options, mapper="global"), None, on_image)
+            attempts.append(_attempt("global", None, other))
+            models = other
+    return models, attempts
+
+
+def _attempt(mapper: Mapper, pair: Pair | None, models: list[pycolmap.Reconstruction]) -> Attempt:
+    return Attempt(
+        mapper=mapper, initial_pair=pair, registered=[m.num_reg_images() for m in models]
+    )
+
+
+def _image_ids(database: Path, pair: Pair) -> tuple[int, int]:
+    with pycolmap.Database.open(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+    return ids[pair[0]], ids[pair[1]]
+
+
+def _run(
+    database: Path, options: MapOptions, initial: Pair | None, on_image: Callable[[], None]
+) -> list[pycolmap.Reconstruction]:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        if options.mapper == "global":
+            found = native(
+                lambda _: pycolmap.global_mapping(
+                    database, scratch, scratch, _global_options(options)
+                ),
+                database,
+                grace_s=1,  # it takes no token
+            )
+            return _order(list(found.values()))
+        p = _incremental_options(options)
+        if initial is not None:
+            p.init_image_id1, p.init_image_id2 = _image_ids(database, initial)
+            p.multiple_models = False  # else COLMAP starts every model from this pair, 50 times
+            p.mapper.init_min_num_inliers = 30
+            p.mapper.init_min_tri_angle = 4.0
+        found = native(
+            lambda token: pycolmap.incremental_mapping(
+                database,
+                scratch,
+                scratch,
+                p,
+                initial_image_pair_callback=lambda: (on_image(), on_image()) and None,
+                next_image_callback=on_image,
+                cancellation_token=token,
+            ),
+            database,
+        )
+        return _order(list(found.values()))

@@ -1,0 +1,94 @@
+"""Camera poses from a COLMAP model or a folder of Strecha `.camera` files."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
+import numpy as np
+import pycolmap
+
+from jaxsfm.colmap.model_files import Damaged, check_binary
+from jaxsfm.errors import UserError
+
+
+class CameraPose(NamedTuple):
+    """Where a camera stands and looks."""
+
+    rotation: np.ndarray
+    """float64 (3, 3), world to camera."""
+    centre: np.ndarray
+    """float64 (3,), world units."""
+
+
+Poses = dict[str, CameraPose]
+_SUBFOLDERS = ("", "gt_dense_cameras", "sparse/0", "sparse")
+
+
+def model_poses(model: pycolmap.Reconstruction) -> Poses:
+    """Poses of a model's registered images, by name."""
+    poses = {}
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        rotation = image.cam_from_world().rotation.matrix()
+        poses[image.name] = CameraPose(rotation, np.asarray(image.projection_center()))
+    return poses
+
+
+def _read_strecha(path: Path) -> CameraPose:
+    """K (3 rows), a row of zeros, R camera-to-world (3 rows), centre, width and height."""
+    try:
+        values = [float(v) for v in path.read_text(encoding="utf-8").split()]
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not a Strecha camera file ({error})") from error
+    if len(values) < 24 or not np.isfinite(values).all():
+        raise UserError(f"{path}: not a Strecha camera file (expected at least 24 finite numbers)")
+    rotation = np.asarray(values[12:21]).reshape(3, 3).T
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise UserError(f"{path}: its rotation is not one")
+    return CameraPose(rotation, np.asarray(values[21:24]))
+
+
+def read_model(path: Path) -> pycolmap.Reconstruction:
+    """The COLMAP model (binary or text) in a folder."""
+    try:
+        if (path / "images.bin").is_file():
+            check_binary(path)
+        model = pycolmap.Reconstruction(path)
+        if not all(
+            np.isfinite([*p.rotation.flat, *p.centre]).all() for p in model_poses(model).values()
+        ):
+            raise Damaged("a pose that is not finite")
+        return model
+    except Damaged as error:
+        raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
+    except Exception as error:  # native errors of several kinds; the text is long and technical
+        raise UserError(f"{path}: not a readable COLMAP model") from error
+
+
+def _has_model(path: Path) -> bool:
+    return (path / "images.bin").is_file() or (path / "images.txt").is_file()
+
+
+def find_model(path: Path) -> Path:
+    """The model folder of a run's OUT, or of a folder that is a model itself."""
+    for sub in ("", "sparse/0", "sparse"):
+        if _has_model(path / sub):
+            return path / sub
+    raise UserError(f"{path}: no COLMAP model here (looked for sparse/0/images.bin)")
+
+
+def read_poses(path: Path, *, option: str = "--reference") -> Poses:
+    """Reference poses: Strecha `.camera` files or a COLMAP model, in the folder or below it.
+
+    Raises:
+      UserError: nothing of either kind, or damaged.
+    """
+    if not path.is_dir():
+        raise UserError(f"{option} {path}: no such folder")
+    for sub in _SUBFOLDERS:
+        folder = path / sub
+        if cameras := sorted(folder.glob("*.camera")):
+            return {file.name.removesuffix(".camera"): _read_strecha(file) for file in cameras}
+        if _has_model(folder):
+            return model_poses(read_model(folder))
+    raise UserError(f"{option} {path}: neither Strecha .camera files nor a COLMAP model in it")

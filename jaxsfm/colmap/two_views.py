@@ -1,0 +1,96 @@
+"""What COLMAP's two-view verification found, read from a database."""
+
+import dataclasses
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pycolmap
+
+from jaxsfm.colmap.database import PIXEL_OFFSET
+from jaxsfm.io.pairs import Pair
+
+PLANAR = (4, 6)
+"""COLMAP's two-view configurations PLANAR and PLANAR_OR_PANORAMIC."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PairGeometry:
+    """What two-view verification says of a pair."""
+
+    num_inliers: int
+    rotation: np.ndarray | None
+    """float64 (3, 3), camera of the first image to that of the second; None: not determined."""
+    spread: float = 1.0
+    """Share of the image the inliers cover, 0 .. 1, the smaller of the two."""
+
+
+def spread(xy: np.ndarray, size: tuple[int, int], *, cells: int = 8) -> float:
+    """Share of a cells x cells grid over the image that holds at least one point.
+
+    Args:
+      xy: float (n, 2), pixels of an image of `size` (width, height).
+    """
+    at = np.floor((xy + 0.5) / np.asarray(size) * cells).astype(int).clip(0, cells - 1)
+    return len(np.unique(at[:, 1] * cells + at[:, 0])) / cells**2
+
+
+class TwoView(NamedTuple):
+    """What COLMAP's verification says of a pair."""
+
+    geometry: PairGeometry
+    tri_angle_deg: float
+    """Median angle between the rays of a point; 0 if unknown. (COLMAP's own is not stored.)"""
+    planar: bool
+    """A homography explains all inliers."""
+
+
+def rays_of(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
+    """Unit directions (n, 3) of pixels, in the camera's frame."""
+    flat = camera.cam_from_img(np.ascontiguousarray(xy + float(PIXEL_OFFSET)))
+    assert flat is not None
+    rays = np.c_[flat, np.ones(len(flat))]
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def read_two_views(path: Path) -> dict[Pair, TwoView]:
+    """Every pair with inliers, the lesser name first.
+
+    Relative poses are there if `verify` was asked for them.
+    """
+    with pycolmap.Database.open(path) as db:
+        images = {image.image_id: image for image in db.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
+        camera_of = {i: cameras[image.camera_id] for i, image in images.items()}
+        xy = {i: np.asarray(db.read_keypoints(i))[:, :2] - PIXEL_OFFSET for i in images}
+        found = {}
+        for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            if not len(geometry.inlier_matches):
+                continue
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            seen = [
+                xy[i][geometry.inlier_matches[:, side]].astype(np.float64)
+                for side, i in enumerate((a, b))
+            ]
+            covered = min(
+                spread(at, (camera_of[i].width, camera_of[i].height))
+                for at, i in zip(seen, (a, b), strict=True)
+            )
+            rotation, angle = None, 0.0
+            if geometry.cam2_from_cam1 is not None:
+                rotation = geometry.cam2_from_cam1.rotation.matrix()
+                rays = [rays_of(camera_of[i], at) for at, i in zip(seen, (a, b), strict=True)]
+                cross = np.linalg.norm(np.cross(rays[0] @ rotation.T, rays[1]), axis=1)
+                seen_angles = np.arcsin(np.minimum(cross[np.isfinite(cross)], 1.0))
+                angle = float(np.degrees(np.median(seen_angles))) if len(seen_angles) else 0.0
+            if images[a].name > images[b].name:
+                rotation = None if rotation is None else rotation.T
+            name0, name1 = sorted((images[a].name, images[b].name))
+            found[name0, name1] = TwoView(
+                PairGeometry(
+                    num_inliers=len(geometry.inlier_matches), rotation=rotation, spread=covered
+                ),
+                angle,
+                int(geometry.config) in PLANAR,
+            )
+        return found

@@ -1,0 +1,1 @@
+"""Our own files: images, weights, features and matches, the work folder."""

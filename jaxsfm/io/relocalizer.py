@@ -1,0 +1,83 @@
+"""Learned relocalizers: parameters of `jaxsfm.core.scores.Scores` in safetensors files.
+
+A file holds conv1_2.kernel, conv1_2.bias, conv1_2.out, conv1_2.place and the same of pool1 and of
+pool2, float32, and says in its metadata how it was made. Nothing in it can run code.
+"""
+
+import dataclasses
+import functools
+import importlib.resources
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsfm.core.scores import PLACES, WALKED, Head
+from jaxsfm.errors import UserError
+from jaxsfm.io.tensors import Tensors, open_tensors, save_tensors
+
+FORMAT = "jaxsfm relocalizer 1"
+SHIPPED = "relocalizer.safetensors"
+MAX_HIDDEN = 1024
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Relocalizer:
+    """Learned scores and what is known of them."""
+
+    params: dict[str, Any]
+    """{'params': {level: `jaxsfm.core.scores.Head`'s fields by name}}, float32."""
+    sha256: str
+    about: dict[str, Any]
+    """The file's metadata: how the parameters were made."""
+
+
+def save_relocalizer(path: Path, params: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    """Write parameters of `Scores`; the same ones give the same bytes.
+
+    Raises:
+      UserError: the file cannot be written.
+    """
+    tensors = {
+        f"{level}.{part}": params["params"][level][part]
+        for level in WALKED
+        for part in Head._fields
+    }
+    save_tensors(path, tensors, marker=FORMAT, about=about)
+
+
+def load_relocalizer(path: Path) -> Relocalizer:
+    """Read and check a relocalizer.
+
+    Raises:
+      UserError: no such file, or not a relocalizer.
+    """
+    with open_tensors(
+        path, marker=FORMAT, what="relocalizer", made_by="jaxsfm train relocalizer"
+    ) as file:
+        levels = {level: _checked(file, level) for level in WALKED}
+        known = {f"{level}.{part}" for level in WALKED for part in Head._fields}
+        if unknown := file.shapes.keys() - known:
+            raise UserError(f"{path}: {sorted(unknown)[0]} does not belong in a relocalizer")
+        return Relocalizer(params={"params": levels}, sha256=file.sha256, about=file.about)
+
+
+def _checked(file: Tensors, level: str) -> dict[str, np.ndarray]:
+    hidden = int(np.prod(file.shapes.get(f"{level}.bias", (1,))))
+    if not 1 <= hidden <= MAX_HIDDEN:
+        raise UserError(f"{file.path}: {level} must have 1 to {MAX_HIDDEN} units; got {hidden}")
+    shapes = {
+        "kernel": (WALKED[level], hidden),
+        "bias": (hidden,),
+        "out": (hidden,),
+        "place": (PLACES[level], PLACES[level]),
+    }
+    return {part: file.read(f"{level}.{part}", shapes[part]) for part in Head._fields}
+
+
+@functools.cache
+def shipped_relocalizer() -> Relocalizer:
+    """The one that comes with jaxsfm; docs/relocalization.md tells how it was made."""
+    with importlib.resources.as_file(importlib.resources.files("jaxsfm") / SHIPPED) as path:
+        return load_relocalizer(path)

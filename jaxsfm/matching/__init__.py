@@ -1,0 +1,1 @@
+"""From photos to verified pairs, on all devices."""

@@ -1,0 +1,171 @@
+"""Image files to dense features, in batches over all devices."""
+
+import dataclasses
+import itertools
+import os
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxsfm.config import Config
+from jaxsfm.core.features import Extraction
+from jaxsfm.core.sharded import extract_batch
+from jaxsfm.core.types import DenseFeatures
+from jaxsfm.io.features import ImageFeatures, check_memory, padded_size, room_of
+from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
+from jaxsfm.io.weights import Weights
+from jaxsfm.matching.execution import SINGLE, Execution, chosen_devices, images_at_once, one_ahead
+
+READERS = 8
+"""Threads that decode at most: one JPEG takes 20 ms, an accelerator wants 150 a second."""
+
+
+def _start(
+    weights: Weights, working: Sequence[WorkingImage], config: Config, mesh: Mesh, batch_size: int
+) -> DenseFeatures:
+    """Features, with a leading axis, of images that share a padded size and capacity; on the
+    devices, and not waited for."""
+    padded, num_coarse = _shapes(working[0].rgb.shape[1::-1])
+    room = batch_size * mesh.size
+    images = np.zeros((room, *padded, 3), np.uint8)
+    sizes = np.zeros((room, 2), np.int32)
+    for k, each in enumerate(working):
+        height, width = sizes[k] = each.rgb.shape[:2]
+        images[k, :height, :width] = each.rgb
+    return extract_batch(
+        weights.params,
+        weights.scores(config),
+        images,
+        sizes,
+        mesh=mesh,
+        settings=extraction_settings(weights, config, num_coarse),
+    )
+
+
+def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Extraction:
+    """The config's part of the extraction's program.
+
+    Raises:
+      ValueError: the weights are of another network.
+    """
+    if weights.backbone != config.backbone:
+        raise ValueError(f"weights must be of {config.backbone}; got {weights.backbone}")
+    return Extraction(
+        preprocessing=weights.preprocessing,
+        num_coarse=num_coarse,
+        backbone=config.backbone,
+        relocalized=config.keypoints != "grid",
+        octaves=config.octaves,
+        centred=config.centred,
+        bfloat16=config.convolutions == "bfloat16",
+    )
+
+
+def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
+    """Padded size and capacity of a working image of (width, height): they fix the program."""
+    return padded_size(size), room_of(size).num_coarse
+
+
+def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
+    """Read one image and compute its features.
+
+    Raises:
+      ImageError: the image cannot be used.
+      UserError: it needs more memory than there is.
+    """
+    ((_, found),) = extracted(weights, [image], config=config, execution=SINGLE)
+    if isinstance(found, ImageError):
+        raise found
+    return found
+
+
+def extracted(
+    weights: Weights,
+    images: Iterable[ImageFile],
+    *,
+    config: Config,
+    execution: Execution | None = None,
+) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
+    """Features of every image, or why it has none, as batches are done; images of one padded size
+    follow each other. The next images are read meanwhile.
+
+    Raises:
+      UserError: an image needs more memory than there is.
+    """
+    execution, images = execution or Execution(), list(images)
+    mesh = chosen_devices(execution)
+    at_once = mesh.size * (execution.images_at_once or 1)
+    for image in images:  # before the first is computed
+        check_memory(image, at_once, config=config)
+    params = jax.device_put(weights.params, NamedSharding(mesh, PartitionSpec()))
+    weights = dataclasses.replace(weights, params=params)
+
+    def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
+        return _shapes(working_size(image.size, config.max_size, config.enlarge))
+
+    def batches() -> Iterator[_Batch]:
+        for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
+            some = list(group)
+            pixels = padded[0] * padded[1]
+            side_by_side = images_at_once(execution, mesh, pixels, len(some))
+            read = _read_ahead(some, config=config, ahead=side_by_side * mesh.size + READERS)
+            while batch := list(itertools.islice(read, side_by_side * mesh.size)):
+                yield _Batch(batch, side_by_side)
+
+    def start(batch: _Batch) -> tuple[_Batch, DenseFeatures | None]:
+        good = [each for _, each in batch.read if isinstance(each, WorkingImage)]
+        return batch, _start(weights, good, config, mesh, batch.side_by_side) if good else None
+
+    return one_ahead(batches(), start, _results)
+
+
+class _Batch(NamedTuple):
+    """Images that were read together, and how many of them a device computes side by side."""
+
+    read: list[tuple[ImageFile, WorkingImage | ImageError]]
+    side_by_side: int
+
+
+def _results(
+    started: tuple[_Batch, DenseFeatures | None],
+) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
+    batch, found = started
+    dense, k = jax.device_get(found), 0
+    for image, each in batch.read:
+        if isinstance(each, ImageError):
+            yield image, each
+        else:
+            own = jax.tree.map(lambda x, k=k: x[k].copy(), dense)  # not a view of the whole batch
+            yield image, ImageFeatures(image, each.scale, own)
+            k += 1
+
+
+def _read_ahead(
+    images: Iterable[ImageFile], *, config: Config, ahead: int
+) -> Iterator[tuple[ImageFile, WorkingImage | ImageError]]:
+    """Images in order, decoded by threads up to `ahead` of the one that is wanted."""
+
+    def read(image: ImageFile) -> WorkingImage | ImageError:
+        try:
+            return read_image(image, max_size=config.max_size, enlarge=config.enlarge)
+        except ImageError as error:
+            return error
+
+    waiting: deque[tuple[ImageFile, Future]] = deque()
+    todo = iter(images)
+    pool = ThreadPoolExecutor(min(READERS, os.cpu_count() or 1))
+    try:
+        while True:
+            for image in itertools.islice(todo, ahead - len(waiting)):
+                waiting.append((image, pool.submit(read, image)))
+            if not waiting:
+                return
+            image, working = waiting.popleft()
+            yield image, working.result()
+    finally:  # an interrupted run does not wait for what it will not use
+        pool.shutdown(cancel_futures=True)

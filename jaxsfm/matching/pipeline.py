@@ -1,0 +1,75 @@
+"""The stages up to matches: photos to features to matches.
+
+Every stage is a function of its inputs and a config. `jaxsfm.run_folder` strings them together in a
+work folder.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from tqdm import tqdm
+
+from jaxsfm.config import Config
+from jaxsfm.errors import UserError
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.weights import Weights
+from jaxsfm.matching.execution import Execution
+from jaxsfm.matching.extraction import extracted
+from jaxsfm.matching.pair_matching import matched
+
+
+def open_images(folder: Path, *, progress: bool = False) -> tuple[list[ImageFile], dict[str, str]]:
+    """The usable images below a folder, and why each of the others is not.
+
+    Raises:
+      UserError: no such folder, or no image files in it.
+    """
+    images, lost = [], {}
+    names = find_images(folder)
+    for name in tqdm(names, desc="reading", unit="image", delay=2, disable=not progress):
+        try:
+            images.append(inspect_image(folder / name, name=name))
+        except UserError as error:
+            lost[name] = str(error)
+    return images, lost
+
+
+def extract(
+    weights: Weights,
+    images: Iterable[ImageFile],
+    *,
+    config: Config,
+    execution: Execution | None = None,
+) -> dict[str, ImageFeatures]:
+    """Dense features of images, by name; all of them in memory (25 MB for 1536 x 1024).
+
+    Raises:
+      ImageError: an image cannot be decoded.
+    """
+    features = {}
+    for image, found in extracted(weights, images, config=config, execution=execution):
+        if isinstance(found, ImageError):
+            raise found
+        features[image.name] = found
+    return features
+
+
+def match(
+    features: Mapping[str, ImageFeatures],
+    pairs: Iterable[tuple[str, str]],
+    *,
+    config: Config,
+    seed: int = 0,
+    execution: Execution | None = None,
+) -> dict[Pair, PairResult]:
+    """Verified matches of pairs of images, by pair (the lesser name first).
+
+    A pair's result depends on the two images, the config and the seed; not on other pairs.
+    """
+    rooms = {name: each.room for name, each in features.items()}
+    results = matched(
+        features.__getitem__, rooms, pairs, config=config, seed=seed, execution=execution
+    )
+    return {result.pair: result for result in results}

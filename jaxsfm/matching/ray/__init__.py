@@ -1,0 +1,1 @@
+"""Features and matches from workers on a Ray cluster."""

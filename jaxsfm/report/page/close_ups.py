@@ -1,0 +1,157 @@
+"""Close-ups of tracks: the cell that matched, the pixel it walked to, its place in the model."""
+
+import functools
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsfm.core.grid import FINE_STRIDE, rescale
+from jaxsfm.io.images import WorkingImage
+from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.report.finished_run import KeptRun, Model
+from jaxsfm.report.page.embedded import data_uri
+
+TRACKS, PHOTOS = 5, 6
+"""Tracks shown, and photos of each."""
+MATCHED = 12
+"""Photos of a track whose matches with each other are looked at."""
+SIDE = 40
+"""Side of a patch, working pixels."""
+NEAR_PX = 6.0
+"""Working pixels between a keypoint and the observation that the refinement made of it."""
+LEAST = 4
+"""Photos that see a shown point, where there are such points."""
+
+
+class Patch(NamedTuple):
+    """A piece of one photo; places in pixels of the patch, its top-left corner (0, 0)."""
+
+    name: str
+    uri: str
+    cell: tuple[float, float] | None
+    """Top-left corner of the cell of FINE_STRIDE pixels; None: none matched."""
+    walked: tuple[float, float] | None
+    final: tuple[float, float]
+
+
+class ShownTrack(NamedTuple):
+    """One 3-D point in some of the photos that see it."""
+
+    length: int
+    error: float
+    """Mean reprojection error, original pixels."""
+    patches: list[Patch]
+
+
+def _candidates(model: Model) -> list[int]:
+    """Points that many photos see, from all over the model."""
+    lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
+    least = min(LEAST, int(lengths.max(initial=0)))
+    long = np.flatnonzero((lengths >= least) & (lengths > 0))
+    # Points next to each other in the model's order are next to each other in space.
+    return long[np.linspace(0, len(long) - 1, 4 * TRACKS).astype(int)].tolist() if len(long) else []
+
+
+def _cells(
+    load: Callable[[Pair], PairResult | None], names: list[str], xy: np.ndarray, radius: float
+) -> dict[int, tuple[int, np.ndarray]]:
+    """Place in `names` -> (cell, keypoint) of the matches that made a track's observations.
+
+    Args:
+      xy: (n, 2), original pixels of the observations in the images `names`.
+      radius: original pixels: how far off a keypoint may lie.
+    """
+    found = []
+    for i, j in itertools.combinations(range(len(names)), 2):
+        pair = make_pair(names[i], names[j])
+        result = load(pair)
+        if result is None or not result.num_inliers:
+            continue
+        first, second = (i, j) if pair[0] == names[i] else (j, i)
+        off = np.maximum(
+            np.linalg.norm(result.keypoints0 - xy[first], axis=1),
+            np.linalg.norm(result.keypoints1 - xy[second], axis=1),
+        )
+        k = int(np.argmin(off))
+        if off[k] < radius:
+            ends = zip((first, second), (result.keypoints0[k], result.keypoints1[k]), strict=True)
+            found += [
+                (float(off[k]), v, int(result.cells[k, s]), p) for s, (v, p) in enumerate(ends)
+            ]
+    cells: dict[int, tuple[int, np.ndarray]] = {}
+    for _, view, cell, place in sorted(found, key=lambda f: f[:2]):
+        cells.setdefault(view, (cell, place))
+    return cells
+
+
+def _patch(
+    name: str, image: WorkingImage, final: np.ndarray, own: tuple[int, np.ndarray] | None
+) -> Patch:
+    """A patch around the cell, or around the place in the model.
+
+    Args:
+      final: (2,), original pixels.
+      own: cell index and its keypoint, original pixels.
+    """
+    height, width = image.rgb.shape[:2]
+    to_working = 1 / np.asarray(image.scale)
+    aligned = np.asarray(rescale(final, to_working))
+    corner, walked = None, None
+    if own is not None:
+        row, column = divmod(own[0], width // FINE_STRIDE)
+        corner = np.asarray([column, row]) * float(FINE_STRIDE)
+        walked = np.asarray(rescale(np.asarray(own[1], np.float64), to_working))
+    middle = aligned if corner is None else corner + (FINE_STRIDE - 1) / 2
+    x, y = np.round(middle - (SIDE - 1) / 2).astype(int)
+    rows = np.clip(np.arange(y, y + SIDE), 0, height - 1)
+    columns = np.clip(np.arange(x, x + SIDE), 0, width - 1)
+    origin = np.asarray([x, y])
+
+    def at(place: np.ndarray, half: float) -> tuple[float, float]:
+        return tuple((place - origin + half).round(2).tolist())
+
+    return Patch(
+        name=name,
+        uri=data_uri(np.ascontiguousarray(image.rgb[np.ix_(rows, columns)]), ".png"),
+        cell=None if corner is None else at(corner, 0.0),
+        walked=None if walked is None else at(walked, 0.5),
+        final=at(aligned, 0.5),
+    )
+
+
+def _track(
+    run: KeptRun, model: Model, load: Callable[[Pair], PairResult | None], point: int
+) -> ShownTrack | None:
+    rows = np.flatnonzero(model.tracks.point == point)
+    names = [model.views[model.tracks.view[row]].name for row in rows]
+    shown = [
+        (k, image) for k, name in enumerate(names[:PHOTOS]) if (image := run.photos.read(name))
+    ]
+    if len(shown) < 2:
+        return None
+    names, some = names[:MATCHED], rows[:MATCHED]
+    scale = max(max(image.scale) for _, image in shown)
+    cells = _cells(load, names, model.tracks.xy[some], NEAR_PX * scale)
+    patches = [
+        _patch(names[k], image, model.tracks.xy[rows[k]], cells.get(k)) for k, image in shown
+    ]
+    if sum(patch.cell is not None for patch in patches) < 2:
+        return None
+    return ShownTrack(len(rows), float(np.mean(model.errors[rows])), patches)
+
+
+def close_ups(run: KeptRun) -> list[ShownTrack]:
+    """A few tracks; none without a model, photos or matches."""
+    if run.model is None:
+        return []
+    load = functools.lru_cache(maxsize=None)(run.load_matches)
+    shown: list[ShownTrack] = []
+    for point in _candidates(run.model):
+        track = _track(run, run.model, load, point)
+        if track is not None:
+            shown.append(track)
+        if len(shown) == TRACKS:
+            break
+    return shown

@@ -1,0 +1,103 @@
+"""How exact the model is: by itself, and beside a reference."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+
+from jaxsfm.report.finished_run import Model
+from jaxsfm.report.page.figures import BLUE, GREEN, Figure, figure
+
+LONGEST_TRACK = 15
+
+
+def _axis(title: str, **more: Any) -> dict[str, Any]:
+    return {"title": {"text": title}, "automargin": True, **more}
+
+
+def reprojection_figure(model: Model) -> Figure:
+    """Histogram of every observation's reprojection error."""
+    errors = model.errors[np.isfinite(model.errors)]
+    top = float(max(np.percentile(errors, 99), 0.1)) if len(errors) else 1.0
+    counts, edges = np.histogram(np.minimum(errors, top), bins=50, range=(0, top))
+    return figure(
+        "reprojection",
+        "Reprojection errors",
+        "How far the model's points, projected into the photos, lie from where they were seen: a "
+        "good model piles up at the left; the last bar holds the worst 1 %.",
+        alt=f"Histogram of {len(errors)} reprojection errors",
+        data=[
+            go.Bar(
+                x=(edges[:-1] + edges[1:]).astype(np.float32) / 2,
+                y=counts,
+                marker={"color": BLUE},
+                hovertemplate="%{x:.2f} px: %{y}<extra></extra>",
+            )
+        ],
+        layout={"xaxis": _axis("pixels"), "yaxis": _axis("observations"), "bargap": 0.05},
+    )
+
+
+def track_figure(model: Model) -> Figure:
+    """How many photos see a point."""
+    lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
+    counts = np.bincount(np.minimum(lengths, LONGEST_TRACK), minlength=3)[2:]
+    labels = [str(k) for k in range(2, 2 + len(counts))]
+    if len(labels) == LONGEST_TRACK - 1:
+        labels[-1] += "+"
+    return figure(
+        "tracks",
+        "How many photos see each point",
+        "Points that many photos agree on are the firm ones; points seen twice only are the least "
+        "certain.",
+        alt=f"Bar chart of the track lengths of {len(lengths)} points",
+        data=[
+            go.Bar(
+                x=labels,
+                y=counts,
+                marker={"color": GREEN},
+                hovertemplate="seen in %{x} photos: %{y} points<extra></extra>",
+            )
+        ],
+        layout={
+            "xaxis": _axis("photos", type="category"),
+            "yaxis": _axis("points"),
+            "bargap": 0.15,
+        },
+    )
+
+
+def cumulative_figures(evaluation: Mapping[str, Any]) -> list[Figure]:
+    """Share of the reference's photos within an error, for positions and rotations."""
+    total = evaluation["reference_images"]
+    figures = []
+    for id, field, title, unit, colour in (
+        ("positions", "position", "Position errors", "units of the reference", BLUE),
+        ("rotations", "rotation_deg", "Rotation errors", "degrees", GREEN),
+    ):
+        errors = np.sort([image[field] for image in evaluation["images"].values()])
+        share = 100 * np.arange(1, len(errors) + 1) / total
+        figures.append(
+            figure(
+                id,
+                title,
+                f"Share of the reference's {total} photos whose {field.split('_')[0]} is off by no "
+                "more than the value on the axis: a good curve rises early and ends at 100 %.",
+                alt=f"Cumulative curve of {len(errors)} {field.split('_')[0]} errors",
+                data=[
+                    go.Scatter(
+                        x=np.r_[0, errors].astype(np.float32),
+                        y=np.r_[0, share].astype(np.float32),
+                        mode="lines+markers" if len(errors) <= 100 else "lines",
+                        line={"shape": "hv", "color": colour, "width": 2},
+                        hovertemplate="%{y:.0f} % within %{x:.4g}<extra></extra>",
+                    )
+                ],
+                layout={
+                    "xaxis": _axis(unit, rangemode="tozero", exponentformat="none"),
+                    "yaxis": _axis("photos, %", range=[0, 104]),
+                },
+            )
+        )
+    return figures

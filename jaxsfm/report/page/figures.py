@@ -1,0 +1,72 @@
+"""What all figures of the page share."""
+
+import html
+from typing import Any, NamedTuple
+
+import numpy as np
+import plotly.graph_objects as go
+
+from jaxsfm.io.images import shown_name
+
+BLUE, ORANGE, GREEN, GREY = "#3b82c4", "#e07b39", "#3f9d6b", "#8a94a3"
+"""Legible on light and on dark ground, and apart for colour-blind readers."""
+
+
+class Figure(NamedTuple):
+    """A figure that plotly draws in the browser."""
+
+    id: str
+    title: str
+    caption: str
+    """One sentence: what it shows and how to read it."""
+    alt: str
+    spec: str
+    """JSON of data and layout, numbers in base64; plotly escapes < and > in it, so that no name can
+    end the <script> that holds it."""
+    tall: bool = False
+
+
+def text(name: str) -> str:
+    """An image's name for plotly, which takes a few tags in its texts."""
+    return html.escape(shown_name(name))
+
+
+def count(n: int) -> str:
+    """With thin spaces between thousands."""
+    return f"{n:,}".replace(",", "\u202f")
+
+
+def figures3(value: float) -> str:
+    """Three significant figures, never as a power of ten."""
+    return np.format_float_positional(value, precision=3, fractional=False, trim="-")
+
+
+def short(names: list[str]) -> list[str]:
+    """The names without the folder that all of them share."""
+    shared = names[0].rpartition("/")[0] + "/" if names else ""
+    if shared != "/" and all(name.startswith(shared) for name in names):
+        return [name.removeprefix(shared) for name in names]
+    return names
+
+
+def figure(
+    id: str,
+    title: str,
+    caption: str,
+    *,
+    alt: str,
+    data: list[Any],
+    layout: dict[str, Any],
+    tall: bool = False,
+) -> Figure:
+    """A figure; colours of ground, text and grid come from the page."""
+    base = {
+        "template": go.layout.Template(),
+        "margin": {"l": 60, "r": 16, "t": 12, "b": 50},
+        "legend": {"orientation": "h", "yanchor": "bottom", "y": 1.01, "x": 0},
+        "hoverlabel": {"namelength": -1},
+    }
+    made = go.Figure(data=data, layout={**base, **layout})
+    spec = made.to_json()
+    assert spec is not None
+    return Figure(id, title, caption, alt, spec, tall)

@@ -1,0 +1,139 @@
+"""Every pair in two squares: how many matches, and what became of it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+
+from jaxsfm.report.page.figures import Figure, count, figure, short, text
+from jaxsfm.report.page.pair_states import NOT_TRIED, STATES, state
+
+MAX_SQUARES = 200
+"""Squares per side; photos beyond it share squares."""
+MAX_LABELS = 25
+
+
+def _reduced(matrix: np.ndarray, block: int) -> np.ndarray:
+    """The largest value of every block x block part."""
+    n = -(-len(matrix) // block)
+    wide = np.zeros((n * block, n * block), matrix.dtype)
+    wide[: len(matrix), : len(matrix)] = matrix
+    return wide.reshape(n, block, n, block).max((1, 3))
+
+
+def pair_matrices(names: Sequence[str], rows: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """int32 (n, n): inliers (COLMAP's where it verified) and index into STATES; symmetrical."""
+    index = {name: k for k, name in enumerate(names)}
+    inliers = np.zeros((len(names), len(names)), np.int32)
+    states = np.zeros_like(inliers)
+    for row in rows:
+        a, b = (index[name] for name in row["pair"])
+        inliers[a, b] = inliers[b, a] = row["colmap_inliers"] or row["inliers"]
+        states[a, b] = states[b, a] = state(row)
+    return inliers, states
+
+
+def matrix_figures(names: list[str], rows: Sequence[Any]) -> list[Figure]:
+    """Matches and states of all pairs as heat maps.
+
+    Args:
+      names: all images, in the order of the axes.
+      rows: `pairs.each` of report.json.
+    """
+    block = max(1, -(-len(names) // MAX_SQUARES))
+    inliers, states = (_reduced(m, block) for m in pair_matrices(names, rows))
+    shown = short(names)
+    groups = [shown[k : k + block] for k in range(0, len(shown), block)]
+    labels = [text(g[0] if len(g) == 1 else f"{g[0]} .. {g[-1]}") for g in groups]
+    note = (
+        f" Each square stands for {block} x {block} photos and shows the best of their pairs."
+        if block > 1
+        else ""
+    )
+    side = np.arange(len(labels))
+    ticks = [text(g[0]) for g in groups]
+    every = max(1, -(-len(labels) // MAX_LABELS))
+    axis = {
+        "type": "category",
+        "tickmode": "array",
+        "tickvals": side[::every],
+        "ticktext": ticks[::every],
+        "showgrid": False,
+        "zeroline": False,
+        "automargin": True,
+    }
+    layout = {
+        "xaxis": {**axis, "tickangle": -60},
+        "yaxis": {**axis, "autorange": "reversed", "scaleanchor": "x", "constrain": "domain"},
+        "margin": {"l": 20, "r": 10, "t": 12, "b": 20},
+    }
+    there = sorted(set(states.ravel().tolist()) - {NOT_TRIED})
+    # Only the states that occur take room beside the squares.
+    place = np.full(len(STATES), np.nan, np.float32)
+    place[there] = np.arange(len(there))
+    colours = [
+        [edge / len(there), STATES[s].colour] for k, s in enumerate(there) for edge in (k, k + 1)
+    ]
+    common = {"x": labels, "y": labels, "hoverongaps": False}
+    where = "%{x}<br>%{y}"
+    return [
+        figure(
+            "inliers",
+            "How many matches each pair has",
+            "Each square is a pair of photos, brighter with more verified matches (counts on a "
+            f"logarithmic scale); photos of neighbouring places give bright blocks.{note}",
+            alt=f"Heat map of the matches of {len(names)} x {len(names)} photos",
+            data=[
+                go.Heatmap(
+                    z=np.where(inliers, np.log10(np.maximum(inliers, 1)), np.nan).astype(
+                        np.float32
+                    ),
+                    customdata=inliers,
+                    colorscale="Viridis",
+                    hovertemplate=where + "<br>%{customdata} matches<extra></extra>",
+                    colorbar=_counts_bar(int(inliers.max(initial=1))),
+                    **common,
+                )
+            ],
+            layout=layout,
+            tall=True,
+        ),
+        figure(
+            "states",
+            "What became of each pair",
+            "The same squares by outcome: only blue pairs reach the model, orange ones were "
+            f"verified but contradict stronger pairs.{note}",
+            alt=f"Heat map of the outcome of the pairs of {len(names)} photos",
+            data=[
+                go.Heatmap(
+                    z=place[states],
+                    zmin=-0.5,
+                    zmax=len(there) - 0.5,
+                    colorscale=colours or None,
+                    hovertemplate=where + "<extra></extra>",
+                    colorbar=_bar(range(len(there)), [STATES[k].name for k in there]),
+                    **common,
+                )
+            ],
+            layout=layout,
+            tall=True,
+        ),
+    ]
+
+
+def _counts_bar(most: int) -> dict[str, Any]:
+    ticks = [k * 10**p for p in range(7) for k in (1, 2, 5) if k * 10**p <= most]
+    return _bar(np.log10(ticks).tolist(), [count(k) for k in ticks])
+
+
+def _bar(at: Sequence[float], labels: list[str]) -> dict[str, Any]:
+    """The colours' key, above the squares: narrow screens have no room beside them."""
+    return {
+        "orientation": "h",
+        "y": 1.0,
+        "yanchor": "bottom",
+        "thickness": 10,
+        "tickvals": list(at),
+        "ticktext": labels,
+    }

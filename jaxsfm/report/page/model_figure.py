@@ -1,0 +1,116 @@
+"""The 3-D model to turn with the mouse."""
+
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+
+from jaxsfm.report.page.figures import BLUE, ORANGE, Figure, figure, text
+from jaxsfm.report.scene import Scene, ShownCamera
+
+MAX_POINTS = 40_000
+
+
+def _hex(colours: np.ndarray) -> list[str]:
+    return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours.tolist()]
+
+
+def _cameras(cameras: list[ShownCamera], depth: float, name: str, colour: str) -> list[Any]:
+    """Frusta as one line with gaps, and the centres to point at."""
+    gap = np.full((1, 3), np.nan)
+    lines = np.concatenate([p for c in cameras for p in (c.frustum(depth), gap)])
+    lines = lines.astype(np.float32)
+    centres = np.asarray([c.pose.centre for c in cameras], np.float32)
+    return [
+        go.Scatter3d(
+            x=lines[:, 0],
+            y=lines[:, 1],
+            z=lines[:, 2],
+            mode="lines",
+            name=name,
+            legendgroup=name,
+            line={"color": colour, "width": 3},
+            hoverinfo="skip",
+        ),
+        go.Scatter3d(
+            x=centres[:, 0],
+            y=centres[:, 1],
+            z=centres[:, 2],
+            mode="markers",
+            name=name,
+            legendgroup=name,
+            showlegend=False,
+            marker={"color": colour, "size": 3},
+            text=[text(c.name) for c in cameras],
+            hovertemplate="%{text}<extra></extra>",
+        ),
+    ]
+
+
+def _start(scene: Scene) -> dict[str, Any]:
+    """Where to look from first, in plotly's units."""
+    eye = 1.55 * scene.behind()
+    return {
+        "eye": dict(zip("xyz", eye.tolist(), strict=True)),
+        "up": {"x": 0, "y": 0, "z": 1},
+    }
+
+
+def model_figure(scene: Scene, unit: str) -> Figure:
+    """Points with their colours, cameras, and the reference's cameras if there are any.
+
+    Args:
+      unit: what the axes count, for the caption.
+    """
+    n = len(scene.points)
+    some = np.sort(np.random.default_rng(0).permutation(n)[:MAX_POINTS])
+    points = scene.points[some].astype(np.float32)
+    data = [
+        go.Scatter3d(
+            x=points[:, 0],
+            y=points[:, 1],
+            z=points[:, 2],
+            mode="markers",
+            name="points",
+            # Squares are two triangles each: circles take three times as long to draw.
+            marker={"size": 1.6, "symbol": "square", "color": _hex(scene.colours[some])},
+            hoverinfo="skip",
+        ),
+        *_cameras(scene.cameras, scene.frustum_depth, "cameras", BLUE),
+    ]
+    if scene.reference:
+        data += _cameras(scene.reference, 1.3 * scene.frustum_depth, "reference", ORANGE)
+    notes = ""
+    if n > MAX_POINTS:
+        notes += f" {MAX_POINTS} of {n} points are drawn, taken at random."
+    if scene.far:
+        notes += f" {scene.far} points far outside are left out."
+    reference = ", orange ones (a little larger) where they ought to be" if scene.reference else ""
+    axis = {"showbackground": False, "title": {"text": ""}, "nticks": 6}
+    return figure(
+        "model",
+        "The 3-D model",
+        f"Drag to turn, scroll to zoom: points in the photos' colours, blue pyramids where the "
+        f"cameras stand and look{reference}; axes in {unit}.{notes}",
+        alt=f"3-D model with {len(some)} points and {len(scene.cameras)} cameras",
+        data=data,
+        layout={
+            "scene": {
+                "aspectmode": "data",
+                "dragmode": "orbit",
+                "camera": _start(scene),
+                "xaxis": axis,
+                "yaxis": axis,
+                "zaxis": axis,
+            },
+            "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+            "legend": {
+                "itemsizing": "constant",
+                "orientation": "h",
+                "x": 0,
+                "y": 1,
+                "yanchor": "top",
+            },
+        },
+        tall=True,
+    )

@@ -1,0 +1,135 @@
+"""The best and the most doubtful pairs, with their matches."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsfm.report.finished_run import KeptRun, Photos
+from jaxsfm.report.page.embedded import Embedded, embed
+from jaxsfm.report.page.pair_states import NOT_TRUSTED, NOT_VERIFIED, USED, state
+from jaxsfm.report.plot import COLOURS, MAX_LINES
+
+OF_A_KIND = 3
+"""Pairs shown of the best, the weakest and the refused."""
+SIDE = 640
+"""Longer side of a photo in the page, pixels."""
+MAX_DOTS = 400
+"""Dots drawn per plane and photo."""
+
+
+class Plane(NamedTuple):
+    """The matches on one homography, as paths."""
+
+    colour: str
+    matches: int
+    lines: str
+    dots: str
+
+
+class PairPicture(NamedTuple):
+    """Two photos side by side, what to draw on them and what to say."""
+
+    heading: str
+    note: str
+    names: tuple[str, str]
+    photos: tuple[Embedded, Embedded]
+    shift: int
+    """Left edge of the second photo."""
+    width: int
+    height: int
+    planes: list[Plane]
+    matches: int
+
+
+def _chosen(rows: Sequence[Any]) -> list[tuple[str, Any]]:
+    """Headings and rows of report.json, best first."""
+    used = [row for row in rows if state(row) == USED]
+    used.sort(key=lambda row: (-row["colmap_inliers"], row["pair"]))
+    best, weakest = used[:OF_A_KIND], used[OF_A_KIND:][-OF_A_KIND:]
+    refused = [row for row in rows if state(row) in (NOT_TRUSTED, NOT_VERIFIED)]
+    refused.sort(key=lambda row: (-row["colmap_inliers"], -row["inliers"], row["pair"]))
+    return [
+        *(("Among the best pairs", row) for row in best),
+        *(("Among the weakest pairs that were used", row) for row in weakest),
+        *(("Refused", row) for row in refused[:OF_A_KIND]),
+    ]
+
+
+def _note(row: Any) -> str:
+    verdict = row["view_graph"]
+    parts = [
+        f"{row['inliers']} matches on {row['planes']} planes, "
+        f"{row['colmap_inliers']} of them verified by COLMAP"
+    ]
+    if verdict:
+        parts.append(f"strength {verdict['strength']:.2f} of 1")
+        if verdict["reason"]:
+            parts.append(f"refused because {verdict['reason']}")
+    elif not row["colmap_inliers"]:
+        parts.append("no common geometry found")
+    return "; ".join(parts)
+
+
+def _some(index: np.ndarray, limit: int) -> np.ndarray:
+    return index[:: max(1, -(-len(index) // limit))]
+
+
+def _planes(result: Any, xy0: np.ndarray, xy1: np.ndarray) -> list[Plane]:
+    planes = []
+    for k in range(len(result.homographies)):
+        member = np.flatnonzero(result.plane == k)
+        lines = [
+            f"M{xy0[m, 0]:.0f} {xy0[m, 1]:.0f}L{xy1[m, 0]:.0f} {xy1[m, 1]:.0f}"
+            for m in _some(member, MAX_LINES)
+        ]
+        some = _some(member, MAX_DOTS)
+        dots = [f"M{x:.0f} {y:.0f}h0" for xy in (xy0, xy1) for x, y in xy[some]]
+        planes.append(Plane(COLOURS[k % len(COLOURS)], len(member), "".join(lines), "".join(dots)))
+    return planes
+
+
+def _picture(run: KeptRun, heading: str, row: Any, seen: dict[str, Embedded]) -> PairPicture | None:
+    a, b = row["pair"]
+    result = run.load_matches((a, b))
+    if result is None:
+        return None
+    for name in (a, b):
+        if name not in seen and (made := _photo(run.photos, name, len(seen))) is not None:
+            seen[name] = made
+    if a not in seen or b not in seen:
+        return None
+    photo0, photo1 = seen[a], seen[b]
+    shift = photo0.width + 6
+    return PairPicture(
+        heading=heading,
+        note=_note(row),
+        names=(a, b),
+        photos=(photo0, photo1),
+        shift=shift,
+        width=shift + photo1.width,
+        height=max(photo0.height, photo1.height),
+        planes=_planes(
+            result,
+            photo0.place(result.keypoints0),
+            photo1.place(result.keypoints1) + np.asarray([shift, 0]),
+        ),
+        matches=result.num_inliers,
+    )
+
+
+def _photo(photos: Photos, name: str, number: int) -> Embedded | None:
+    image = photos.read(name)
+    return image and embed(image, id=f"photo{number}", side=SIDE)
+
+
+def pair_pictures(run: KeptRun) -> tuple[list[PairPicture], Iterable[Embedded]]:
+    """Pictures of a few pairs, and the photos they use, each once.
+
+    Pairs whose photos or matches are gone have none.
+    """
+    seen: dict[str, Embedded] = {}
+    made = [
+        _picture(run, heading, row, seen) for heading, row in _chosen(run.report["pairs"]["each"])
+    ]
+    return [picture for picture in made if picture is not None], list(seen.values())

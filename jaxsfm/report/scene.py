@@ -1,0 +1,134 @@
+"""A model as it is shown: upright, in the reference's units if there is one, without far points."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from jaxsfm.colmap.poses import CameraPose
+from jaxsfm.report.finished_run import KeptRun, Model
+from jaxsfm.sfm.evaluation import Similarity
+
+FAR = 0.5
+"""Points further outside the box of the middle 98 % than this share of it are left out."""
+
+
+class ShownCamera(NamedTuple):
+    """A camera in the shown world."""
+
+    name: str
+    pose: CameraPose
+    corners: np.ndarray
+    """float64 (4, 3): the image's corners at depth 1 from the centre, clockwise from top left."""
+
+    def frustum(self, depth: float) -> np.ndarray:
+        """Ten points (10, 3) of one line along its edges, up to the image at `depth`."""
+        tip, at = self.pose.centre, self.pose.centre + depth * self.corners
+        return np.stack([at[0], at[1], tip, at[2], at[3], tip, at[0], at[3], at[2], at[1]])
+
+
+class Scene(NamedTuple):
+    """What there is to see; z is up, the origin amid the cameras."""
+
+    points: np.ndarray
+    """float64 (n, 3)."""
+    colours: np.ndarray
+    """uint8 (n, 3)."""
+    cameras: list[ShownCamera]
+    reference: list[ShownCamera]
+    """Where the cameras ought to be; empty without a reference."""
+    frustum_depth: float
+    far: int
+    """Points left out because they lie far outside."""
+
+    def behind(self) -> np.ndarray:
+        """Direction (3,) from the model to a first look at it: behind the cameras, and above."""
+        ahead = np.mean([c.pose.rotation[2] for c in self.cameras], axis=0)
+        ahead[2] = 0.0
+        length = np.linalg.norm(ahead)
+        ahead = ahead / length if length > 0.1 else np.asarray([0.0, 1.0, 0.0])
+        return np.asarray([0.0, 0.0, 0.4]) - 0.9 * ahead
+
+
+def _corners(model: Model) -> dict[str, np.ndarray]:
+    """Corners of every view's image at depth 1, camera frame."""
+    found = {}
+    for view in model.views:
+        w, h = view.size
+        xy = np.asarray([[0, 0], [w, 0], [w, h], [0, h]], float) - 0.5
+        found[view.name] = view.rays(xy) @ view.rotation.T
+    return found
+
+
+def _upright(poses: list[CameraPose]) -> np.ndarray:
+    """The rotation (3, 3) that turns the cameras' mean upward direction to z."""
+    down = np.mean([pose.rotation[1] for pose in poses], axis=0)
+    if np.linalg.norm(down) < 0.1:  # they look from all around: any one is as good
+        down = poses[0].rotation[1]
+    up = -down / np.linalg.norm(down)
+    right = np.mean([pose.rotation[0] for pose in poses], axis=0)
+    right -= (right @ up) * up
+    if np.linalg.norm(right) < 1e-3:
+        right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(up, right), up])
+
+
+def _moved(pose: CameraPose, by: Similarity) -> CameraPose:
+    centre = by.scale * by.rotation @ pose.centre + by.translation
+    return CameraPose(pose.rotation @ by.rotation.T, centre)
+
+
+def _depth(centres: np.ndarray, extent: float) -> float:
+    """A frustum's depth: cameras should neither touch each other nor vanish."""
+    nearest = extent
+    if len(centres) > 1:
+        nearest = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
+    return float(np.clip(0.5 * nearest, 0.01 * extent, 0.08 * extent))
+
+
+def shown_scene(run: KeptRun) -> Scene:
+    """The run's best model.
+
+    Raises:
+      ValueError: the run has none.
+    """
+    if run.model is None:
+        raise ValueError("run must have a model; got none")
+    model = run.model
+    own = Similarity(1.0, np.eye(3), np.zeros(3))
+    to_reference = run.reference.similarity if run.reference else own
+    poses = [_moved(CameraPose(v.rotation, v.centre), to_reference) for v in model.views]
+    # Coordinates of a reference may be of a whole country: too long for a browser's float32.
+    upright = _upright(poses)
+    turn = Similarity(1.0, upright, -upright @ np.mean([p.centre for p in poses], axis=0))
+    corners = _corners(model)
+
+    def camera(name: str, pose: CameraPose, at: np.ndarray) -> ShownCamera:
+        turned = _moved(pose, turn)
+        return ShownCamera(name, turned, at @ turned.rotation)
+
+    cameras = [
+        camera(view.name, pose, corners[view.name])
+        for view, pose in zip(model.views, poses, strict=True)
+    ]
+    usual = np.median(list(corners.values()), axis=0)
+    reference = [
+        camera(name, pose, usual)
+        for name, pose in sorted(run.reference.poses.items() if run.reference else ())
+    ]
+    points = to_reference.scale * model.tracks.points @ to_reference.rotation.T
+    points = (points + to_reference.translation) @ turn.rotation.T + turn.translation
+    centres = np.asarray([c.pose.centre for c in cameras])
+    low, high = np.percentile(np.concatenate([points, centres]), (1, 99), axis=0)
+    low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
+    margin = FAR * (high - low)
+    near = ((points >= low - margin) & (points <= high + margin)).all(1)
+    return Scene(
+        points=points[near],
+        colours=model.colours[near],
+        cameras=cameras,
+        reference=reference,
+        frustum_depth=_depth(centres, float(np.linalg.norm(high - low))),
+        far=int((~near).sum()),
+    )

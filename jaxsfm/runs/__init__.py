@@ -1,0 +1,1 @@
+"""A resumable piece of work in a folder: reconstruct, localize, extend."""

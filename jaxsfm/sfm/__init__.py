@@ -1,0 +1,1 @@
+"""From verified pairs to a refined and evaluated model."""

@@ -1,0 +1,1 @@
+"""Adds photos to a finished model."""

@@ -1,0 +1,189 @@
+"""The pose of one photo in a finished model, which stays as it is: resection from its matches, then
+followed over the octaves (`jaxsfm.sfm.refine.octave_pose`), as a weak view is.
+
+Only some views of the model take part, and the points that they see: the work does not grow with
+the model.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.resection import MIN_POINTS, find_view
+from jaxsfm.config import Refinement
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.image_readers import ReadGray
+from jaxsfm.sfm.refine.octave_pose import (
+    MAX_DOUBT_PX,
+    MIN_COUNT,
+    MIN_SHARE,
+    Followed,
+    Observed,
+    follow,
+    pose_doubt,
+    trusted,
+)
+from jaxsfm.sfm.refine.weak_views import MATCH_ERROR_PX, matched_points
+
+CELL_PX = 8
+"""Side of a fine cell, working pixels: the grain of matches."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Located:
+    """What became of a photo."""
+
+    view: View | None
+    """Where it was taken; None: nowhere that alignment confirms or 30 matches agree on."""
+    trusted: bool
+    """Alignment confirms the pose; else it hangs on matches alone."""
+    why: str | None
+    """Why it has no pose, or none that is trusted."""
+    on_surface: int
+    """Matches with the surface of the model under them."""
+    inliers: int
+    """Those that agree with the resection."""
+    candidates: int
+    """Points of the model that it could show."""
+    agreed: int
+    """Those that alignment finds there."""
+    octave_px: int | None
+    """Working pixels per pixel of the octave that gives the pose; None: not trusted."""
+    error_px: float | None
+    """Median distance of what determines the pose from where the pose puts it, working pixels."""
+    doubt_px: float | None
+    """How far off projections are expected to be, working pixels (`Pose.doubt_px`)."""
+    centre_error: float | None
+    """Expected error of the centre, units of the model, beside the model's own."""
+    rotation_error_deg: float | None
+    """Likewise, of the rotation."""
+    observed: Observed | None = None
+    """The points that it shows, of a trusted pose."""
+
+
+def locate(
+    image: View,
+    views: list[View],
+    tracks: Tracks,
+    matches: Mapping[Pair, PairResult],
+    read: ReadGray,
+    *,
+    config: Refinement,
+    own_camera: bool,
+    seed: int = 0,
+) -> Located:
+    """The pose of a photo among views of a model.
+
+    Args:
+      image: size, scale and camera of the photo; its pose does not count.
+      views, tracks: of the model or a part of it, working pixels.
+      matches: of the photo with the views, original pixels.
+      read: intensities of the photo and of the views, by name.
+      own_camera: the focal length is estimated too: from nothing, unless the camera's is known
+        from before (`has_prior_focal_length`).
+      seed: of the resection.
+    """
+    if not len(tracks.points):
+        return _nowhere(0, matches)
+    normal = plane_geometry.normals(tracks, views, neighbours=config.neighbours)
+    xy, points = matched_points(image, views, tracks, normal, matches)
+    found = find_view(
+        image,
+        xy,
+        points,
+        max_error_px=MATCH_ERROR_PX,
+        estimate_focal_length=own_camera and not image.camera.has_prior_focal_length,
+        seed=seed,
+    )
+    if found is None:
+        return _nowhere(len(xy), matches)
+    errors = np.linalg.norm(found.project(points)[0] - xy, axis=1)
+    near = np.isfinite(errors) & (errors <= MATCH_ERROR_PX)
+    if near.sum() < MIN_POINTS:  # of the camera after its refinement
+        return _nowhere(len(xy), matches)
+    pose = Followed(view=found, own_camera=own_camera)
+    if config.weak_octaves:
+        follow([pose], views, tracks, read, config)
+    best = trusted(pose)
+    if best is None and near.sum() < MIN_COUNT:
+        return dataclasses.replace(
+            _nowhere(len(xy), matches),
+            why=_doubtful(pose, int(near.sum()), len(xy)),
+            inliers=int(near.sum()),
+            candidates=pose.candidates,
+            agreed=pose.agreed,
+        )
+    if best is None:
+        error_px = float(np.median(errors[near]))
+        seen, side, view = (points[near], xy[near]), CELL_PX, found
+    else:
+        error_px, view = best.error_px, best.view
+        seen = best.observed.points, best.observed.xy
+        side = best.octave_px * (2 * config.radius + 1)
+    doubt = pose_doubt(view, *seen, error_px, side, focal=own_camera)
+    return Located(
+        view=view,
+        trusted=best is not None,
+        why=None if best else _doubtful(pose, int(near.sum()), len(xy)),
+        on_surface=len(xy),
+        inliers=int(near.sum()),
+        candidates=len(best.observed.could) if best else pose.candidates,
+        agreed=best.agreed if best else pose.agreed,
+        octave_px=best.octave_px if best else None,
+        error_px=error_px,
+        doubt_px=best.doubt_px if best else None,
+        centre_error=doubt.centre,
+        rotation_error_deg=doubt.rotation_deg,
+        observed=best.observed if best else None,
+    )
+
+
+def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Located:
+    """No pose."""
+    most = max((result.num_inliers for result in matches.values()), default=0)
+    if most == 0:
+        tentative = max((result.num_tentative for result in matches.values()), default=0)
+        why = f"no plane in common with a photo of the model (at most {tentative} matches of cells)"
+    elif on_surface < MIN_POINTS:
+        why = (
+            f"{on_surface} matches lie on the surface of the model, a pose needs {MIN_POINTS} "
+            f"({most} matches with its best photo)"
+        )
+    else:
+        why = f"no pose agrees with enough of the {on_surface} matches on the model's surface"
+    return Located(
+        view=None,
+        trusted=False,
+        why=why,
+        on_surface=on_surface,
+        inliers=0,
+        candidates=0,
+        agreed=0,
+        octave_px=None,
+        error_px=None,
+        doubt_px=None,
+        centre_error=None,
+        rotation_error_deg=None,
+    )
+
+
+def _doubtful(pose: Followed, inliers: int, on_surface: int) -> str:
+    """Why a pose from matches is not trusted."""
+    start = f"a pose agrees with {inliers} of {on_surface} matches, but "
+    if pose.best is None:
+        return (
+            f"{start}alignment finds {pose.agreed} of the {pose.candidates} points that it would "
+            f"show there (needed: {MIN_COUNT})"
+        )
+    if pose.share < MIN_SHARE:
+        return (
+            f"{start}alignment finds at most {100 * pose.share:.1f} % of the points that it would "
+            f"show there (needed: {100 * MIN_SHARE:.0f} %)"
+        )
+    return (
+        f"{start}what alignment finds leaves {pose.best.doubt_px:.2f} px of doubt "
+        f"(at most {MAX_DOUBT_PX:g})"
+    )

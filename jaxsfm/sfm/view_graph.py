@@ -1,0 +1,194 @@
+"""Which verified pairs to trust: a view graph whose rotations agree.
+
+Scenes that repeat themselves (courtyards, rows of windows) verify pairs of images that show
+different walls. Each such pair looks sound by itself; together they contradict the rest. The
+evidence is compared, strongest first:
+
+1. A pair's *strength* is its inliers relative to what its two images reach with their best partners
+   (geometric mean), times how far the inliers spread over the smaller of their two regions.
+2. Pairs are joined strongest first, as in a maximum spanning tree. Where two groups of images meet,
+   the pairs between them vote, with their strengths, on the rotation between the groups; the
+   largest group of agreeing votes decides.
+3. The rotations of all images are then averaged over the agreeing pairs (robustly), and a pair
+   whose own rotation is further than `tolerance_deg` from them is dropped, unless it is strong:
+   then its rotation may be poor (a plane, a guessed focal length), but its matches are sound.
+
+So a false pair can survive only where nothing stronger speaks against it. Nothing depends on the
+order of images or pairs. On castle-P19 the false pairs are off by 75-180 deg and hold 0.01-0.09 of
+their images' best counts; true pairs are off by less than 10 deg with one exception in 90.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from jaxsfm.colmap.two_views import PairGeometry
+from jaxsfm.io.pairs import Pair
+
+STRONG = 0.3
+"""Strength above which a pair is trusted whatever its rotation; false pairs reached 0.09."""
+TOLERANCE_DEG = 15.0
+"""How far a trusted pair's rotation may be from the averaged ones. Two-view rotations of true pairs
+are good to 0.3 deg (median), of weak ones to 10."""
+MAX_VOTES = 500
+"""Strongest pairs between two groups that vote: the vote is quadratic in them."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Whether a pair is trusted, and why not."""
+
+    trusted: bool
+    strength: float
+    """0 .. 1; 1: as many inliers as the best pair of both images, all over the image."""
+    rotation_error_deg: float | None
+    """Own rotation against the averaged ones."""
+    reason: str = ""
+    """Empty for trusted pairs."""
+
+
+def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between rotations (..., 3, 3), degrees; accurate near zero, where arccos is not."""
+    half_sine = np.linalg.norm(a - b, axis=(-2, -1)) / (2 * np.sqrt(2))
+    return np.degrees(2 * np.arcsin(np.minimum(half_sine, 1.0)))
+
+
+def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
+    """Every pair's strength, see the module."""
+    weight = {p: g.num_inliers * np.sqrt(g.spread) for p, g in geometries.items()}
+    best: dict[str, float] = {}
+    for pair, w in weight.items():
+        for image in pair:
+            best[image] = max(best.get(image, 0.0), w)
+    return {
+        (a, b): float(w / np.sqrt(best[a] * best[b])) if w > 0 else 0.0
+        for (a, b), w in weight.items()
+    }
+
+
+def trusted_pairs(
+    geometries: Mapping[Pair, PairGeometry], *, tolerance_deg: float = TOLERANCE_DEG
+) -> dict[Pair, Verdict]:
+    """A verdict for every pair.
+
+    Args:
+      geometries: by pair of image names (the lesser first).
+      tolerance_deg: see `TOLERANCE_DEG`.
+    """
+    if not 0 < tolerance_deg < 180:
+        raise ValueError(f"tolerance_deg must lie in (0, 180); got {tolerance_deg}")
+    strength = strengths(geometries)
+    ranked = sorted(geometries, key=lambda p: (-strength[p], p))
+    known = [p for p in ranked if geometries[p].rotation is not None and strength[p] > 0]
+    rotations = _average(_grow(known, geometries, strength, tolerance_deg), known, geometries)
+    verdicts = {}
+    determined = set(known)
+    for pair in sorted(geometries):
+        error, reason = None, ""
+        if pair not in determined:
+            reason = "no relative pose"
+        else:
+            error = float(_error_deg(pair, geometries, rotations))
+            if error > tolerance_deg and strength[pair] < STRONG:
+                reason = (
+                    f"its rotation is {error:.0f} deg from the one that stronger pairs give "
+                    f"(its strength is {strength[pair]:.3f} of 1)"
+                )
+        verdicts[pair] = Verdict(
+            trusted=not reason,
+            strength=strength[pair],
+            rotation_error_deg=error,
+            reason=reason,
+        )
+    return verdicts
+
+
+Rotations = dict[str, np.ndarray]
+
+
+def _rotation(pair: Pair, geometries: Mapping[Pair, PairGeometry]) -> np.ndarray:
+    rotation = geometries[pair].rotation
+    assert rotation is not None
+    return rotation
+
+
+def _error_deg(
+    pair: Pair, geometries: Mapping[Pair, PairGeometry], rotations: Rotations
+) -> np.ndarray:
+    predicted = rotations[pair[1]] @ rotations[pair[0]].T
+    return rotation_angle_deg(_rotation(pair, geometries), predicted)
+
+
+def _grow(
+    ranked: list[Pair],
+    geometries: Mapping[Pair, PairGeometry],
+    strength: Mapping[Pair, float],
+    tolerance_deg: float,
+) -> Rotations:
+    """Camera rotations (world to camera), each connected group of images in a frame of its own."""
+    names = sorted({image for pair in ranked for image in pair})
+    index = {name: k for k, name in enumerate(names)}
+    ends = np.asarray([[index[a], index[b]] for a, b in ranked]).reshape(-1, 2)
+    relative = np.asarray([_rotation(pair, geometries) for pair in ranked]).reshape(-1, 3, 3)
+    votes = np.asarray([strength[pair] for pair in ranked])
+    group = np.arange(len(names))
+    rotations = np.tile(np.eye(3), (len(names), 1, 1))
+    for i, j in ends:
+        a, b = group[i], group[j]
+        if a == b:
+            continue
+        of = group[ends]
+        forward = (of == (a, b)).all(1)
+        rows = np.flatnonzero(forward | (of == (b, a)).all(1))[:MAX_VOTES]
+        swap = ~forward[rows]
+        in_a = np.where(swap, ends[rows, 1], ends[rows, 0])
+        in_b = np.where(swap, ends[rows, 0], ends[rows, 1])
+        turned = np.where(swap[:, None, None], relative[rows].transpose(0, 2, 1), relative[rows])
+        # World of b -> world of a, as each pair has it.
+        moves = rotations[in_a].transpose(0, 2, 1) @ turned.transpose(0, 2, 1) @ rotations[in_b]
+        close = rotation_angle_deg(moves[:, None], moves[None]) < tolerance_deg
+        winner = int(np.argmax(close @ votes[rows]))  # the first of equals is the strongest
+        move = mean_rotation(moves[close[winner]], votes[rows][close[winner]])
+        members = group == b
+        rotations[members] = rotations[members] @ move.T
+        group[members] = a
+    return dict(zip(names, rotations, strict=True))
+
+
+def mean_rotation(rotations: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The rotation nearest to the weighted mean of (n, 3, 3) (chordal L2 mean)."""
+    u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, rotations))
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def _average(
+    rotations: Rotations, pairs: Iterable[Pair], geometries: Mapping[Pair, PairGeometry]
+) -> Rotations:
+    """Robust rotation averaging: every image in turn takes the mean of what its pairs imply,
+    weighted by inliers over (1 + (error / 2 deg)^2)^2, until nothing moves."""
+    around: dict[str, list[tuple[str, np.ndarray, int]]] = {}
+    for pair in sorted(pairs):
+        relative, count = _rotation(pair, geometries), geometries[pair].num_inliers
+        around.setdefault(pair[1], []).append((pair[0], relative, count))
+        around.setdefault(pair[0], []).append((pair[1], relative.T, count))
+    stacked = {
+        image: (
+            [other for other, _, _ in rows],
+            *map(np.asarray, list(zip(*rows, strict=True))[1:]),
+        )
+        for image, rows in around.items()
+    }
+    rotations = dict(rotations)
+    for _ in range(50):
+        largest = 0.0
+        for image in sorted(stacked):
+            others, relative, counts = stacked[image]
+            implied = relative @ np.asarray([rotations[other] for other in others])
+            error = rotation_angle_deg(implied, rotations[image])
+            new = mean_rotation(implied, counts / (1.0 + (error / 2.0) ** 2) ** 2)
+            largest = max(largest, float(rotation_angle_deg(new, rotations[image])))
+            rotations[image] = new
+        if largest < 1e-3:
+            break
+    return rotations

@@ -1,0 +1,216 @@
+"""Second tries of the mapper, and scenes that make the first one hard."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mapped import map_database, verified
+from scipy.spatial.transform import Rotation
+
+from jaxsfm.colmap import mapper
+from jaxsfm.colmap.database import drop_pairs, write_database
+from jaxsfm.colmap.mapper import MapOptions, build_models, initial_pairs
+from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views
+from jaxsfm.core.types import Status
+from jaxsfm.io.pairs import PairResult, exhaustive_pairs
+from jaxsfm.sfm.view_graph import rotation_angle_deg
+
+ONE = MapOptions(refine_intrinsics=False, threads=1)
+
+
+SAME = np.eye(3)
+
+
+def two_view(inliers=100, angle=20.0, *, planar=False, rotation: np.ndarray | None = SAME):
+    return TwoView(PairGeometry(num_inliers=inliers, rotation=rotation), angle, planar)
+
+
+def test_initial_pairs_have_many_inliers_a_wide_angle_and_more_than_a_plane():
+    views = {
+        ("a", "b"): two_view(500, 2.0),
+        ("a", "c"): two_view(300, 20.0),
+        ("a", "d"): two_view(300, 60.0),
+        ("b", "c"): two_view(900, 20.0, planar=True),
+        ("b", "d"): two_view(900, 20.0, rotation=None),
+        ("c", "d"): two_view(900, 0.0),
+    }
+    assert initial_pairs(views) == [("a", "c"), ("a", "d"), ("b", "c"), ("a", "b")]
+
+
+class Model(SimpleNamespace):
+    """As much of a reconstruction as choosing between models needs."""
+
+    def num_reg_images(self):
+        return len(self.names)
+
+    def num_points3D(self):  # noqa: N802
+        return self.points
+
+    def reg_image_ids(self):
+        return list(range(len(self.names)))
+
+    def image(self, i):
+        return SimpleNamespace(name=self.names[i])
+
+
+def model(names: str, points=10) -> Model:
+    return Model(names=list(names), points=points)
+
+
+def runs(monkeypatch, outcomes):
+    """`_run` gives these outcomes in turn; the (mapper, initial pair) of every call are kept."""
+    calls, left = [], list(outcomes)
+
+    def run(database, options, initial, on_image):
+        calls.append((options.mapper, initial))
+        return left.pop(0)
+
+    monkeypatch.setattr(mapper, "_run", run)
+    return calls
+
+
+PAIRS = {pair: two_view(100 - k) for k, pair in enumerate(exhaustive_pairs("abcdef"))}
+
+
+def test_a_complete_model_needs_one_attempt(monkeypatch, tmp_path):
+    calls = runs(monkeypatch, [[model("abcdef")]])
+    models, attempts = build_models(tmp_path / "d.db", PAIRS, ONE)
+    assert calls == [("incremental", None)] and models[0].num_reg_images() == 6
+    assert [a.registered for a in attempts] == [[6]]
+
+
+def test_images_that_nothing_connects_are_no_reason_to_try_again(monkeypatch, tmp_path):
+    calls = runs(monkeypatch, [[model("abc"), model("de")]])
+    apart = {p: two_view() for p in [("a", "b"), ("a", "c"), ("d", "e")]}
+    assert len(build_models(tmp_path / "d.db", apart, ONE)[0]) == 2 and len(calls) == 1
+
+
+def test_connected_images_left_out_are_tried_from_other_pairs_and_the_best_counts(
+    monkeypatch, tmp_path
+):
+    calls = runs(monkeypatch, [[model("ab")], [model("abcd")], [model("abc")]])
+    models, attempts = build_models(tmp_path / "d.db", PAIRS, ONE)
+    assert [initial for _, initial in calls] == [None, ("a", "b"), ("c", "d")]  # each image once
+    assert models[0].num_reg_images() == 4
+    assert [a.registered for a in attempts] == [[2], [4], [3]]
+
+
+def test_without_any_model_the_global_mapper_is_the_last_try(monkeypatch, tmp_path):
+    calls = runs(monkeypatch, [[], [], [], [model("abc")]])
+    models, attempts = build_models(tmp_path / "d.db", PAIRS, ONE)
+    assert [mapper for mapper, _ in calls] == ["incremental"] * 3 + ["global"]
+    assert models and attempts[-1].mapper == "global"
+    calls = runs(monkeypatch, [[]])
+    assert build_models(tmp_path / "d.db", {}, ONE)[0] == [] and len(calls) == 1
+
+
+def planar_results(count=5, points=200):
+    """Views of one plane, exact."""
+    rng = np.random.default_rng(0)
+    xyz = np.c_[rng.uniform(-1, 1, (points, 2)), np.zeros(points)]
+    seen = {}
+    for k in range(count):
+        turn = Rotation.from_euler("yx", [(k - 2) * 12, 4 * (k % 2)], degrees=True)
+        local = turn.apply(xyz) + [0, 0, 6]
+        seen[k] = local[:, :2] / local[:, 2:] * 1280 + [511.5, 383.5]
+    return seen
+
+
+def test_a_planar_scene_is_mapped_whole(tmp_path, scene):
+    """A facade: every initial pair is planar."""
+    seen = planar_results()
+    names = scene.names
+    cells = np.tile(np.arange(200, dtype=np.int32)[:, None], (1, 2))
+    results = {}
+    for i in range(5):
+        for j in range(i + 1, 5):
+            results[names[i], names[j]] = PairResult(
+                pair=(names[i], names[j]),
+                cells=cells,
+                keypoints0=seen[i].astype(np.float32),
+                keypoints1=seen[j].astype(np.float32),
+                plane=np.zeros(200, np.int32),
+                homographies=np.eye(3)[None],
+                num_tentative=200,
+                num_dropped=0,
+                status=Status.VERIFIED,
+            )
+    write_database(tmp_path / "d.db", scene.images, results, scene.known)
+    two_views = verified(tmp_path / "d.db", ONE)
+    assert all(view.planar for view in two_views.values())
+    models, _ = build_models(tmp_path / "d.db", two_views, ONE)
+    assert models[0].num_reg_images() == 5
+    assert models[0].compute_mean_reprojection_error() < 0.01
+
+
+def test_two_view_rotations_spreads_and_angles_are_the_scenes(tmp_path, scene):
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    images = list(scene.truth.images.values())
+    centre = {i.name: i.projection_center() for i in images}
+    rotation = {i.name: i.cam_from_world().rotation.matrix() for i in images}
+    points = np.asarray([p.xyz for p in scene.truth.points3D.values()])
+    for (a, b), view in verified(tmp_path / "d.db", ONE).items():
+        assert a < b and 0 < view.geometry.spread <= 1 and not view.planar
+        assert rotation_angle_deg(view.geometry.rotation, rotation[b] @ rotation[a].T) < 0.1
+        rays = [centre[name] - points for name in (a, b)]
+        sine = np.linalg.norm(np.cross(*rays), axis=1)
+        sine /= np.prod([np.linalg.norm(r, axis=1) for r in rays], axis=0)
+        assert view.tri_angle_deg == pytest.approx(np.degrees(np.median(np.arcsin(sine))), abs=1)
+
+
+def test_dropped_pairs_are_gone_for_the_mapper_but_their_matches_stay(tmp_path, scene):
+    import pycolmap
+
+    path = tmp_path / "d.db"
+    write_database(path, scene.images, scene.results, scene.known)
+    all_pairs = sorted(verified(path, ONE))
+    lonely = scene.names[0]
+    dropped = [pair for pair in all_pairs if lonely in pair]
+    drop_pairs(path, dropped)
+    left = read_two_views(path)
+    assert sorted(left) == [pair for pair in all_pairs if pair not in dropped]
+    with pycolmap.Database.open(path) as db:
+        assert len(db.read_all_matches()[0]) == len(all_pairs)
+    models, _ = build_models(path, left, ONE)
+    assert lonely not in {models[0].image(i).name for i in models[0].reg_image_ids()}
+
+
+@pytest.mark.parametrize("initial", [None, 0])
+def test_a_given_initial_pair_gives_the_same_scene(tmp_path, scene, initial):
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    if initial is None:
+        assert map_database(tmp_path / "d.db", ONE)[0].num_reg_images() == 5
+        return
+    pair = initial_pairs(verified(tmp_path / "d.db", ONE))[initial]
+    assert mapper._run(tmp_path / "d.db", ONE, pair, lambda: None)[0].num_reg_images() == 5
+
+
+def test_a_given_pair_gives_one_model_not_one_per_try(tmp_path, scene):
+    """COLMAP starts every further model from the given pair too, up to 50 times."""
+    small = [dataclasses.replace(i, name=f"s{k}.png") for k, i in enumerate(scene.images[:3])]
+    other = {
+        (f"s{i}.png", f"s{j}.png"): dataclasses.replace(
+            scene.results[scene.names[i], scene.names[j]], pair=(f"s{i}.png", f"s{j}.png")
+        )
+        for i, j in ((0, 1), (0, 2), (1, 2))
+    }
+    path = tmp_path / "d.db"
+    write_database(path, small + scene.images, scene.results | other, scene.known)
+    two_views = verified(path, ONE)
+    pair = next(p for p in initial_pairs(two_views) if p[0] in scene.names)
+    assert [m.num_reg_images() for m in mapper._run(path, ONE, pair, lambda: None)] == [5]
+    assert [m.num_reg_images() for m in build_models(path, two_views, ONE)[0]] == [5, 3]
+
+
+def test_models_of_other_images_stay_beside_a_better_attempt(monkeypatch, tmp_path):
+    runs(monkeypatch, [[model("ab"), model("xy")], [model("abcdef")]])
+    models, _ = build_models(tmp_path / "d.db", PAIRS, ONE)
+    assert [m.names for m in models] == [list("abcdef"), list("xy")]
+
+
+def test_one_missing_image_of_many_is_no_reason_to_try_again(monkeypatch, tmp_path):
+    names = [f"{k:02d}" for k in range(30)]
+    chain = {pair: two_view() for pair in zip(names, names[1:], strict=False)}
+    calls = runs(monkeypatch, [[Model(names=names[:-1], points=9)]])
+    assert len(build_models(tmp_path / "d.db", chain, ONE)[1]) == 1 == len(calls)

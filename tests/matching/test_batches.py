@@ -1,0 +1,278 @@
+"""Batches, devices and memory decide when something is computed, never what."""
+
+import dataclasses
+import itertools
+import json
+import os
+import subprocess
+import sys
+
+import cv2
+import jax
+import numpy as np
+import pytest
+from described import compute_features
+from hypothesis import given
+from hypothesis import strategies as st
+
+import jaxsfm
+from jaxsfm.config import preset
+from jaxsfm.core.features import stored
+from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.sharded import device_mesh
+from jaxsfm.errors import UserError
+from jaxsfm.io.features import room_of
+from jaxsfm.io.images import ImageError, read_image
+from jaxsfm.matching import execution
+from jaxsfm.matching.device_cache import Resident, by_tiles
+from jaxsfm.matching.execution import Execution
+from jaxsfm.matching.extraction import extracted, image_features
+from jaxsfm.matching.pair_matching import match_features
+
+FIELDS = ("cells", "keypoints0", "keypoints1", "plane", "homographies", "num_tentative")
+MESH = device_mesh(jax.local_devices()[:1])
+
+
+@pytest.fixture(scope="module")
+def folder(photos, tmp_path_factory):
+    """Five photos of two sizes; neighbours overlap."""
+    path = tmp_path_factory.mktemp("photos")
+    for k in range(5):
+        size = (240, 180) if k != 3 else (200, 230)
+        crop = photos[2][20 * k : 20 * k + 400, 30 * k : 30 * k + 460]
+        cv2.imwrite(str(path / f"{k}.png"), cv2.resize(crop, size, interpolation=cv2.INTER_AREA))
+    return path
+
+
+@pytest.fixture(scope="module")
+def images(folder):
+    return jaxsfm.open_images(folder)[0]
+
+
+@pytest.fixture(scope="module")
+def features(weights, images):
+    return jaxsfm.extract(weights, images, config=preset("default"))
+
+
+@pytest.fixture(scope="module")
+def matches(features):
+    pairs = jaxsfm.exhaustive_pairs(features)
+    return jaxsfm.match(features, pairs, config=preset("default"))
+
+
+def assert_same_matches(ours, expected):
+    assert ours.keys() == expected.keys()
+    for pair, want in expected.items():
+        for field in FIELDS:
+            np.testing.assert_array_equal(getattr(ours[pair], field), getattr(want, field))
+
+
+def test_memory_for_two_images_gives_the_same_matches(features, matches):
+    tight = Execution(memory_gb=1e-6)
+    pairs = list(matches)[::-1]
+    ours = jaxsfm.match(features, pairs, config=preset("default"), execution=tight)
+    assert_same_matches(ours, matches)
+    (a, b), want = max(matches.items(), key=lambda item: item[1].num_inliers)
+    assert want.num_inliers > 100
+    alone = match_features(features[a], features[b], config=preset("default"))
+    assert_same_matches({(a, b): alone}, {(a, b): want})
+
+
+def test_pairs_side_by_side_give_the_same_matches_up_to_rounding(features, matches):
+    together = Execution(pairs_at_once=3)
+    ours = jaxsfm.match(features, list(matches), config=preset("default"), execution=together)
+    for pair, want in matches.items():
+        cells = {tuple(c) for c in want.cells.tolist()}
+        same = cells & {tuple(c) for c in ours[pair].cells.tolist()}
+        assert len(same) >= 0.99 * max(len(cells), len(ours[pair].cells))
+
+
+def test_images_side_by_side_give_the_same_features_up_to_rounding(weights, images, features):
+    together = Execution(images_at_once=3)
+    ours = jaxsfm.extract(weights, images, config=preset("default"), execution=together)
+    for name, want in features.items():
+        for one, other in zip(ours[name].dense.coarse, want.dense.coarse, strict=True):
+            np.testing.assert_allclose(one, other, atol=2e-3)  # two steps of float16 at 1
+        same = (ours[name].dense.keypoints == want.dense.keypoints).all(1).mean()
+        assert same > 0.99
+
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+import jax, numpy as np, jaxsfm
+from jaxsfm.matching.execution import Execution
+assert len(jax.devices()) == 3
+images, _ = jaxsfm.open_images(Path(sys.argv[1]))
+weights, config = jaxsfm.load_weights(), jaxsfm.preset("default")
+everything = []
+for execution in (Execution(devices=1), Execution(), Execution(devices=2, memory_gb=1e-6)):
+    features = jaxsfm.extract(weights, images, config=config, execution=execution)
+    pairs = jaxsfm.exhaustive_pairs(features)
+    matches = jaxsfm.match(features, pairs, config=config, execution=execution)
+    arrays = [jax.tree.leaves(features[n].dense) for n in sorted(features)]
+    arrays += [[m.cells, m.keypoints1, m.plane, m.homographies] for _, m in sorted(matches.items())]
+    everything.append([np.asarray(a).tobytes() for each in arrays for a in each])
+print(json.dumps([len(everything[0]), [all(a == b for a, b in zip(everything[0], other,
+    strict=True)) for other in everything[1:]]]))
+"""
+
+
+def test_any_number_of_devices_gives_what_one_gives_bit_for_bit(folder):
+    """Three devices for five images and ten pairs: the last batches are not full."""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(folder)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    count, same = json.loads(done.stdout.splitlines()[-1])
+    assert count > 50 and same == [True, True]
+
+
+def test_features_are_the_programs_rounded_once(weights, images):
+    image, config = images[0], preset("default")
+    found = image_features(weights, image, config=config)
+    expected = compute_features(weights, read_image(image, max_size=config.max_size), config=config)
+    for one, other in zip(
+        jax.tree.leaves(found.dense), jax.tree.leaves(stored(jax.device_put(expected))), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    assert found.dense.coarse[0].dtype == np.float16
+    assert found.room == room_of(image.size)
+
+
+def test_a_photo_that_went_away_is_told_and_the_others_are_there(weights, images, tmp_path):
+    gone = dataclasses.replace(images[1], path=tmp_path / "gone.png")
+    some = [images[0], gone, *images[2:]]
+    for at_once in (1, 4):
+        found = dict(
+            extracted(
+                weights,
+                some,
+                config=preset("paper"),
+                execution=Execution(images_at_once=at_once),
+            )
+        )
+        assert set(found) == set(some)
+        assert [i for i, f in found.items() if isinstance(f, ImageError)] == [gone]
+    with pytest.raises(ImageError, match="1.png"):
+        jaxsfm.extract(weights, some, config=preset("paper"))
+
+
+@given(st.integers(2, 14), st.integers(1, 6), st.randoms())
+def test_tiles_keep_every_pair_once_and_images_at_hand(count, side, random):
+    pairs = list(itertools.combinations(range(count), 2))
+    random.shuffle(pairs)
+    ordered = by_tiles(pairs, side)
+    assert sorted(ordered) == sorted(pairs)
+
+    loads = []
+    most = 2 * side
+    resident = Resident(lambda name: loads.append(name) or name, ordered, most)
+    for a, b in ordered:
+        assert (resident.take(a), resident.take(b)) == (a, b)
+        assert len(resident) <= most
+    assert len(resident) == 0
+    blocks = -(-count // side)
+    # A tile needs both its blocks; the first of them is still there from the tile before.
+    assert len(loads) <= side * (blocks * (blocks + 1) // 2 + blocks)
+    if count <= most:
+        assert len(loads) == count
+
+
+def test_along_a_street_every_image_is_loaded_once_whatever_the_names():
+    names = np.random.default_rng(0).permutation(400).tolist()
+    near = [(names[k], names[k + d]) for k in range(400) for d in range(1, 8) if k + d < 400]
+    ordered = by_tiles(sorted(tuple(sorted(pair)) for pair in near), 8)
+    loads = []
+    resident = Resident(lambda name: loads.append(name) or name, ordered, 16)
+    for a, b in ordered:
+        resident.take(a)
+        resident.take(b)
+    assert len(loads) <= 1.1 * 400
+
+
+def test_a_hosts_memory_does_not_grow_with_the_number_of_small_images():
+    config = preset("default")
+    assert execution.resident_images(Execution(), MESH, 512, config=config) <= 32
+    large = execution.resident_images(Execution(), MESH, 8192, config=config)
+    assert 2 <= large <= 16
+
+
+def test_memory_is_what_the_formula_says(features):
+    config = preset("default")
+    (one, *_) = features.values()
+    joined = jax.jit(join_octaves)(one.dense)
+    size = sum(x.nbytes for x in jax.tree.leaves(joined))
+    assert execution.joined_bytes(one.room.num_coarse, octaves=4) == size
+    for budget, most in ((10.5 * size, 10), (size, 2)):
+        chosen = Execution(memory_gb=budget / 1e9)
+        found = execution.resident_images(chosen, MESH, one.room.num_coarse, config=config)
+        assert found == most
+
+
+def test_a_cpu_takes_one_at_a_time_unless_told():
+    config = preset("default")
+    assert execution.images_at_once(Execution(), MESH, 10**6, 99) == 1
+    assert execution.pairs_at_once(Execution(), MESH, 6144, 99, config=config) == 1
+    told = Execution(images_at_once=6, pairs_at_once=7)
+    assert execution.images_at_once(told, MESH, 10**6, 99) == 6
+    assert execution.pairs_at_once(told, MESH, 6144, 99, config=config) == 7
+    for count, most in ((1, 1), (2, 2), (3, 4), (5, 7)):  # no more than there are, few programs
+        assert execution.pairs_at_once(told, MESH, 6144, count, config=config) == most
+
+
+@pytest.mark.parametrize("memory", [8e9, 24e9, 140e9])
+def test_an_accelerator_takes_what_fits(monkeypatch, memory):
+    config = preset("default")
+    monkeypatch.setattr(execution, "_device_memory", lambda _: int(memory))
+    pixels, cells = 1600 * 1200, 8192
+    images = execution.images_at_once(Execution(), MESH, pixels, 999)
+    pairs = execution.pairs_at_once(Execution(), MESH, cells, 999, config=config)
+    kept = execution.resident_images(Execution(), MESH, cells, config=config)
+    joined = execution.joined_bytes(cells, octaves=4)
+    assert images == 1 or images * execution.ACCELERATOR_BYTES_PER_PIXEL * pixels <= memory / 2
+    batch = pairs * (2 * joined + execution.PAIR_BYTES_PER_CELL * cells)
+    assert kept * joined + batch <= memory
+    # And not much less than fits, up to what is asked for at most.
+    assert images in (1, execution.MAX_IMAGES, int(memory / 2 / (3000 * pixels)))
+    assert pairs == execution.MAX_PAIRS or batch > memory / 8
+
+
+def test_the_next_batch_is_loaded_while_one_runs():
+    log = []
+
+    def batches():
+        for k in range(3):
+            log.append(f"load {k}")
+            yield k
+
+    def start(k):
+        log.append(f"start {k}")
+        return k
+
+    def finish(k):
+        log.append(f"finish {k}")
+        yield k
+
+    assert list(execution.one_ahead(batches(), start, finish)) == [0, 1, 2]
+    expected = "load 0, start 0, load 1, start 1, finish 0, load 2, start 2, finish 1, finish 2"
+    assert ", ".join(log) == expected
+
+
+def test_executions_refuse_what_makes_no_sense():
+    for wrong in (
+        {"devices": 0},
+        {"images_at_once": 0},
+        {"pairs_at_once": -1},
+        {"memory_gb": 0.0},
+        {"memory_gb": float("inf")},
+        {"memory_gb": float("nan")},
+    ):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            Execution(**wrong)
+    with pytest.raises(UserError, match="--devices 99: there are"):
+        execution.chosen_devices(Execution(devices=99))

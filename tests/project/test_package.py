@@ -1,0 +1,74 @@
+"""What is released: wheel and sdist hold the package whole, and it works away from the sources."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DATA = (
+    "jaxsfm/py.typed",
+    "jaxsfm/relocalizer.safetensors",
+    *(f"jaxsfm/report/page/page.{kind}" for kind in ("html", "css", "js")),
+)
+
+
+def run(*command: object, cwd: Path, **environment: str) -> str:
+    done = subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": "", **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """sdist, and the wheel made of it: what is not in the sdist is not in the wheel."""
+    pytest.importorskip("build")
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("dist")
+    for name in run("git", "ls-files", cwd=ROOT).splitlines():
+        if (ROOT / name).is_file() and not name.startswith("docs/"):
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", out, source, cwd=source)
+    return out
+
+
+def test_wheel_and_sdist_hold_all_modules_and_data(built):
+    (wheel,), (sdist,) = built.glob("*.whl"), built.glob("*.tar.gz")
+    in_wheel = set(zipfile.ZipFile(wheel).namelist())
+    with tarfile.open(sdist) as archive:
+        in_sdist = {name.partition("/")[2] for name in archive.getnames()}
+    packages = (ROOT / "jaxsfm", ROOT / "weights_conversion")
+    sources = {str(path.relative_to(ROOT)) for each in packages for path in each.rglob("*.py")}
+    for names in (in_wheel, in_sdist):
+        assert sources | set(DATA) <= names
+    assert not [name for name in in_wheel if name.startswith(("tests", "benchmarks", "docs"))]
+    assert wheel.stat().st_size < 1_000_000
+
+
+def test_a_wheel_works_in_an_environment_of_its_own(built, tmp_path):
+    """Its dependencies are those of this environment, by a path; the package is the wheel's."""
+    place = tmp_path / "env"
+    venv.create(place, with_pip=False)
+    python = place / "bin" / "python"
+    site = next((place / "lib").glob("python*/site-packages"))
+    (wheel,) = built.glob("*.whl")
+    zipfile.ZipFile(wheel).extractall(site)
+    others = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
+    (site / "others.pth").write_text("\n".join(dict.fromkeys(others)))
+    where = run(python, "-c", "import jaxsfm; print(jaxsfm.__file__)", cwd=tmp_path)
+    assert Path(where.strip()).is_relative_to(site.resolve()) or str(site) in where
+    assert run(python, "-m", "jaxsfm", "--version", cwd=tmp_path).startswith("jaxsfm ")
+    assert "checked" in run(python, "-m", "jaxsfm", "weights", cwd=tmp_path)

@@ -1,0 +1,378 @@
+"""The report as a page: complete, harmless, small, and never in a run's way."""
+
+import dataclasses
+import html
+import json
+import logging
+import re
+import shutil
+
+import numpy as np
+import pytest
+from kept_runs import HOSTILE, change_report, renamed
+
+from jaxsfm.cli.main import main
+from jaxsfm.colmap.poses import read_poses
+from jaxsfm.core.grid import FINE_STRIDE
+from jaxsfm.report.finished_run import read_run
+from jaxsfm.report.page import write
+from jaxsfm.report.page.close_ups import close_ups
+from jaxsfm.report.page.figures import figures3
+from jaxsfm.report.page.matrices import _reduced, pair_matrices
+from jaxsfm.report.page.pair_states import NOT_TRUSTED, STATES, USED, state
+from jaxsfm.report.page.view_graph import BEST_OF_EACH, chosen_edges
+from jaxsfm.report.page.write import page
+from jaxsfm.report.scene import shown_scene
+from jaxsfm.sfm.evaluation import Similarity
+
+SECTIONS = ("the-model", "photos", "pairs", "matches", "keypoints", "run", "next")
+FIGURES = ("model", "reprojection", "tracks", "view-graph", "inliers", "states")
+LOADS = re.compile(
+    r"<[^>]*\s(?:src|href|srcset|poster|data)\s*=\s*(?![\"']?(?:data:|#))[^\s>]", re.I
+)
+SCRIPT = re.compile(r"<script[^>]*>.*?</script>", re.S)
+
+
+def without_scripts(text: str) -> str:
+    return SCRIPT.sub("", text)
+
+
+@pytest.fixture(scope="module")
+def text(plain) -> str:
+    return (plain[0] / "report.html").read_text()
+
+
+def row(a: str, b: str, inliers=100, verified=80, strength=0.5, trusted=True) -> dict:
+    verdict = {"trusted": trusted, "strength": strength, "rotation_error_deg": 1.0}
+    return {
+        "pair": [a, b],
+        "status": "verified",
+        "tentative": 2 * inliers,
+        "inliers": inliers,
+        "planes": 3,
+        "handed_on": inliers > 0,
+        "colmap_inliers": verified,
+        "view_graph": {**verdict, "reason": "" if trusted else "it is off"} if verified else None,
+    }
+
+
+# -- what is in it ------------------------------------------------------------------------------
+
+
+def test_every_run_leaves_a_page_with_all_parts(text, plain):
+    for section in SECTIONS:
+        assert f'<section id="{section}">' in text, section
+    for figure in FIGURES:
+        assert f'data-for="{figure}"' in text, figure
+    assert "All 3 photos are in one model." in text
+    assert f"{plain[1]['models'][0]['reprojection_error_px']:.2f} px" in text
+    for name in ("view0.png", "view1_night.png", "view2.png", "pycolmap", "max_planes"):
+        assert name in text, name
+
+
+def test_every_figure_and_picture_is_described(text):
+    body = without_scripts(text)
+    assert body.count("<figure") == body.count("<figcaption") >= 6
+    for tag in re.findall(r"<img[^>]*>", body):
+        assert re.search(r'alt="[^"]+', tag)
+    for tag in re.findall(r"<(?:svg|div)[^>]*role=\"img\"[^>]*>", body):
+        assert re.search(r'aria-label="[^"]+', tag)
+
+
+def test_the_page_loads_nothing_from_outside(text):
+    body = without_scripts(text)
+    assert LOADS.search(body) is None and "@import" not in body and "url(" not in body
+    assert not re.search(r"<script[^>]*\ssrc", text) and "<iframe" not in body
+    assert LOADS.search('<img alt="" src="http://x/y.png">') and LOADS.search("<link href=a.css>")
+
+
+def test_the_command_adds_the_errors_against_a_reference(plain, scene, tmp_path, capsys):
+    out = tmp_path / "with.html"
+    args = ["--reference", str(scene / "reference"), "--out", str(out)]
+    assert main(["report", str(plain[0]), *args]) == 0
+    assert capsys.readouterr().out.strip() == str(out)
+    text = out.read_text()
+    assert 'id="errors"' in text and 'data-for="positions"' in text
+    assert "Against the reference the cameras are off by" in text
+    assert 'id="errors"' not in (plain[0] / "report.html").read_text()
+
+
+def test_shown_cameras_differ_from_the_reference_by_the_evaluated_errors(plain, scene):
+    run = read_run(plain[0], reference=scene / "reference")
+    shown = shown_scene(run)
+    truth = {camera.name: camera for camera in shown.reference}
+    errors = run.report["evaluation"]["images"]
+    assert len(shown.cameras) == len(truth) == 3
+    for camera in shown.cameras:
+        other = truth[camera.name]
+        off = np.linalg.norm(camera.pose.centre - other.pose.centre)
+        assert off == pytest.approx(errors[camera.name]["position"], abs=1e-9)
+        # Both look at the same things: frusta point the same way.
+        ahead = [c.corners.mean(0) / np.linalg.norm(c.corners.mean(0)) for c in (camera, other)]
+        assert ahead[0] @ ahead[1] > 0.99 and camera.corners.mean(0) @ camera.pose.rotation[2] > 0
+    # The room's cameras are upright (y down), so its floor is below them and z is up.
+    reference = read_poses(scene / "reference")
+    low = min(c.pose.centre[2] for c in shown.reference)
+    heights = {c.name: c.pose.centre[2] - low for c in shown.reference}
+    order = sorted(heights, key=heights.__getitem__)
+    assert order == sorted(reference, key=lambda name: -reference[name].centre[1])
+
+
+def test_keypoints_walk_inside_their_cells_and_patches_hold_them(plain):
+    tracks = close_ups(read_run(plain[0]))
+    assert len(tracks) == 5
+    for track in tracks:
+        assert 2 <= len(track.patches) <= track.length and track.error < 2
+        walked = [(p.cell, p.walked) for p in track.patches if p.cell and p.walked]
+        assert len(walked) >= 2
+        for cell, at in walked:
+            inside = np.asarray(at) - cell
+            assert (inside > 0).all() and (inside < FINE_STRIDE).all()
+
+
+# -- names, limits, gaps ------------------------------------------------------------------------
+
+
+def test_names_from_files_are_only_ever_text(plain, scene, tmp_path):
+    out, _ = renamed(plain[0], scene / "images", tmp_path, "view0.png", HOSTILE)
+    assert main(["report", str(out)]) == 0
+    text = (out / "report.html").read_text()
+    assert HOSTILE not in text and "<img src=x" not in text
+    assert text.count(html.escape(HOSTILE, quote=True).replace("&#x27;", "&#39;")) > 5
+    for source in re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', text, re.S):
+        assert "<" not in source
+        json.loads(source)
+
+
+def many(n: int, lost: int) -> list[dict]:
+    names = [f"s/{k:04d}.jpg" for k in range(n - lost)]
+    near = lambda a, b: 3000 // (b - a) if b - a < 40 else 30  # noqa: E731
+    return [
+        row(names[a], names[b], near(a, b), near(a, b) // 2, 1 / (b - a), trusted=b - a < 40)
+        for a in range(len(names))
+        for b in range(a + 1, len(names))
+    ]
+
+
+def test_a_large_run_has_a_small_page_that_says_what_is_left_out(plain):
+    n, lost = 400, 70
+    rows = many(n, lost)
+    run = read_run(plain[0])
+    missing = [
+        {"image": f"s/{k:04d}.jpg", "stage": "pairs", "detail": f"gone {k}"}
+        for k in range(n - lost, n)
+    ]
+    report = {
+        **run.report,
+        "pairs": {**run.report["pairs"], "each": rows},
+        "models": [{**run.report["models"][0], "images": [f"s/{k:04d}.jpg" for k in range(330)]}],
+        "lost": missing,
+    }
+    text = page(dataclasses.replace(run, report=report))
+    small = len((plain[0] / "report.html").read_text())
+    assert len(text) < small + 1_000_000
+    body = without_scripts(text)
+    assert all(f"gone {k}" in body for k in range(n - lost, n))  # every lost image and why
+    assert "10 more lost photos" in body and "The 330 photos with the smallest errors" in body
+    assert "Each square stands for 2 x 2 photos" in body
+    used, odd = (sum(state(r) == s for r in rows) for s in (USED, NOT_TRUSTED))
+    assert f"{used + odd - 1500} weaker pairs are left out" in body
+    assert f"{odd - 15} more are in report.json" in body
+
+
+def test_points_beyond_the_limit_are_drawn_in_part_and_the_page_says_so(plain, monkeypatch):
+    from jaxsfm.report.page import model_figure
+
+    scene = shown_scene(read_run(plain[0]))
+    n = len(scene.points)
+    whole = model_figure.model_figure(scene, "units")
+    monkeypatch.setattr(model_figure, "MAX_POINTS", n // 2)
+    part = model_figure.model_figure(scene, "units")
+    assert f"{n // 2} of {n} points are drawn" in part.caption
+    assert "points are drawn" not in whole.caption
+    assert len(json.loads(part.spec)["data"][0]["marker"]["color"]) == n // 2
+
+
+@pytest.mark.parametrize("what", ["photos", "matches", "changed"])
+def test_a_page_without_photos_or_matches_has_all_the_rest(plain, scene, tmp_path, what):
+    out, images = tmp_path / "run", tmp_path / "images"
+    shutil.copytree(plain[0], out)
+    shutil.copytree(scene / "images", images)
+    if what == "matches":
+        shutil.rmtree(out / "matches")
+    for path in images.iterdir():
+        if what == "photos":
+            path.unlink()
+        elif what == "changed":  # another photo under the same name would be a lie
+            path.write_bytes(path.read_bytes() + b"\0")
+    assert main(["report", str(out), "--images", str(images)]) == 0
+    body = without_scripts((out / "report.html").read_text())
+    assert 'id="matches"' not in body and 'id="keypoints"' not in body
+    assert ("<img" in body) == (what == "matches")
+    assert "All 3 photos are in one model." in body and 'id="view-graph"' in body
+
+
+def test_a_run_without_a_model_says_why_each_photo_was_lost(plain, tmp_path):
+    def lose(report):
+        names = report["models"][0]["images"]
+        report.update(models=[], refinement=[], mapping=[])
+        report["lost"] = [
+            {"image": name, "stage": "no plane", "detail": f"<{k}> matches"}
+            for k, name in enumerate(names)
+        ]
+        del report["versions"], report["finished"], report["images"]["folder"]  # an older run
+        del report["no_model"], report["view_graph"]
+
+    out = tmp_path / "run"
+    shutil.copytree(plain[0], out)
+    change_report(out, lose)
+    assert main(["report", str(out)]) == 0
+    body = without_scripts((out / "report.html").read_text())
+    assert "No model could be built." in body and 'id="the-model"' not in body
+    for k in range(3):
+        assert f"<b>Lost: no plane.</b> &lt;{k}&gt; matches" in body
+
+
+def test_a_run_in_parts_says_what_parts_them_and_what_may_help(plain, tmp_path):
+    def part(report):
+        a, b, c = report["models"][0]["images"]
+        near = {"pair": [b, HOSTILE], "missed": "7 matches, 26 are needed"}
+        groups = [
+            {"images": [a, b], "pairs": 1, "registered": 2, "nearest": near},
+            {"images": [c, HOSTILE], "pairs": 1, "registered": 0, "nearest": near},
+        ]
+        report["view_graph"]["components"] = groups
+        why = {"stage": "not connected", "detail": "few"}
+        found = [
+            {"option": "--some <option>", "reason": "small"},
+            {"option": None, "reason": "far"},
+        ]
+        report["lost"] = [{"image": HOSTILE, **why, "help": found}]
+
+    out = tmp_path / "run"
+    shutil.copytree(plain[0], out)
+    change_report(out, part)
+    assert main(["report", str(out)]) == 0
+    body = without_scripts((out / "report.html").read_text())
+    assert "Groups of photos that trusted pairs join" in body
+    assert "7 matches, 26 are needed" in body and HOSTILE not in body
+    assert "What may help: --some &lt;option&gt; (small); far." in body
+    change_report(out, lambda report: report.update(models=[], no_model="nothing <fits>"))
+    assert main(["report", str(out)]) == 0
+    assert "<p>Nothing &lt;fits&gt;.</p>" in (out / "report.html").read_text()
+
+
+# -- never in a run's way -----------------------------------------------------------------------
+
+
+def test_a_page_that_fails_costs_one_line_and_nothing_else(
+    scene, tmp_path, monkeypatch, capsys, plain
+):
+    def broken(*args, **kwargs):
+        raise MemoryError("no room")
+
+    out = tmp_path / "run"
+    shutil.copytree(plain[0], out)  # matched already: only mapped again
+    monkeypatch.setattr(write, "write_page", broken)
+    args = ["--intrinsics", str(scene / "K.txt"), "--threads", "1", "--refine", "0"]
+    assert main(["reconstruct", str(scene / "images"), "--out", str(out), *args]) == 0
+    lines = [x for x in capsys.readouterr().err.splitlines() if "report.html" in x]
+    assert len(lines) == 1 and "was not written (no room)" in lines[0]
+    assert json.loads((out / "report.json").read_text())["models"]
+    assert not (out / "report.html").exists()  # the old page told of the old model
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["{tmp}"], "no finished run here"),
+        (["{run}", "--images", "{tmp}/none"], "--images .*: no such folder"),
+        (["{run}", "--reference", "{tmp}/none"], "--reference .*: no such folder"),
+        (["{run}", "--out", "{tmp}/page.pdf"], "--out .*: the name must end in .html"),
+        (["{damaged}"], "no finished run here"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_sentence(plain, tmp_path, capsys, args, says):
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    (damaged / "report.json").write_text('{"pairs": ')
+    places = {"tmp": tmp_path, "run": plain[0], "damaged": damaged}
+    assert main(["report", *(arg.format(**places) for arg in args)]) == 2
+    assert re.search(says, capsys.readouterr().err)
+
+
+def test_reference_poses_that_are_gone_are_a_warning(plain, tmp_path, caplog):
+    out = tmp_path / "run"
+    shutil.copytree(plain[0], out)
+    change_report(out, lambda report: report["options"].update(reference=str(tmp_path / "gone")))
+    with caplog.at_level(logging.WARNING):
+        assert read_run(out).reference is None
+    assert "reference poses of the run are not shown" in caplog.text
+
+
+# -- parts --------------------------------------------------------------------------------------
+
+
+def test_states_follow_a_pair_through_the_pipeline():
+    rows = [
+        row("a", "b"),
+        row("a", "b", trusted=False),
+        row("a", "b", verified=0),
+        {**row("a", "b"), "handed_on": False},
+        row("a", "b", inliers=0, verified=0),
+    ]
+    names = [STATES[state(r)].name for r in rows]
+    assert names == ["used", "not trusted", "not verified", "not chosen", "no plane"]
+    assert STATES[state({**row("a", "b"), "view_graph": None})].name == "used"
+
+
+def test_matrices_are_symmetrical_and_reduced_to_the_best():
+    rows = [row("a", "b", 9, 0), row("a", "c", 9, 5), row("b", "e", 7, 3, trusted=False)]
+    inliers, states = pair_matrices(list("abcde"), rows)
+    assert (inliers == inliers.T).all() and (states == states.T).all()
+    assert inliers[0, 1] == 9 and inliers[0, 2] == 5 and states[1, 4] == NOT_TRUSTED
+    small = _reduced(inliers, 2)
+    assert small.tolist() == [[9, 5, 3], [5, 0, 0], [3, 0, 0]]
+
+
+def test_a_cut_graph_keeps_the_best_of_every_photo():
+    rng = np.random.default_rng(0)
+    names = [f"{k:02d}" for k in range(30)]
+    rows = [
+        row(a, b, strength=float(rng.random()) * (0.01 if "29" in (a, b) else 1.0))
+        for i, a in enumerate(names)
+        for b in names[i + 1 :]
+    ]
+    edges = chosen_edges(rows, 100, 80)
+    assert len(edges) == 100
+    for name in names:
+        assert sum(name in r["pair"] for r in edges) >= BEST_OF_EACH
+    assert chosen_edges(rows[:50], 100, 80) == sorted(
+        rows[:50], key=lambda r: -r["view_graph"]["strength"]
+    )
+
+
+def test_far_points_are_left_out_and_counted(plain):
+    run = read_run(plain[0])
+    assert run.model is not None
+    points = run.model.tracks.points.copy()
+    few = len(points) // 200
+    points[:few] += 1e4
+    tracks = run.model.tracks._replace(points=points)
+    shown = shown_scene(dataclasses.replace(run, model=run.model._replace(tracks=tracks)))
+    near = shown_scene(run)
+    assert shown.far == near.far + few
+    assert len(shown.points) + shown.far == len(points) and np.abs(shown.points).max() < 1e3
+
+
+def test_a_scene_far_from_its_origin_is_shown_around_zero(plain, scene):
+    run = read_run(plain[0], reference=scene / "reference")
+    assert run.reference is not None
+    moved = Similarity(1.0, np.eye(3), np.asarray([4.5e5, 5.2e6, 300.0]))
+    far = dataclasses.replace(run, reference=run.reference._replace(similarity=moved))
+    assert np.abs(shown_scene(far).points).max() < 1e3
+
+
+def test_small_and_large_errors_are_written_out():
+    values = (5.2345e-05, 0.02312, 0.0, 1.0, 12345.6)
+    assert [figures3(v) for v in values] == ["0.0000523", "0.0231", "0", "1", "12300"]

@@ -1,0 +1,95 @@
+"""A run's last lines."""
+
+import pytest
+
+from jaxsfm.io.images import ImageError, inspect_image
+from jaxsfm.report.summary import summary_lines
+
+MODEL = {"registered": 2, "points": 321, "track_length": 2.5, "reprojection_error_px": 0.71}
+
+
+def report(**changes) -> dict:
+    return {
+        "images": {"found": 4, "usable": 3, "skipped": {}},
+        "pairs": {"tried": 3, "verified": 2, "handed_on": 1, "trusted": 1, "overflowed": 0},
+        "models": [MODEL],
+        "mapping": [{"mapper": "incremental", "initial_pair": None, "registered": [2]}],
+        "refinement": [],
+        "seconds": {"extraction": 1.25, "mapping": 2.0},
+        "view_graph": {"components": [{"images": ["a", "b", "c"]}]},
+        "lost": [],
+        "no_model": None,
+        **changes,
+    }
+
+
+def test_a_summary_has_the_counts_of_every_stage():
+    text = "\n".join(summary_lines(report()))
+    for part in ("3 usable of 4", "3 tried, 2 verified, 1 handed", "2 of 3 images", "321", "0.71"):
+        assert part in text
+    assert "warning" not in text and "smaller" not in text and "reference" not in text
+    assert "and 1 smaller model" in "\n".join(summary_lines(report(models=[MODEL, MODEL])))
+    assert "none of 3 images" in "\n".join(summary_lines(report(models=[])))
+
+
+def test_second_tries_and_refinement_are_said():
+    figures = {"accepted": True, "kept": 5, "dropped": 3, "added": 4, "weak_views": ["night"]}
+    attempts = [{"registered": []}, {"registered": [2, 1]}]
+    night = {"name": "night", "registered": True, "agreed": 7, "octave_px": None, "error_px": None}
+    dusk = night | {"name": "dusk", "agreed": 321, "octave_px": 4, "error_px": 1.26}
+    late = dusk | {"name": "late", "registered": False}
+    never = night | {"name": "never", "registered": False}
+    done = {
+        "passes": [figures, figures],
+        "placed": [night, dusk, dusk | {"octave_px": 1}, late, never],
+    }
+    text = "\n".join(summary_lines(report(mapping=attempts, refinement=[done])))
+    assert "started 2 times, images registered: 0, 2" in text
+    assert "5 observations agreed, 3 dropped, 4 added in the last of 2 passes" in text
+    assert "not refined      night" in text and "taken back" not in text
+    assert "placed           dusk: 321 points agree at 1/4 size, 1.3 px" in text
+    assert "placed           dusk: 321 points agree at full size" in text
+    assert "late: 321 points agree at 1/4 size, 1.3 px; the mapper had left it out" in text
+    assert "never" not in text and text.count("left it out") == 1
+    back = {"passes": [figures | {"accepted": False}], "placed": []}
+    text = "\n".join(summary_lines(report(refinement=[back])))
+    assert "too few, taken back" in text
+
+
+def test_a_failed_evaluation_is_said():
+    lines = summary_lines(report(evaluation_failed="no common images"))
+    assert lines[-1] == "not evaluated    no common images"
+
+
+def test_overflow_and_evaluation_are_said():
+    pairs = {"tried": 3, "verified": 2, "handed_on": 1, "trusted": 1, "overflowed": 2}
+    errors = {"mean": 0.01, "median": 0.02, "max": 0.03}
+    evaluation = {
+        "registered": 2,
+        "reference_images": 3,
+        "aligned_on": 2,
+        "position": errors,
+        "rotation_deg": errors,
+        "within_10deg": {"0.5": 2 / 3},
+    }
+    text = "\n".join(summary_lines(report(pairs=pairs, evaluation=evaluation)))
+    assert "2 pairs had more matches than kept" in text
+    assert "2 of 3 images, aligned on 2" in text and "0.5: 67 %" in text
+    assert text.count("mean 0.0100  median 0.0200  max 0.0300") == 2
+
+
+def test_skipped_and_lost_images_have_one_line_each_whatever_their_names(tmp_path):
+    name = "new\nline\x1b[31m.jpg"
+    (tmp_path / name).write_text("not an image")
+    with pytest.raises(ImageError) as error:
+        inspect_image(tmp_path / name, name=name)
+    rows = [{"image": "lost\n.jpg", "stage": "no plane", "detail": "5 tentative matches"}]
+    images = {"found": 4, "usable": 3, "skipped": {name: str(error.value)}}
+    lines = summary_lines(report(images=images, lost=rows))
+    assert all(line.isprintable() for line in lines)
+    assert [line for line in lines if line.startswith("skipped")] == [
+        r"skipped          new\nline\x1b[31m.jpg: not a readable image"
+    ]
+    assert [line for line in lines if line.startswith("lost")] == [
+        r"lost             lost\n.jpg: no plane (5 tentative matches)"
+    ]

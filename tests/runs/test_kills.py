@@ -1,0 +1,109 @@
+"""Killed at any moment, a run goes on to the very database and model that it would have made."""
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from databases import content
+
+from jaxsfm.bench.synthetic import write_scene
+from jaxsfm.io.atomic import PARTIAL, load_arrays
+
+KILLS, SEED = 50, 8
+OPTIONS = ("--preset", "paper", "--refine", "1", "--threads", "1", "--pairs", "exhaustive")
+
+
+class Nursery:
+    """See `nursery.py`."""
+
+    def __init__(self, folder: Path) -> None:
+        command = [sys.executable, str(Path(__file__).parents[1] / "nursery.py"), str(folder)]
+        self._process = subprocess.Popen(command, stdin=-1, stdout=-1, text=True, bufsize=1)
+        self.log = folder / "log"
+
+    def run(self, argv: list[str], kill_after: float | None = None) -> tuple[int, float]:
+        """Exit status (minus the signal) and seconds of a command."""
+        assert self._process.stdin and self._process.stdout
+        start = time.monotonic()
+        self._process.stdin.write(json.dumps(argv) + "\n")
+        child = int(self._process.stdout.readline())
+        if kill_after is not None:
+            ended, _, _ = select.select([self._process.stdout], [], [], kill_after)
+            if not ended:
+                with contextlib.suppress(ProcessLookupError):  # at this very moment
+                    os.kill(child, signal.SIGKILL)
+        return int(self._process.stdout.readline()), time.monotonic() - start
+
+    def end(self) -> None:
+        self._process.communicate(timeout=60)
+
+
+@pytest.fixture
+def nursery(tmp_path):
+    (tmp_path / "compiled").mkdir()
+    made = Nursery(tmp_path / "compiled")
+    yield made
+    made.end()
+
+
+def results(out: Path) -> dict[str, object]:
+    """What a run leaves that must not depend on how it came there."""
+    files = [*out.glob("matches/*/*"), *out.glob("sparse/*/*")]
+    report = json.loads((out / "report.json").read_text())
+    return {
+        **{str(file.relative_to(out)): file.read_bytes() for file in files},
+        "database": content(out / "database.db"),
+        "report": {
+            name: report[name] for name in ("identity", "pairs", "models", "lost", "refinement")
+        },
+    }
+
+
+def assert_whole(out: Path) -> None:
+    """Nothing is half there but what says so by its name; call after a kill."""
+    for file in out.glob("*/*/*.npz"):
+        assert load_arrays(file) is not None, file
+    for name in ("run.json", "report.json"):
+        if (out / name).exists():
+            json.loads((out / name).read_text())
+
+
+def test_killed_fifty_times_at_random_moments_nothing_is_lost_or_changed(tmp_path, nursery):
+    write_scene(tmp_path, num_views=4, size=(192, 144))
+    command = ["reconstruct", str(tmp_path / "images"), *OPTIONS, "--out"]
+    whole = tmp_path / "whole"
+    status, _ = nursery.run([*command, str(whole)])  # compiles
+    assert status == 0, nursery.log.read_text(errors="replace")[-2000:]
+    status, seconds = nursery.run([*command, str(tmp_path / "again")])
+    assert status == 0 and results(tmp_path / "again") == results(whole)
+    rng = np.random.default_rng(SEED)
+    killed, finished, steps = 0, 0, set()
+    while killed < KILLS:
+        out = tmp_path / f"out{finished}"
+        status, _ = nursery.run([*command, str(out)], rng.uniform(0, seconds))
+        assert status in (0, -signal.SIGKILL), nursery.log.read_text(errors="replace")[-2000:]
+        if out.exists():
+            steps.add(
+                (
+                    *sorted(p.name for p in out.iterdir()),
+                    *(len(list(out.glob(f"{kind}/*/*"))) for kind in ("features", "matches")),
+                )
+            )
+            assert_whole(out)
+        if status:
+            killed += 1
+        else:
+            assert results(out) == results(whole)
+            finished += 1
+    status, _ = nursery.run([*command, str(out)])
+    assert status == 0 and results(out) == results(whole)
+    assert not list(tmp_path.glob(f"out*/**/*{PARTIAL}"))
+    assert finished >= 3 and len(steps) >= 5, "the kills must meet different moments"

@@ -1,0 +1,289 @@
+"""Laws of localization in a finished run, on a rendered room whose cameras are known."""
+
+import dataclasses
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from kept_runs import change_report
+
+from jaxsfm.bench.synthetic import camera_matrix, look_at, render, room
+from jaxsfm.cli.main import main
+from jaxsfm.config import preset
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import ImageError, inspect_image
+from jaxsfm.io.store import Store
+from jaxsfm.matching.execution import Execution
+from jaxsfm.report.finished_run import read_run
+from jaxsfm.runs import localize as localize_module
+from jaxsfm.runs.finished_model import by_similarity, choose_camera, known_model
+from jaxsfm.runs.localize import LocalizeOptions, localize
+
+SIZE, WIDE = (320, 240), (368, 248)
+"""Of one padded size: nothing is compiled twice."""
+POSE = look_at(np.asarray([-0.6, -0.5, 0.6]), np.asarray([-0.1, 0.1, 5.2]))
+"""Of the new photos: between the run's views."""
+POSITION, ROTATION_DEG = 0.03, 0.3
+"""Errors of a good pose; a working pixel is 0.015 units at the room's distance."""
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def write(path: Path, rgb: np.ndarray) -> Path:
+    cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    return path
+
+
+@pytest.fixture(scope="module")
+def photos(scene, tmp_path_factory) -> Path:
+    """Photos to localize, in a folder, and reference poses that know the new ones too."""
+    folder = tmp_path_factory.mktemp("localize")
+    (folder / "photos").mkdir()
+    write(folder / "photos" / "new.png", render(room(), POSE, SIZE))
+    write(folder / "photos" / "wide.png", render(room(), POSE, WIDE))
+    noise = np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8)
+    write(folder / "photos" / "elsewhere.png", np.kron(noise, np.ones((4, 4, 1), np.uint8)))
+    (folder / "photos" / "broken.png").write_bytes(b"not an image")
+    shutil.copy(scene / "images" / "view0.png", folder / "photos" / "again.png")
+    shutil.copytree(scene / "reference", folder / "reference")
+    rows = [*camera_matrix(SIZE), np.zeros(3), *POSE.rotation.T, POSE.centre, np.asarray(SIZE)]
+    text = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in rows)
+    for name in ("new.png", "wide.png"):
+        (folder / "reference" / f"{name}.camera").write_text(text + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def localized(photos, plain) -> dict[str, dict]:
+    """Rows of all photos in one call, by file name."""
+    before = contents(plain[0])
+    options = LocalizeOptions(reference=photos / "reference")
+    result = localize([photos / "photos"], plain[0], options=options)
+    assert contents(plain[0]) == before  # the run stays as it is
+    return {Path(row["photo"]).name: row for row in result["photos"]}
+
+
+def test_a_new_photo_is_localized_and_knows_about_how_well(localized):
+    row = localized["new.png"]
+    assert row["status"] == "localized" and row["confidence"]["trusted"]
+    assert row["error"]["position"] < POSITION and row["error"]["rotation_deg"] < ROTATION_DEG
+    assert row["camera"]["source"] == "run" and row["in_run"] is None
+    assert len(row["shortlist"]) == 3 and row["inliers"] > 100 and row["agreed"] > 100
+    expected = row["confidence"]
+    assert 0 < expected["centre_error"] < POSITION
+    assert 0 < expected["rotation_error_deg"] < ROTATION_DEG
+
+
+def test_a_pose_is_colmaps(localized):
+    """cam_from_world takes the centre to the origin."""
+    pose = localized["new.png"]["cam_from_world"]
+    w, *v = pose["rotation_wxyz"]
+    x = np.asarray(localized["new.png"]["centre"])
+    turned = x + 2 * np.cross(v, np.cross(v, x) + w * x)
+    np.testing.assert_allclose(turned + pose["translation"], 0, atol=1e-9)
+
+
+def test_a_photo_of_another_size_has_its_focal_length_estimated(localized):
+    row = localized["wide.png"]
+    assert row["status"] == "localized" and row["camera"]["source"] == "guess"
+    assert row["camera"]["params"][0] == pytest.approx(WIDE[0], rel=0.03)
+    assert row["error"]["position"] < 5 * POSITION
+
+
+def test_a_photo_of_the_run_is_told_and_finds_its_pose_without_itself(localized, plain, scene):
+    row = localized["again.png"]
+    assert row["in_run"] == "view0.png" and "view0.png" not in row["shortlist"]
+    assert row["status"] == "localized"
+
+
+def test_a_photo_of_elsewhere_is_lost_for_a_reason(localized):
+    row = localized["elsewhere.png"]
+    assert row["status"] == "lost" and any(char.isdigit() for char in row["why"])
+    assert "cam_from_world" not in row and row["confidence"]["centre_error"] is None
+
+
+def test_one_bad_file_keeps_no_other_from_its_pose(localized):
+    assert localized["broken.png"]["status"] == "unusable"
+    assert "not a readable image" in localized["broken.png"]["why"]
+
+
+def test_a_photo_alone_and_under_another_name_has_the_same_pose(localized, plain, photos, tmp_path):
+    other = shutil.copy(photos / "photos" / "new.png", tmp_path / "other.png")
+    alone = localize([Path(other)], plain[0], options=LocalizeOptions())["photos"][0]
+    for key in localized["new.png"].keys() - {"photo", "error"}:
+        assert alone[key] == localized["new.png"][key], key
+
+
+def test_kept_features_spare_the_next_call_and_change_no_pose(
+    localized, plain, photos, tmp_path, monkeypatch
+):
+    run, computed = Path(shutil.copytree(plain[0], tmp_path / "run")), []
+    extracted = localize_module.extracted
+
+    def counted(weights, images, **kwargs):
+        computed.append(len(images))
+        return extracted(weights, images, **kwargs)
+
+    monkeypatch.setattr(localize_module, "extracted", counted)
+    for keep in (True, False):  # the second call neither computes nor deletes
+        options = LocalizeOptions(keep_features=keep)
+        row = localize([photos / "photos" / "new.png"], run, options=options)["photos"][0]
+        assert row["cam_from_world"] == localized["new.png"]["cam_from_world"]
+        assert len(list(run.glob("features/*/*.npz"))) == 3
+    assert computed == [3, 0]
+
+
+def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
+    options = LocalizeOptions(shortlist=lambda image, names: [n for n in names if n == "view2.png"])
+    result = localize([photos / "photos" / "new.png"], plain[0], options=options)
+    assert result["photos"][0]["shortlist"] == ["view2.png"]
+    assert result["photos"][0]["status"] in ("localized", "doubtful")
+
+
+def test_the_most_similar_photos_are_shortlisted_and_described_once(
+    plain, photos, weights, tmp_path, monkeypatch
+):
+    run = read_run(Path(shutil.copytree(plain[0], tmp_path / "run")))
+    image = inspect_image(photos / "photos" / "again.png", name="photo")
+    names = ["view0.png", "view1_night.png", "view2.png"]
+
+    def shortlist(k: int, names: list[str]) -> list[str]:
+        return list(by_similarity(run, weights, k, {"photo": image}, Execution())(image, names))
+
+    assert shortlist(1, names) == ["view0.png"]  # it is that photo
+    two = shortlist(2, names)
+    assert two == shortlist(2, names[::-1]) and two[0] == "view0.png"
+    assert shortlist(3, names) == names
+    assert (run.matches.path / "descriptors").is_dir()
+    monkeypatch.setattr(run.photos, "file", None)  # nobody opens them again
+    assert shortlist(1, names) == ["view0.png"]
+    with pytest.raises(UserError, match="--shortlist"):
+        shortlist(0, names)
+    cut = tmp_path / "cut.png"
+    cut.write_bytes((photos / "photos" / "new.png").read_bytes()[:2000])
+    bad = inspect_image(cut, name="bad")
+    choose = by_similarity(run, weights, 1, {"photo": image, "bad": bad}, Execution())
+    assert choose(image, [*names, "bad"]) == ["view0.png"]
+    with pytest.raises(ImageError):
+        choose(bad, names)
+
+
+def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
+    plain, photos, weights, tmp_path, monkeypatch
+):
+    run = read_run(Path(shutil.copytree(plain[0], tmp_path / "run")))
+    home, save = run.matches.path, Store.save_descriptor
+
+    def refused(self, *args):
+        if self.path == home:
+            raise UserError("cannot be written")
+        save(self, *args)
+
+    monkeypatch.setattr(Store, "save_descriptor", refused)
+    image = inspect_image(photos / "photos" / "again.png", name="photo")
+    choose = by_similarity(run, weights, 1, {"photo": image}, Execution())
+    assert choose(image, ["view0.png", "view2.png"]) == ["view0.png"]
+    assert not list(home.glob("descriptors/*/*"))
+
+
+def test_features_that_cannot_be_kept_are_one_sentence(plain, photos, tmp_path, capsys):
+    run = Path(shutil.copytree(plain[0], tmp_path / "run"))
+    (run / "features").write_text("in the way")
+    command = ["localize", str(photos / "photos" / "new.png"), "--model", str(run)]
+    assert main([*command, "--keep-features"]) == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error and f"{run}" in error
+
+
+def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, photos):
+    model = known_model(plain[0] / "sparse" / "0", preset("default"))
+    new = inspect_image(photos / "photos" / "new.png", name="photo")
+    odd_one, wide = (
+        pycolmap.Camera(
+            model="SIMPLE_PINHOLE", width=size[0], height=size[1], params=[300, 160, 120]
+        )
+        for size in (SIZE, WIDE)
+    )
+    odd_one.camera_id, wide.camera_id = 7, 8
+    first = model.views[0]
+
+    def chosen(*more):
+        views = [*model.views, *(dataclasses.replace(first, camera=camera) for camera in more)]
+        found = choose_camera(new, views, None)
+        return found.source, found.camera.camera_id
+
+    shared = first.camera.camera_id
+    assert chosen() == chosen(odd_one) == chosen(odd_one, wide, wide) == ("run", shared)
+    assert chosen(odd_one, odd_one)[0] == "guess"  # nobody can tell which
+    assert choose_camera(new, model.views[:1], None).source == "guess"  # nobody else's
+
+
+def test_an_empty_folder_keeps_no_photo_from_its_pose(plain, photos, tmp_path):
+    (tmp_path / "empty").mkdir()
+    new = photos / "photos" / "new.png"
+    found = localize([tmp_path / "empty", new], plain[0], options=LocalizeOptions())["photos"]
+    status = {row["photo"]: row["status"] for row in found}
+    assert status == {str(tmp_path / "empty"): "unusable", str(new): "localized"}
+
+
+# -- the command ----------------------------------------------------------------------------------
+
+
+def says(capsys, *args) -> str:
+    """What a wrong call says: one sentence, status 2."""
+    assert main(["localize", *map(str, args)]) == 2
+    text = capsys.readouterr().err
+    assert text.startswith("jaxsfm: ") and text.count("\n") == 1, text
+    return text
+
+
+def test_the_command_writes_poses_and_tells_them(plain, photos, tmp_path, capsys):
+    new, out = photos / "photos" / "new.png", tmp_path / "poses.json"
+    assert main(["localize", str(new), "--model", str(plain[0]), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "localized" in text and "expected error" in text and "1 localized of 1" in text
+    row = json.loads(out.read_text())["photos"][0]
+    assert row["photo"] == str(new) and row["cam_from_world"]
+
+
+def test_nothing_localized_ends_with_1(localized, plain, photos, capsys, monkeypatch):
+    rows = [localized["elsewhere.png"]]
+    monkeypatch.setattr(localize_module, "localize", lambda *args, **kwargs: {"photos": rows})
+    lost = photos / "photos" / "elsewhere.png"
+    assert main(["localize", str(lost), "--model", str(plain[0])]) == 1
+    captured = capsys.readouterr()
+    assert "no photo could be localized" in captured.err and "1 lost of 1" in captured.out
+
+
+def test_wrong_calls_are_one_sentence(plain, photos, scene, tmp_path, capsys):
+    out, new = plain[0], photos / "photos" / "new.png"
+    broken = photos / "photos" / "broken.png"
+    assert "not a readable image" in says(capsys, broken, "--model", out)
+    assert "cannot be read" in says(capsys, tmp_path / "none.png", "--model", out)
+    assert "no finished run" in says(capsys, new, "--model", scene)
+    assert "no such folder" in says(capsys, new, "--model", out, "--images", tmp_path / "none")
+    assert "gone or changed" in says(capsys, new, "--model", out, "--images", scene)
+    far = "PINHOLE:320,320,390,50"
+    assert "principal point" in says(capsys, new, "--model", out, "--intrinsics", far)
+    assert "--out" in says(capsys, new, "--model", out, "--out", tmp_path / "poses.txt")
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda report: report["weights"].update(sha256="0" * 64), "other weights"),
+        (lambda report: report.update(models=[]), "no model"),
+        (lambda report: report["options"]["config"].update(colour="red"), "does not know"),
+    ],
+)
+def test_a_run_that_cannot_serve_is_one_sentence(plain, photos, tmp_path, capsys, change, sentence):
+    run = change_report(Path(shutil.copytree(plain[0], tmp_path / "run")), change)
+    assert sentence in says(capsys, photos / "photos" / "new.png", "--model", run)

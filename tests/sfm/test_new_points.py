@@ -1,0 +1,135 @@
+"""Laws of new points, on the rendered room with exact matches."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from room_scene import Room, exact_tracks, read_of
+
+from jaxsfm.colmap.model_arrays import Tracks, select
+from jaxsfm.config import Refinement
+from jaxsfm.core.types import Status
+from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.sfm.register.grow import Newcomer, grow
+from jaxsfm.sfm.register.triangulate import matched_tracks, new_points, triangulated
+
+NEW = "3.png"
+
+
+def all_matches(scene: Room, *, sigma: float = 0.0) -> dict[Pair, PairResult]:
+    """Of all pairs; a point's number is its cell; a keypoint is the same in every pair."""
+    rng = np.random.default_rng(0)
+    xy = {}
+    for view in scene.views:
+        at = view.project(scene.points)[0]
+        xy[view.name] = (at + rng.normal(0, sigma, at.shape)).astype(np.float32)
+    index = {view.name: k for k, view in enumerate(scene.views)}
+    found = {}
+    for a, b in exhaustive_pairs(index):
+        both = np.flatnonzero(scene.visible[:, index[a]] & scene.visible[:, index[b]])
+        found[a, b] = PairResult(
+            pair=(a, b),
+            cells=np.c_[both, both].astype(np.int32),
+            keypoints0=xy[a][both],
+            keypoints1=xy[b][both],
+            plane=np.zeros(len(both), np.int32),
+            homographies=np.eye(3)[None],
+            num_tentative=len(both),
+            num_dropped=0,
+            status=Status.VERIFIED,
+        )
+    return found
+
+
+def half_known(scene: Room) -> tuple[Tracks, np.ndarray]:
+    """The tracks of every other point, of all views but the new one, and which points are new."""
+    tracks = exact_tracks(scene)
+    known = np.arange(len(scene.points)) % 2 == 0
+    return select(tracks, known[tracks.point] & (tracks.view != 3)), ~known
+
+
+def test_rays_meet_where_the_points_are(rendered):
+    tracks = exact_tracks(rendered)
+    found = triangulated(rendered.views, tracks._replace(points=np.zeros_like(tracks.points)))
+    np.testing.assert_allclose(found.points, rendered.points, atol=1e-6)
+    alone = select(tracks, tracks.view == 0)
+    assert np.isnan(triangulated(rendered.views, alone).points).all()
+
+
+def test_what_has_a_point_gets_no_other_and_the_rest_is_found_where_it_is(rendered):
+    tracks, _ = half_known(rendered)
+    made = new_points(
+        rendered.views, tracks, {NEW}, all_matches(rendered), read_of(rendered), refinement=None
+    )
+    assert len(made.points) > 100
+    distance = np.linalg.norm(made.points[:, None] - rendered.points[None], axis=2)
+    nearest = distance.argmin(1)
+    assert distance.min(1).max() < 1e-3
+    assert len(np.unique(nearest)) == len(nearest)
+    # A point with an observation in each of the views is known; new ones lack it in one at least.
+    for k in range(len(rendered.views)):
+        own, old = made.xy[made.view == k], tracks.xy[tracks.view == k]
+        if len(own) and len(old):
+            assert np.linalg.norm(own[:, None] - old[None], axis=2).min() > 3.9
+
+
+def test_a_keypoint_that_leads_to_two_of_one_view_makes_no_point(rendered):
+    tracks, _ = half_known(rendered)
+    matches = all_matches(rendered)
+    fresh = {NEW, "4.png"}
+    right = matched_tracks(rendered.views, tracks, fresh, matches)
+    pair = ("0.png", NEW)
+    wrong = matches[pair]
+    cells = wrong.cells.copy()
+    cells[:, 0] = np.roll(cells[:, 0], 1)  # now each leads to another point's keypoint in view 0
+    matches[pair] = dataclasses.replace(
+        wrong, cells=cells, keypoints0=np.roll(wrong.keypoints0, 1, axis=0)
+    )
+    mixed = matched_tracks(rendered.views, tracks, fresh, matches)
+    assert len(mixed.points) < len(right.points)
+    for point in range(len(mixed.points)):
+        seen = mixed.view[mixed.point == point]
+        assert len(np.unique(seen)) == len(seen)
+
+
+@pytest.mark.parametrize("refinement", [None, Refinement()])
+def test_alignment_takes_the_noise_of_matches_away(rendered, refinement):
+    tracks, _ = half_known(rendered)
+    matches = all_matches(rendered, sigma=1.0)
+    made = new_points(
+        rendered.views, tracks, {NEW}, matches, read_of(rendered), refinement=refinement
+    )
+    planes = np.stack([rendered.points, rendered.normals], axis=1)
+    off = np.abs(np.einsum("npk,pk->np", made.points[:, None] - planes[None, :, 0], planes[:, 1]))
+    error = np.median(off[np.arange(len(off)), _nearest(made.points, rendered.points)])
+    assert error < 0.004 if refinement else error > 0.004
+
+
+def _nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(points[:, None] - others[None], axis=2).argmin(1)
+
+
+def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
+    """View 4 is matched with view 3 alone, which is new itself."""
+    use = rendered.visible.copy()
+    use[:, 3:] = False
+    use[use.sum(1) < 2] = False
+    tracks = exact_tracks(rendered, use=use)
+    every = {view.name: view for view in rendered.views}
+    newcomers = {
+        NEW: Newcomer(every[NEW], False, ["0.png", "1.png", "2.png", "4.png"]),
+        "4.png": Newcomer(every["4.png"], False, [NEW]),
+    }
+    grown = grow(
+        rendered.views[:3],
+        tracks,
+        newcomers,
+        all_matches(rendered),
+        read_of(rendered),
+        refinement=Refinement(),
+    )
+    assert grown.placed == [NEW, "4.png"] and grown.rounds == 2
+    np.testing.assert_array_equal(grown.tracks.points[: len(tracks.points)], tracks.points)
+    assert len(grown.tracks.points) > len(tracks.points)
+    for view, truth in zip(grown.views, rendered.views, strict=True):
+        np.testing.assert_allclose(view.centre, truth.centre, atol=0.02)

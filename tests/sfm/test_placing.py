@@ -1,0 +1,157 @@
+"""Laws of placing: how much doubt observations leave about a view, and octaves of an image."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from room_scene import SIZE, Room, exact_tracks, read_of
+
+from jaxsfm.colmap.resection import adjust_view
+from jaxsfm.config import Refinement
+from jaxsfm.sfm.refine import octave_pose
+from jaxsfm.sfm.refine.octave_pose import (
+    Followed,
+    Observed,
+    Pose,
+    _doubt,
+    at_octave,
+    follow,
+    pose_doubt,
+    trusted,
+)
+from jaxsfm.sfm.view_graph import rotation_angle_deg
+
+NIGHT = 2
+
+
+def observed(scene: Room, rows: np.ndarray, sigma: float) -> Observed:
+    """Points as the night view would show them, off by noise."""
+    points = scene.points[rows]
+    xy = scene.views[NIGHT].project(points)[0]
+    noise = np.random.default_rng(0).normal(0, sigma, xy.shape)
+    return Observed(rows, points, xy + noise, scene.points[scene.visible[:, NIGHT]])
+
+
+@pytest.mark.parametrize("sigma", [0.3, 2.0])
+def test_doubt_is_how_far_off_projections_are(rendered, sigma):
+    """Over many draws of the noise, where every observation has a patch of its own."""
+    view = rendered.views[NIGHT]
+    rows = np.flatnonzero(rendered.visible[:, NIGHT])[::9]
+    doubts, errors = [], []
+    for seed in range(40):
+        noise = np.random.default_rng(seed).normal(0, sigma, (len(rows), 2))
+        seen = observed(rendered, rows, 0.0)
+        seen = seen._replace(xy=seen.xy + noise)
+        found = adjust_view(view, seen.xy, seen.points, refine_focal_length=False)
+        assert found is not None
+        off = found.project(seen.points)[0] - seen.xy
+        median = float(np.median(np.linalg.norm(off, axis=1)))
+        doubts.append(_doubt(found, seen, median, 1))
+        errors.append(found.project(seen.could)[0] - view.project(seen.could)[0])
+    true = np.sqrt(np.mean(np.square(errors)))
+    assert 0.6 < np.median(doubts) / true < 1.3
+
+
+@pytest.mark.parametrize("focal", [False, True])
+def test_the_doubt_about_a_pose_is_how_far_off_it_is(rendered, focal):
+    """Root mean square over many draws of the noise, of centre and rotation."""
+    view = rendered.views[NIGHT]
+    rows = np.flatnonzero(rendered.visible[:, NIGHT])[::9]
+    points, exact = rendered.points[rows], view.project(rendered.points[rows])[0]
+    doubts, errors = [], []
+    for seed in range(40):
+        xy = exact + np.random.default_rng(seed).normal(0, 1.0, exact.shape)
+        found = adjust_view(view, xy, points, refine_focal_length=focal)
+        assert found is not None
+        median = float(np.median(np.linalg.norm(found.project(points)[0] - xy, axis=1)))
+        doubts.append(pose_doubt(found, points, xy, median, 1, focal=focal))
+        turn = rotation_angle_deg(found.rotation, view.rotation)
+        errors.append((np.linalg.norm(found.centre - view.centre), turn))
+    ratio = np.median(doubts, axis=0) / np.sqrt(np.mean(np.square(errors), axis=0))
+    assert (ratio > 0.6).all() and (ratio < 1.4).all(), ratio
+
+
+def test_points_in_a_corner_leave_more_doubt_than_fewer_everywhere(rendered):
+    rows = np.flatnonzero(rendered.visible[:, NIGHT])
+    at = rendered.views[NIGHT].project(rendered.points[rows])[0]
+    corner = rows[np.argsort(at @ [1.0, 1.0])[: len(rows) // 8]]
+    spread = rows[:: len(rows) // 30]
+    doubt = [
+        _doubt(rendered.views[NIGHT], observed(rendered, some, 1.0), 1.0, 1)
+        for some in (corner, spread)
+    ]
+    assert len(spread) < len(corner) / 2 and doubt[0] > 2 * doubt[1]
+
+
+def test_patches_that_overlap_count_once(rendered):
+    rows = np.flatnonzero(rendered.visible[:, NIGHT])[::9]
+    seen = observed(rendered, rows, 1.0)
+    twice = seen._replace(points=np.repeat(seen.points, 2, 0), xy=np.repeat(seen.xy, 2, 0))
+    view = rendered.views[NIGHT]
+    assert _doubt(view, twice, 1.0, 1) == pytest.approx(_doubt(view, seen, 1.0, 1))
+
+
+def test_one_point_determines_no_pose(rendered):
+    seen = observed(rendered, np.full(40, np.flatnonzero(rendered.visible[:, NIGHT])[0]), 1.0)
+    assert _doubt(rendered.views[NIGHT], seen, 1.0, 15) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("share", "doubt_px", "right"),
+    [(0.06, 0.9, True), (0.04, 0.1, False), (0.5, 1.1, False), (0.5, np.inf, False)],
+)
+def test_a_pose_is_trusted_with_little_doubt_and_enough_that_agrees(
+    rendered, share, doubt_px, right
+):
+    view = rendered.views[NIGHT]
+    seen = observed(rendered, np.arange(40), 1.0)
+    best = Pose(view, 2, seen, 40, 1.0, doubt_px)
+    pose = Followed(view=view, own_camera=False, best=best, share=share)
+    assert trusted(pose) is (best if right else None)
+    assert trusted(dataclasses.replace(pose, best=None)) is None
+
+
+def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_best(
+    rendered, monkeypatch
+):
+    start, end, last = rendered.views[NIGHT], rendered.views[0], rendered.views[1]
+    seen = observed(rendered, np.arange(40), 1.0)
+    found = {"doubtful": 0.8, "sure": 0.3, "lost": None}
+    poses = {name: Followed(view=start, own_camera=False) for name in found}
+    began = []
+
+    def descend(moving, *_):
+        names = [next(n for n, p in poses.items() if p is pose) for pose in moving]
+        began.append([(name, poses[name].view) for name in names])
+        for name in names:
+            doubt_px = found[name]
+            best = Pose(end, 2, seen, 40, 1.0, doubt_px) if doubt_px else None
+            poses[name].view, poses[name].best = last, best
+
+    monkeypatch.setattr(octave_pose, "_descend", descend)
+    follow(
+        list(poses.values()),
+        rendered.views,
+        exact_tracks(rendered),
+        read_of(rendered),
+        Refinement(),
+    )
+    first, second = began
+    assert [(name, view is start) for name, view in first] == [(name, True) for name in found]
+    assert [(name, view is end) for name, view in second] == [("doubtful", True)]
+
+
+@pytest.mark.parametrize("px", [1, 2, 8])
+def test_an_octaves_pixels_are_means_and_lie_where_they_lay(rendered, px):
+    tracks = exact_tracks(rendered)
+    views, smaller, read = at_octave(px, rendered.views, tracks, read_of(rendered))
+    at, _ = views[0].project(rendered.points[:50])
+    whole, _ = rendered.views[0].project(rendered.points[:50])
+    np.testing.assert_allclose((at + 0.5) * px - 0.5, whole)
+    np.testing.assert_allclose((smaller.xy + 0.5) * px - 0.5, tracks.xy)
+    image, scale = read("0.png")
+    assert image.shape[::-1] == views[0].size == (SIZE[0] // px, SIZE[1] // px)
+    assert scale == (px, px)
+    np.testing.assert_allclose(
+        image[3, 5], rendered.images["0.png"][3 * px : 4 * px, 5 * px : 6 * px].mean(), rtol=1e-5
+    )

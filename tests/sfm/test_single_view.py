@@ -1,0 +1,109 @@
+"""Laws of one photo in a finished model, on the rendered room."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from room_scene import Room, camera, exact_tracks, other_scene, read_of
+from test_weak_views import NIGHT, NIGHT_NAME, night_matches
+
+from jaxsfm.colmap.model_arrays import Tracks, View, part_of
+from jaxsfm.config import Refinement
+from jaxsfm.sfm.register.locate_view import Located, locate
+
+
+def known(scene: Room) -> tuple[list[View], Tracks]:
+    """The exact model without the view that is to be found."""
+    use = scene.visible.copy()
+    use[:, NIGHT] = False
+    return part_of(scene.views, exact_tracks(scene, use=use), set(scene.images) - {NIGHT_NAME})[:2]
+
+
+def found(scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, focal=1.0) -> Located:
+    unknown = camera()
+    unknown.params = [*(focal * np.asarray(unknown.params[:2])), *unknown.params[2:]]
+    image = dataclasses.replace(
+        scene.views[NIGHT], rotation=np.eye(3), centre=np.zeros(3), camera=unknown
+    )
+    return locate(
+        image,
+        *known(scene),
+        night_matches(scene, right=right, wrong=wrong).matches,
+        read_of(scene),
+        config=Refinement(),
+        own_camera=own_camera,
+    )
+
+
+def errors(located: Located, scene: Room) -> tuple[float, float]:
+    """Of centre and rotation (degrees)."""
+    assert located.view is not None
+    truth = scene.views[NIGHT]
+    turn = located.view.rotation @ truth.rotation.T
+    degrees = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    return float(np.linalg.norm(located.view.centre - truth.centre)), float(degrees)
+
+
+def test_a_few_right_matches_are_enough_and_the_error_is_as_expected(rendered):
+    located = found(rendered)
+    assert located.trusted and located.why is None
+    position, degrees = errors(located, rendered)
+    assert position < 0.01 and degrees < 0.1
+    assert located.centre_error and located.rotation_error_deg
+    assert position < 5 * located.centre_error and degrees < 5 * located.rotation_error_deg
+    assert located.centre_error < 0.01 and located.rotation_error_deg < 0.1
+
+
+def test_an_unknown_focal_length_is_found_and_leaves_more_doubt(rendered):
+    sure, unsure = found(rendered), found(rendered, right=60, own_camera=True, focal=1.2)
+    assert unsure.trusted and unsure.view is not None
+    at, expected = unsure.view.camera.mean_focal_length(), camera().mean_focal_length()
+    assert at == pytest.approx(expected, rel=0.01)
+    assert sure.centre_error and unsure.centre_error
+    assert sure.centre_error < unsure.centre_error < 0.05
+    assert errors(unsure, rendered)[0] < 5 * unsure.centre_error
+
+
+def test_a_pose_that_the_photo_does_not_show_is_not_trusted(rendered):
+    """Its matches agree, its pixels are another scene's."""
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    few = found(elsewhere)
+    assert few.view is None and 6 <= few.inliers < 30 and few.why
+    located = found(elsewhere, right=20)
+    assert not located.trusted and located.view is not None
+    assert located.why and "alignment finds" in located.why
+    assert errors(located, rendered)[0] < 0.5 and located.octave_px is None
+
+
+def test_too_few_matches_are_no_pose_and_are_counted(rendered):
+    located = found(rendered, right=1, wrong=0)
+    assert located.view is None and located.on_surface == 4
+    assert located.why and located.why.startswith("4 matches lie on the surface")
+    assert "no plane in common" in (found(rendered, right=0, wrong=0).why or "")
+
+
+def test_a_part_of_a_model_is_what_its_views_see(rendered):
+    tracks = exact_tracks(rendered)
+    views, part, rows = part_of(rendered.views, tracks, {"0.png", "3.png"})
+    assert [view.name for view in views] == ["0.png", "3.png"]
+    seen = rendered.visible[:, [0, 3]]
+    assert len(part.points) == seen.any(1).sum() and len(part.xy) == seen.sum()
+    np.testing.assert_array_equal(tracks.points[rows], part.points)
+    for k, view in enumerate(views):
+        own = part.view == k
+        at = view.project(part.points[part.point[own]])[0]
+        np.testing.assert_allclose(at, part.xy[own], atol=1e-6)
+
+
+def test_no_view_is_no_pose(rendered):
+    views, part, _ = part_of(rendered.views, exact_tracks(rendered), set())
+    located = locate(
+        rendered.views[NIGHT],
+        views,
+        part,
+        {},
+        read_of(rendered),
+        config=Refinement(),
+        own_camera=False,
+    )
+    assert located.view is None and located.why

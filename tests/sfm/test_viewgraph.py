@@ -1,0 +1,190 @@
+"""Laws of the view graph: which pairs are trusted."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
+from strategies import rng_of, seeds
+
+from jaxsfm.colmap.two_views import PairGeometry, spread
+from jaxsfm.sfm.view_graph import (
+    mean_rotation,
+    rotation_angle_deg,
+    strengths,
+    trusted_pairs,
+)
+
+
+def ring(rng, count=8, *, noise_deg=0.5):
+    """Cameras in a ring, each matched with its neighbours; true rotations and geometries."""
+    rotations = [
+        Rotation.from_euler("y", 360 * k / count, degrees=True)
+        * Rotation.from_rotvec(rng.normal(0, 0.05, 3))
+        for k in range(count)
+    ]
+    names = [f"{k}.jpg" for k in range(count)]
+    pairs = {}
+    for i, j in itertools.combinations(range(count), 2):
+        apart = min(j - i, count - (j - i))
+        if apart > 2:
+            continue
+        noise = Rotation.from_rotvec(np.radians(rng.normal(0, noise_deg, 3)))
+        relative = noise * rotations[j] * rotations[i].inv()
+        pairs[names[i], names[j]] = PairGeometry(
+            num_inliers=int(rng.integers(800, 2000) / apart), rotation=relative.as_matrix()
+        )
+    return names, rotations, pairs
+
+
+def false_pair(rng, inliers: int) -> PairGeometry:
+    """A facade taken for its likeness on the opposite side."""
+    turn = Rotation.from_euler("y", rng.uniform(60, 180), degrees=True)
+    return PairGeometry(num_inliers=inliers, rotation=turn.as_matrix())
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds)
+def test_true_pairs_stay_and_weaker_false_ones_go(seed):
+    rng = rng_of(seed)
+    names, rotations, pairs = ring(rng)
+    false = {}
+    for k in range(4):  # consistent with each other, as repeated facades are
+        pair = (names[k], names[k + 4])
+        relative = rotations[k + 4] * rotations[k].inv()
+        turned = Rotation.from_euler("y", 120, degrees=True) * relative
+        false[pair] = PairGeometry(num_inliers=150, rotation=turned.as_matrix())
+    verdicts = trusted_pairs(pairs | false)
+    assert {p for p, v in verdicts.items() if v.trusted} == set(pairs)
+    for pair in false:
+        assert "deg" in verdicts[pair].reason and verdicts[pair].rotation_error_deg > 15
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds)
+def test_verdicts_depend_neither_on_the_order_nor_on_the_names_of_images(seed):
+    rng = rng_of(seed)
+    names, _, pairs = ring(rng)
+    pairs[names[0], names[4]] = false_pair(rng, 100)
+    one = trusted_pairs(pairs)
+    shuffled = list(pairs.items())
+    rng.shuffle(shuffled)
+    again = trusted_pairs(dict(shuffled))
+    assert one == again
+    renamed = dict(zip(names, rng.permutation([f"x{k}" for k in range(len(names))]), strict=True))
+    other = {}
+    for (a, b), g in pairs.items():
+        x, y = str(renamed[a]), str(renamed[b])
+        rotation = g.rotation if x < y else g.rotation.T
+        other[min(x, y), max(x, y)] = PairGeometry(num_inliers=g.num_inliers, rotation=rotation)
+    moved = trusted_pairs(other)
+    for (a, b), verdict in one.items():
+        x, y = sorted((str(renamed[a]), str(renamed[b])))
+        assert moved[x, y].trusted == verdict.trusted
+
+
+def test_groups_meet_where_most_inliers_agree():
+    """Two groups joined by one strong false pair and three true ones that together outweigh it."""
+    rng = rng_of(3)
+    rotations = [Rotation.from_rotvec(rng.normal(0, 0.3, 3)) for _ in range(6)]
+    names = list("abcdef")
+
+    def relative(i, j, turn=None):
+        move = rotations[j] * rotations[i].inv()
+        return (turn * move if turn is not None else move).as_matrix()
+
+    pairs = {}
+    for group in ((0, 1, 2), (3, 4, 5)):
+        for i, j in itertools.combinations(group, 2):
+            pairs[names[i], names[j]] = PairGeometry(num_inliers=1000, rotation=relative(i, j))
+    for i, j in ((0, 3), (1, 4), (2, 5)):
+        pairs[names[i], names[j]] = PairGeometry(num_inliers=120, rotation=relative(i, j))
+    half_turn = Rotation.from_euler("y", 180, degrees=True)
+    pairs["a", "e"] = PairGeometry(num_inliers=200, rotation=relative(0, 4, half_turn))
+    verdicts = trusted_pairs(pairs)
+    assert [p for p, v in verdicts.items() if not v.trusted] == [("a", "e")]
+
+
+def test_an_image_with_one_weak_pair_keeps_it():
+    """A night photo: nothing contradicts its only pair, however few its inliers."""
+    rng = rng_of(0)
+    _, _, pairs = ring(rng)
+    pairs["0.jpg", "night.jpg"] = false_pair(rng, 20)
+    assert trusted_pairs(pairs)["0.jpg", "night.jpg"].trusted
+
+
+def test_a_strong_pair_stays_whatever_its_rotation():
+    """A facade's or a telephoto's rotation can be poor where its thousand matches are not."""
+    rng = rng_of(1)
+    names, _, pairs = ring(rng)
+    turned = (
+        Rotation.from_euler("x", 30, degrees=True).as_matrix() @ pairs[names[0], names[2]].rotation
+    )
+    for inliers, stays in ((1000, True), (40, False)):
+        pairs[names[0], names[2]] = PairGeometry(num_inliers=inliers, rotation=turned)
+        verdict = trusted_pairs(pairs)[names[0], names[2]]
+        assert verdict.trusted == stays and verdict.rotation_error_deg > 15
+
+
+def test_many_pairs_between_two_groups_stay_cheap():
+    """2 x 60 images: a vote of all 3600 pairs would hold gigabytes."""
+    import tracemalloc
+
+    rotation = np.eye(3)
+    pairs = {}
+    for i, j in itertools.combinations(range(120), 2):
+        strong = (i < 60) == (j < 60)
+        pairs[f"{i:03d}", f"{j:03d}"] = PairGeometry(
+            num_inliers=1000 if strong else 100, rotation=rotation
+        )
+    tracemalloc.start()
+    assert all(v.trusted for v in trusted_pairs(pairs).values())
+    assert tracemalloc.get_traced_memory()[1] < 200e6
+    tracemalloc.stop()
+
+
+def test_pairs_without_a_pose_are_not_trusted_and_say_so():
+    pairs = {
+        ("a", "b"): PairGeometry(num_inliers=50, rotation=None),
+        ("a", "c"): PairGeometry(num_inliers=0, rotation=np.eye(3)),
+        ("b", "c"): PairGeometry(num_inliers=50, rotation=np.eye(3)),
+    }
+    verdicts = trusted_pairs(pairs)
+    assert [v.trusted for v in verdicts.values()] == [False, False, True]
+    assert verdicts["a", "b"].reason == "no relative pose"
+    assert trusted_pairs({}) == {}
+    with pytest.raises(ValueError, match="tolerance_deg"):
+        trusted_pairs(pairs, tolerance_deg=0)
+
+
+def test_strength_is_one_for_the_best_pair_of_both_images():
+    pairs = {
+        ("a", "b"): PairGeometry(num_inliers=400, rotation=np.eye(3)),
+        ("b", "c"): PairGeometry(num_inliers=100, rotation=np.eye(3)),
+        ("c", "d"): PairGeometry(num_inliers=100, rotation=np.eye(3), spread=0.25),
+    }
+    got = strengths(pairs)
+    assert got["a", "b"] == 1.0
+    assert got["b", "c"] == pytest.approx(100 / np.sqrt(400 * 100))
+    assert got["c", "d"] == pytest.approx(50 / np.sqrt(100 * 50))
+
+
+def test_spread_counts_covered_cells():
+    corner = np.asarray([[-0.5, -0.5], [0.0, 0.0]])
+    assert spread(corner, (80, 80)) == 1 / 64
+    grid = np.stack(np.meshgrid(np.arange(80.0), np.arange(80.0)), -1).reshape(-1, 2)
+    assert spread(grid, (80, 80)) == 1.0
+    assert spread(np.asarray([[79.5, 79.5]]), (80, 80)) == 1 / 64  # on the very edge
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_angles_and_means_of_rotations_are_scipys(seed):
+    rng = rng_of(seed)
+    some = Rotation.from_rotvec(rng.normal(0, 0.4, (5, 3)))
+    weights = rng.uniform(0.1, 1, 5)
+    want = some.mean(weights).as_matrix()
+    np.testing.assert_allclose(mean_rotation(some.as_matrix(), weights), want, atol=1e-6)
+    got = rotation_angle_deg(some[0].as_matrix(), some[1].as_matrix())
+    assert got == pytest.approx(np.degrees((some[0].inv() * some[1]).magnitude()), abs=1e-5)

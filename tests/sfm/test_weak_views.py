@@ -1,0 +1,406 @@
+"""Weak views against exact cameras and pixels of a rendered room, one view of which is noise."""
+
+import dataclasses
+
+import numpy as np
+import pycolmap
+import pytest
+import tolerances
+from room_scene import (
+    SIZE,
+    Room,
+    camera,
+    exact_tracks,
+    noisy_model,
+    other_scene,
+    read_of,
+    refine,
+    sizes,
+    template,
+)
+from scipy.spatial.transform import Rotation
+
+from jaxsfm.colmap.mapper import registered
+from jaxsfm.colmap.model_arrays import View, build_model, read_model_arrays
+from jaxsfm.colmap.poses import model_poses
+from jaxsfm.config import Refinement
+from jaxsfm.core.types import Status
+from jaxsfm.io.images import ImageError
+from jaxsfm.io.pairs import PairResult, make_pair
+from jaxsfm.sfm.evaluation import evaluate
+from jaxsfm.sfm.refine import plane_geometry, weak_views
+from jaxsfm.sfm.refine.octave_pose import Followed, follow
+from jaxsfm.sfm.refine.passes import refine_model
+from jaxsfm.sfm.refine.track_alignment import align_blocks
+from jaxsfm.sfm.refine.weak_views import (
+    NO_EVIDENCE,
+    Evidence,
+    LeftOut,
+    Placed,
+    place_weak_views,
+    take_out,
+)
+
+NIGHT, NIGHT_NAME = 2, "2.png"
+PHOTONS = 0.02
+"""Per unit of intensity: about two at a bright pixel."""
+
+
+def by_night(scene: Room) -> Room:
+    """The same room; one view counts photons."""
+    counts = np.random.default_rng(0).poisson(PHOTONS * scene.images[NIGHT_NAME])
+    return scene._replace(images=scene.images | {NIGHT_NAME: (counts / PHOTONS).astype(np.float32)})
+
+
+def lost_view(
+    scene: Room, *, turn_deg: float = 1.0, shift: float = 0.0, seen: int = 40
+) -> pycolmap.Reconstruction:
+    """The exact model, but the night view looks elsewhere and has few observations."""
+    tracks = exact_tracks(scene)
+    night = np.flatnonzero(tracks.view == NIGHT)
+    keep = np.delete(np.arange(len(tracks.view)), night[seen:])
+    tracks = tracks._replace(point=tracks.point[keep], view=tracks.view[keep], xy=tracks.xy[keep])
+    views = list(scene.views)
+    angle = np.radians(turn_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    views[NIGHT] = dataclasses.replace(
+        views[NIGHT],
+        rotation=np.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ views[NIGHT].rotation,
+        centre=views[NIGHT].centre + [shift, 0, 0],
+    )
+    return build_model(template(scene), views, tracks)
+
+
+def place(
+    model,
+    scene: Room,
+    *,
+    weak=(NIGHT_NAME,),
+    refine_intrinsics=False,
+    evidence=NO_EVIDENCE,
+    **config,
+):
+    return place_weak_views(
+        model,
+        weak,
+        read_of(scene),
+        sizes(scene),
+        config=Refinement(**config),
+        refine_intrinsics=refine_intrinsics,
+        evidence=evidence,
+    )
+
+
+def night_error(model, scene: Room) -> tuple[float, float]:
+    """Position and degrees, after a similarity from the other cameras."""
+    others = [name for name in scene.poses if name != NIGHT_NAME]
+    error = evaluate(model_poses(model), scene.poses, align_on=others).images[NIGHT_NAME]
+    return error.position, error.rotation_deg
+
+
+@pytest.mark.parametrize(("turn_deg", "shift"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.05)])
+def test_a_view_of_photons_is_placed_where_it_is(rendered, turn_deg, shift):
+    """Two photons at a bright pixel, and the pose up to 10 px off."""
+    night = by_night(rendered)
+    model, (placed,) = place(lost_view(night, turn_deg=turn_deg, shift=shift), night)
+    assert placed.octave_px in (2, 4, 8) and placed.agreed >= 100 and placed.error_px < 4
+    position, rotation = night_error(model, night)
+    assert position < 0.01 and rotation < 0.15
+
+
+def test_an_octave_is_repeated_until_the_view_stands_still(rendered):
+    """One step each leaves 0.004 and 0.055 deg: the first finds half of the points."""
+    night = by_night(rendered)
+    model, (placed,) = place(lost_view(night, turn_deg=0.5), night, weak_octaves=2)
+    position, rotation = night_error(model, night)
+    assert placed.octave_px == 2 and position < 0.002 and rotation < 0.035
+
+
+def test_refinement_places_a_view_that_it_cannot_align(rendered):
+    night = by_night(rendered)
+    tracks = exact_tracks(night)
+    sigma = np.where(tracks.view == NIGHT, 3.0, 0.7)[:, None]
+    noise = sigma * np.random.default_rng(1).normal(size=tracks.xy.shape)
+    before = build_model(template(night), night.views, tracks._replace(xy=tracks.xy + noise))
+    after, figures = refine(before, night)
+    assert [p.name for p in figures.placed] == [NIGHT_NAME] == figures.passes[-1].weak_views
+    without, old = refine(before, night, weak_octaves=0)
+    assert old.placed[0].octave_px is None and old.passes == figures.passes
+    placed, kept = night_error(after, night), night_error(without, night)
+    assert placed[0] < 0.01 and placed[0] < 0.7 * kept[0]
+
+
+def test_the_other_views_and_their_observations_stay(rendered):
+    night = by_night(rendered)
+    before = lost_view(night)
+    after, _ = place(before, night)
+    for image_id in before.reg_image_ids():
+        if before.image(image_id).name != NIGHT_NAME:
+            one, two = (m.image(image_id).cam_from_world().matrix() for m in (before, after))
+            np.testing.assert_allclose(one, two, atol=1e-14)
+    (_, old), (views, new) = (read_model_arrays(m, sizes(night)) for m in (before, after))
+    assert (new.view != NIGHT).sum() == (old.view != NIGHT).sum()
+    own = np.flatnonzero(new.view == NIGHT)
+    assert len(own) > 100 and len(np.unique(new.point[own])) == len(own)
+    off = views[NIGHT].project(new.points[new.point[own]])[0] - new.xy[own]
+    assert np.abs(np.median(off, axis=0)).max() < 0.25
+
+
+def test_a_view_of_something_else_stays_as_it_was(rendered):
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    before = lost_view(elsewhere)
+    after, (placed,) = place(before, elsewhere)
+    assert placed.octave_px is None and placed.error_px is None and placed.candidates > 100
+    assert after is before
+
+
+@pytest.mark.parametrize(("seen", "stays"), [(30, True), (29, False), (0, False)])
+def test_a_view_that_neither_alignment_nor_observations_hold_is_taken_out(rendered, seen, stays):
+    """A photo of another place, among photos that look a little like it."""
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    before = lost_view(elsewhere, seen=seen)
+    model, placed = place(before, elsewhere)
+    after, (told,) = take_out(model, placed, sizes(elsewhere))
+    assert registered(after) == registered(before) - (set() if stays else {NIGHT_NAME})
+    assert told.held == (None if stays else seen)
+    if stays:
+        assert after is before
+        return
+    (views, tracks), (old_views, old) = (
+        read_model_arrays(m, sizes(elsewhere)) for m in (after, before)
+    )
+    for k, view in enumerate(views):  # of the others nothing changes
+        j = [v.name for v in old_views].index(view.name)
+        np.testing.assert_allclose(view.centre, old_views[j].centre, **tolerances.UNIT)
+        theirs = old.xy[old.view == j]
+        assert len(theirs) - seen <= (tracks.view == k).sum() <= len(theirs)
+
+
+def test_a_view_that_alignment_confirms_stays_however_little_held_it(rendered):
+    night = by_night(rendered)
+    model, placed = place(lost_view(night, seen=10), night)
+    after, (told,) = take_out(model, placed, sizes(night))
+    assert told.octave_px is not None and told.held is None and after is model
+
+
+def test_two_views_are_a_model_whatever_holds_them(rendered):
+    model = lost_view(rendered, seen=0)
+    weak = [
+        Placed(name=n, registered=True, octave_px=None, candidates=9, agreed=0, error_px=None)
+        for n in sorted(registered(model))
+    ]
+    few = read_model_arrays(model, sizes(rendered))
+    bare = build_model(model, few[0], few[1]._replace(points=np.zeros((0, 3))))
+    assert take_out(bare, weak, sizes(rendered)) == (bare, weak)
+
+
+def test_refinement_takes_a_photo_of_another_place_out_of_the_model(rendered):
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    after, figures = refine(lost_view(elsewhere, seen=12), elsewhere)
+    assert NIGHT_NAME not in registered(after) and after.num_reg_images() == 4
+    (told,) = figures.placed
+    assert told.held is not None and told.held <= 12
+    kept, _ = refine(lost_view(elsewhere, seen=12), elsewhere, weak_octaves=0)
+    assert NIGHT_NAME in registered(kept)  # where nobody looks, nobody refutes
+
+
+def test_a_model_of_weak_views_alone_stays_as_it_was(rendered):
+    before = lost_view(rendered)
+    after, placed = place_weak_views(
+        before,
+        list(rendered.images),
+        read_of(rendered),
+        sizes(rendered),
+        config=Refinement(),
+        refine_intrinsics=False,
+        evidence=NO_EVIDENCE,
+    )
+    assert after is before and all(p.octave_px is None and not p.candidates for p in placed)
+
+
+def without(visible: np.ndarray, view: int) -> np.ndarray:
+    """The same, but that view sees nothing."""
+    return visible & (np.arange(visible.shape[1]) != view)
+
+
+def without_night(scene: Room) -> pycolmap.Reconstruction:
+    """The exact model of the other views."""
+    use = without(scene.visible, NIGHT)
+    views = [view for k, view in enumerate(scene.views) if k != NIGHT]
+    tracks = exact_tracks(scene, use=use)
+    return build_model(
+        template(scene), views, tracks._replace(view=tracks.view - (tracks.view > NIGHT))
+    )
+
+
+def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
+    """With every other view so many matches, keypoints 3 px off at night."""
+    rng = np.random.default_rng(0)
+    results = {}
+    for k, view in enumerate(scene.views):
+        if k == NIGHT:
+            continue
+        both = np.flatnonzero(scene.visible[:, k] & scene.visible[:, NIGHT])
+        points = scene.points[rng.permutation(both)[: right + wrong]]
+        day = view.project(points)[0]
+        night = scene.views[NIGHT].project(points)[0] + rng.normal(0, 3, day.shape)
+        night[right:] = rng.uniform((0, 0), SIZE, night[right:].shape)
+        pair = make_pair(view.name, NIGHT_NAME)
+        sides = (day, night) if pair[0] == view.name else (night, day)
+        n = len(points)
+        results[pair] = PairResult(
+            pair=pair,
+            cells=np.zeros((n, 2), np.int32),
+            keypoints0=sides[0].astype(np.float32),
+            keypoints1=sides[1].astype(np.float32),
+            plane=np.zeros(n, np.int32),
+            homographies=np.eye(3)[None],
+            num_tentative=n,
+            num_dropped=0,
+            status=Status.VERIFIED,
+        )
+    return Evidence(results, [LeftOut(NIGHT_NAME, NIGHT + 1, camera())], 0)
+
+
+def test_an_image_that_was_left_out_is_registered_from_a_few_right_matches(rendered):
+    night = by_night(rendered)
+    before = without_night(night)
+    evidence = night_matches(night, right=6, wrong=18)
+    after, (placed,) = place(before, night, weak=(), evidence=evidence)
+    assert not placed.registered and placed.octave_px is not None
+    assert after.num_reg_images() == 5 and before.num_reg_images() == 4
+    position, rotation = night_error(after, night)
+    assert position < 0.01 and rotation < 0.15
+    assert after.image(NIGHT + 1).num_points3D > 50
+    without = evidence._replace(matches={})
+    assert place(before, night, weak=(), evidence=without)[1][0].octave_px is None
+
+
+def test_a_photo_that_went_away_is_not_missed(rendered):
+    """Left out and unreadable: the refinement goes on without it."""
+
+    def read(name):
+        if name == NIGHT_NAME:
+            raise ImageError(f"{name}: cannot be read")
+        return read_of(rendered)(name)
+
+    model = noisy_model(rendered, 0.5, use=without(rendered.visible, NIGHT))
+    model.deregister_frame(model.image(NIGHT + 1).frame_id)
+    evidence = night_matches(rendered, right=20, wrong=0)
+    after, figures = refine_model(
+        model, read, config=Refinement(), refine_intrinsics=False, evidence=evidence
+    )
+    assert after.num_reg_images() == 4 and figures.placed == []
+    assert [p.accepted for p in figures.passes] == [True, True]
+
+
+def test_an_image_of_something_else_is_not_registered(rendered):
+    elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
+    before = without_night(elsewhere)
+    for right in (0, 40):  # even where matches give a pose: nothing agrees there
+        evidence = night_matches(elsewhere, right=right, wrong=20)
+        after, (placed,) = place(before, elsewhere, weak=(), evidence=evidence)
+        assert placed.octave_px is None and after is before
+
+
+def test_matches_bring_a_lost_view_back(rendered):
+    """From where alignment alone does not find home."""
+    night = by_night(rendered)
+    before = lost_view(night, turn_deg=15.0, shift=0.3)
+    assert place(before, night)[1][0].octave_px is None
+    after, (placed,) = place(
+        before, night, evidence=night_matches(night, right=20, wrong=20)._replace(left_out=())
+    )
+    assert placed.registered and night_error(after, night)[0] < 0.01
+
+
+@pytest.mark.parametrize(("own", "refined"), [(True, True), (False, False)])
+def test_only_a_camera_of_its_own_gets_another_focal_length(rendered, own, refined):
+    night = by_night(rendered)
+    before = lost_view(night, turn_deg=0.0)
+    right = before.camera(1).focal_length_x
+    if own:
+        alone = pycolmap.Camera(before.camera(1).todict())
+        alone.camera_id = 2
+        alone.focal_length_x = alone.focal_length_y = 1.03 * right
+        views, tracks = read_model_arrays(before, sizes(night))
+        views[NIGHT] = dataclasses.replace(views[NIGHT], camera=alone)
+        before = build_model(before, views, tracks)
+    after, (placed,) = place(before, night, refine_intrinsics=True)
+    assert placed.octave_px is not None
+    found = after.image(NIGHT + 1).camera
+    if refined:
+        assert abs(found.focal_length_x / right - 1) < 0.01
+    else:
+        assert found.focal_length_x == right
+
+
+def test_targets_are_a_part_of_all_views(rendered):
+    """Aligning to some views gives what aligning to all gives there, to the last bit."""
+    tracks, config = exact_tracks(rendered), Refinement()
+    arguments = (tracks, rendered.views, read_of(rendered), config, config.max_shift_px)
+    (every,) = align_blocks(*arguments)
+    (some,) = align_blocks(*arguments, targets=[1, 3])
+    mine = np.isin(every.found.view, [1, 3])
+    for field in ("point", "view", "start", "affine"):
+        np.testing.assert_array_equal(
+            getattr(some.found, field), getattr(every.found, field)[mine], field
+        )
+    np.testing.assert_array_equal(some.moved, every.moved[mine])
+    np.testing.assert_array_equal(some.agrees, every.agrees[mine])
+
+
+def test_only_points_that_a_target_may_show_are_looked_at(rendered):
+    """A view that looks aside: what it shows is the same, the rest of the model costs nothing."""
+    tracks, config, views = exact_tracks(rendered), Refinement(), list(rendered.views)
+
+    def turned(degrees: float) -> View:
+        turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+        return dataclasses.replace(views[1], rotation=turn @ views[1].rotation)
+
+    def aligned(view: View, targets):
+        some = [*views, dataclasses.replace(view, image_id=99)]
+        read = read_of(rendered)
+        return list(align_blocks(tracks, some, read, config, config.max_shift_px, targets=targets))
+
+    (every,) = aligned(turned(35), None)
+    (some,) = aligned(turned(35), [len(views)])
+    assert 0 < len(some.rows) < 0.8 * len(every.rows)
+    mine = every.found.view == len(views)
+    assert mine.any()
+    np.testing.assert_array_equal(some.rows[some.found.point], every.rows[every.found.point][mine])
+    np.testing.assert_array_equal(some.moved, every.moved[mine])
+    assert aligned(turned(180), [len(views)]) == []
+    behind = Followed(view=turned(180), own_camera=False)
+    follow([behind], views, tracks, read_of(rendered), config)
+    assert behind.best is None and behind.agreed == 0
+
+
+def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendered):
+    before = without_night(rendered)
+    evidence = night_matches(rendered, right=30, wrong=0)
+    assert {pair[0] == NIGHT_NAME for pair in evidence.matches} == {True, False}
+    views, tracks = read_model_arrays(before, sizes(rendered))
+    normal = plane_geometry.normals(tracks, views, neighbours=16)
+    xy, points = weak_views.matched_points(
+        rendered.views[NIGHT], views, tracks, normal, evidence.matches
+    )
+    off = np.linalg.norm(rendered.views[NIGHT].project(points)[0] - xy, axis=1)
+    assert len(off) > 60 and np.median(off) < 6 and np.quantile(off, 0.9) < 12
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_shared_camera_is_no_views_own(monkeypatch, rendered, own):
+    before = lost_view(rendered)
+    if own:
+        alone = pycolmap.Camera(before.camera(1).todict())
+        alone.camera_id = 2
+        views, tracks = read_model_arrays(before, sizes(rendered))
+        views[NIGHT] = dataclasses.replace(views[NIGHT], camera=alone)
+        before = build_model(before, views, tracks)
+    followed = []
+    monkeypatch.setattr(weak_views, "follow", lambda poses, *_: followed.extend(poses))
+    place(before, rendered, refine_intrinsics=True)
+    assert [pose.own_camera for pose in followed] == [own]
+    place(before, rendered, refine_intrinsics=False)
+    assert not followed[-1].own_camera
