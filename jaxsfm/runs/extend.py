@@ -22,6 +22,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, make_pair
+from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
 from jaxsfm.io.work_folder import RECORD, WorkFolder, locked, locked_folder
@@ -41,8 +42,6 @@ from jaxsfm.runs.finished_model import (
 )
 from jaxsfm.runs.localize import LocalizeOptions
 from jaxsfm.runs.run_options import RunOptions
-from jaxsfm.sfm.reconstruction import pixel_scale
-from jaxsfm.sfm.refine.image_readers import gray_reader, rgb_reader
 from jaxsfm.sfm.register.grow import Grown, Newcomer, grow
 
 if TYPE_CHECKING:
@@ -164,7 +163,7 @@ def _extended(
         matches,
         seed=model.seed,
         threads=kept.report["options"]["threads"],
-        scale=pixel_scale(list(files.values()), config=config),
+        scale=Photos(files.values(), config).median_scale(),
     )
     newcomers = {
         name: Newcomer(
@@ -190,7 +189,7 @@ def _extended(
             model.tracks,
             newcomers,
             matches,
-            gray_reader(files, config),
+            Photos(files.values(), config).gray,
             refinement=config.refinement,
             seed=model.seed,
             on_view=on_view,
@@ -212,5 +211,5 @@ def _models(
     models = read_models(home / "sparse", database)
     if grown.placed:
         models[0] = build_model(models[0], grown.views, grown.tracks)
-        colour_points(models[0], rgb_reader(files, model.config))
+        colour_points(models[0], Photos(files.values(), model.config).rgb)
     return models

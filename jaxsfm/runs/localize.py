@@ -27,6 +27,7 @@ from jaxsfm.io.images import (
     inspect_image,
 )
 from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import Execution
@@ -46,7 +47,6 @@ from jaxsfm.runs.finished_model import (
     view_of,
 )
 from jaxsfm.runs.localize_report import UNUSABLE, error_against, located_figures
-from jaxsfm.sfm.refine.image_readers import ReadGray, gray_reader
 from jaxsfm.sfm.register.locate_view import Located, locate
 
 
@@ -85,7 +85,7 @@ def locate_photo(
     model: KnownModel,
     shortlist: Sequence[str],
     matches: Mapping[Pair, PairResult],
-    read: ReadGray,
+    read: Reader,
 ) -> Located:
     """The pose of a photo from its matches with the shortlisted photos of a model."""
     views, tracks, _ = part_of(model.views, model.tracks, shortlist)
@@ -181,7 +181,7 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
     with _features(kept, weights, files, options) as load:
         todo = {path: usable[path] for path in shortlists}
-        read = gray_reader(files | {image.name: image for image in todo.values()}, model.config)
+        read = Photos([*files.values(), *todo.values()], model.config).gray
         each = tqdm(todo.items(), desc="localizing", unit="photo", disable=not options.progress)
         for path, image in each:
             row: dict[str, Any] = {

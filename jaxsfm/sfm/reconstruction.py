@@ -13,14 +13,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from jaxsfm.config import Config, Refinement
-from jaxsfm.io.images import ImageError, ImageFile, working_size
+from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
-from jaxsfm.sfm.refine.image_readers import ReadGray, gray_reader, rgb_reader
 from jaxsfm.sfm.stages import InScratch, Kept, made
 from jaxsfm.sfm.view_graph import Verdict, trusted_pairs
 
@@ -54,13 +52,6 @@ class Reconstructed:
     """Per model; None where it was not refined."""
 
 
-def pixel_scale(images: list[ImageFile], *, config: Config) -> float:
-    """Median of original pixels per working pixel: localisation errors grow with it."""
-    working = [working_size(image.size, config.max_size, config.enlarge) for image in images]
-    ratios = [max(i.size) / max(size) for i, size in zip(images, working, strict=True)]
-    return float(np.median(ratios))
-
-
 def reconstruct(
     images: list[ImageFile],
     matches: Mapping[Pair, PairResult],
@@ -76,7 +67,7 @@ def reconstruct(
 ) -> Reconstructed:
     """COLMAP models from verified matches: view graph, mapping, refinement.
 
-    Pixel thresholds are multiplied by `pixel_scale`; points get the photos' colours.
+    Pixel thresholds are multiplied by `Photos.median_scale`; points get the photos' colours.
 
     Args:
       matches: as from `match`.
@@ -96,7 +87,8 @@ def reconstruct(
 
     if options is None:
         options = mapping.MapOptions(refine_intrinsics=intrinsics is None)
-    options = dataclasses.replace(options, scale=pixel_scale(images, config=config))
+    photos = Photos(images, config)
+    options = dataclasses.replace(options, scale=photos.median_scale())
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in images})
 
@@ -113,7 +105,7 @@ def reconstruct(
 
     def refine(folder: Path) -> None:
         models = colmap_models.read_models(mapped / SPARSE, checked / DATABASE)
-        models, figures = _refined(models, images, checked, config, options, matches, on_pass)
+        models, figures = _refined(models, photos, checked, config, options, matches, on_pass)
         colmap_models.write_models(models, folder / SPARSE)
         _write_json(folder, [each and dataclasses.asdict(each) for each in figures])
 
@@ -208,7 +200,7 @@ def _verify(
 
 def _refined(
     models: "list[pycolmap.Reconstruction]",
-    images: list[ImageFile],
+    photos: Photos,
     checked: Path,
     config: Config,
     options: "MapOptions",
@@ -219,22 +211,20 @@ def _refined(
     from jaxsfm.colmap import database as colmap
     from jaxsfm.colmap.models import colour_points
 
-    by_name = {image.name: image for image in images}
     figures: list[RefinementFigures | None] = [None] * len(models)
     if config.refinement is not None:
         cameras = colmap.read_images(checked / DATABASE)
-        read_gray = gray_reader(by_name, config)
         models, figures = _refine(
-            models, read_gray, config.refinement, options, matches, cameras, on_pass
+            models, photos.gray, config.refinement, options, matches, cameras, on_pass
         )
     for model in models:
-        colour_points(model, rgb_reader(by_name, config))
+        colour_points(model, photos.rgb)
     return models, figures
 
 
 def _refine(
     models: "list[pycolmap.Reconstruction]",
-    read_gray: ReadGray,
+    read_gray: Reader,
     config: Refinement,
     options: "MapOptions",
     matches: Mapping[Pair, PairResult],

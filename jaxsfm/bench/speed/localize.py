@@ -27,14 +27,13 @@ from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.io.atomic import read_json, write_atomic
 from jaxsfm.io.images import ImageFile
+from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import KeptRun, read_run
 from jaxsfm.runs.finished_model import choose_camera, known_model
 from jaxsfm.runs.localize import locate_photo
 from jaxsfm.runs.localize_report import error_against, located_figures
-from jaxsfm.sfm.reconstruction import pixel_scale
-from jaxsfm.sfm.refine.image_readers import gray_reader
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.view_graph import trusted_pairs
 
@@ -75,7 +74,7 @@ def map_options(run: KeptRun, files: dict[str, ImageFile]) -> MapOptions:
         refine_intrinsics=options["intrinsics"] is None if refines == "auto" else refines == "yes",
         seed=options["seed"],
         threads=options["threads"],
-        scale=pixel_scale(list(files.values()), config=run.config),
+        scale=Photos(files.values(), run.config).median_scale(),
     )
 
 
@@ -97,7 +96,7 @@ def without(
     if refined and run.config.refinement:
         models[0], _ = refine_model(
             models[0],
-            gray_reader(files, run.config),
+            Photos(files.values(), run.config).gray,
             config=run.config.refinement,
             refine_intrinsics=options.refine_intrinsics,
             threads=options.threads,
@@ -117,7 +116,9 @@ def localized(run: KeptRun, name: str, files: dict[str, ImageFile], folder: Path
     pairs = [pair for pair in pairs if set(pair) - {name} <= set(names)]
     matches = SavedMatches(run.matches, pairs)
     start = time.monotonic()
-    found = locate_photo(image, chosen, model, names, matches, gray_reader(files, run.config))
+    found = locate_photo(
+        image, chosen, model, names, matches, Photos(files.values(), run.config).gray
+    )
     row = located_figures(found, chosen.source, matches)
     row |= {"photo": name, "seconds": time.monotonic() - start, "registered": len(names)}
     if found.view is not None and run.reference is not None:

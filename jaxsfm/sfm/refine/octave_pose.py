@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from jaxsfm.colmap.model_arrays import Tracks, View
 from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.refine.image_readers import ReadGray, block_means
+from jaxsfm.io.photos import Reader
+from jaxsfm.sfm.refine.padding import block_means
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
 MIN_COUNT = 30
@@ -100,8 +101,8 @@ def trusted(pose: Followed) -> Pose | None:
 
 
 def at_octave(
-    octave_px: int, views: Sequence[View], tracks: Tracks, read: ReadGray
-) -> tuple[list[View], Tracks, ReadGray]:
+    octave_px: int, views: Sequence[View], tracks: Tracks, read: Reader
+) -> tuple[list[View], Tracks, Reader]:
     """The same views, observations and images in pixels that are `octave_px` times as large."""
 
     def reduced(name: str) -> tuple[np.ndarray, tuple[float, float]]:
@@ -120,7 +121,7 @@ def at_octave(
 
 
 def _observe(
-    views: list[View], tracks: Tracks, read: ReadGray, targets: Sequence[int], config: Refinement
+    views: list[View], tracks: Tracks, read: Reader, targets: Sequence[int], config: Refinement
 ) -> list[Observed]:
     """Where each of the target views shows the points of `tracks`, which has no observations of
     them."""
@@ -259,7 +260,7 @@ def follow(
     poses: Sequence[Followed],
     views: Sequence[View],
     structure: Tracks,
-    read: ReadGray,
+    read: Reader,
     config: Refinement,
 ) -> None:
     """Follow all poses over all octaves, in place; those that end in doubt once more.
@@ -281,7 +282,7 @@ def _descend(
     poses: Sequence[Followed],
     views: Sequence[View],
     structure: Tracks,
-    read: ReadGray,
+    read: Reader,
     config: Refinement,
 ) -> None:
     """From the coarsest octave to the finest, in place; at each until it stands still."""

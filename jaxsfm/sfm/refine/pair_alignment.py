@@ -15,7 +15,8 @@ from jaxsfm.config import Config, Refinement
 from jaxsfm.core import align as align_core
 from jaxsfm.io.images import ImageFile, read_image
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.refine.image_readers import block_means, chunks, gray, padded
+from jaxsfm.io.photos import intensities
+from jaxsfm.sfm.refine.padding import block_means, chunks, padded
 
 RADIUS, ITERATIONS = Refinement.radius, Refinement.iterations
 """Of the patch, pixels of the octave, and Gauss-Newton steps; these and the limits are those of the
@@ -146,8 +147,8 @@ def align(
     )
     return align_matches(
         result,
-        gray(first.rgb),
-        gray(second.rgb),
+        intensities(first.rgb),
+        intensities(second.rgb),
         first.scale,
         second.scale,
         octaves=config.aligned_octaves,

@@ -27,7 +27,7 @@ from jaxsfm.colmap.model_arrays import (
 )
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
-from jaxsfm.sfm.refine.image_readers import ReadGray
+from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
 from jaxsfm.sfm.refine.weak_views import NO_EVIDENCE, Evidence, Placed, place_weak_views, take_out
 
@@ -103,14 +103,14 @@ def _gather(
     return Tracks(points, point[order], view[order], xy[order]), weak
 
 
-def _size(read: ReadGray, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
+def _size(read: Reader, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
     gray, scale = read(name)
     return (gray.shape[1], gray.shape[0]), scale
 
 
 def refine_model(
     model: "pycolmap.Reconstruction",
-    read: ReadGray,
+    read: Reader,
     *,
     config: Refinement,
     refine_intrinsics: bool,

@@ -13,8 +13,9 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from jaxsfm.colmap.model_arrays import Tracks, View
 from jaxsfm.config import Refinement
 from jaxsfm.core import align as align_core
+from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.image_readers import ReadGray, chunks, padded
+from jaxsfm.sfm.refine.padding import chunks, padded
 
 CELLS = 5_000_000
 """Points times views looked at together; about 100 bytes each, and 2.7 kB for each point."""
@@ -50,7 +51,7 @@ def _templates(
     xy: np.ndarray,
     wanted: np.ndarray,
     views: list[View],
-    read: ReadGray,
+    read: Reader,
     patch: align_core.Patch,
 ) -> align_core.Templates:
     """Templates of the wanted points, one view's image in memory at a time."""
@@ -80,7 +81,7 @@ def _align(
     found: plane_geometry.Candidates,
     templates: align_core.Templates,
     views: list[View],
-    read: ReadGray,
+    read: Reader,
     patch: align_core.Patch,
     config: Refinement,
     max_shift_px: float,
@@ -140,7 +141,7 @@ def may_show(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
 def align_blocks(
     tracks: Tracks,
     views: list[View],
-    read: ReadGray,
+    read: Reader,
     config: Refinement,
     max_shift_px: float,
     *,

@@ -16,8 +16,8 @@ from jaxsfm.colmap.model_arrays import Sizes, Tracks, View, build_model, part_of
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.image_readers import ReadGray
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, Followed, Pose, follow, trusted
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def _outside(left_out: Sequence[LeftOut], sizes: Sizes) -> list[View]:
 def place_weak_views(
     model: "pycolmap.Reconstruction",
     weak: Sequence[str],
-    read: ReadGray,
+    read: Reader,
     sizes: Sizes,
     *,
     config: Refinement,

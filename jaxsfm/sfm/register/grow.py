@@ -13,7 +13,7 @@ import numpy as np
 from jaxsfm.colmap.model_arrays import Tracks, View, part_of
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
-from jaxsfm.sfm.refine.image_readers import ReadGray
+from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.register.locate_view import Located, locate
 from jaxsfm.sfm.register.triangulate import new_points
 
@@ -48,7 +48,7 @@ def grow(
     tracks: Tracks,
     newcomers: Mapping[str, Newcomer],
     matches: Mapping[Pair, PairResult],
-    read: ReadGray,
+    read: Reader,
     *,
     refinement: Refinement | None,
     seed: int = 0,

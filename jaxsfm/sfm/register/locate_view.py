@@ -14,8 +14,8 @@ from jaxsfm.colmap.model_arrays import Tracks, View
 from jaxsfm.colmap.resection import MIN_POINTS, find_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.image_readers import ReadGray
 from jaxsfm.sfm.refine.octave_pose import (
     MAX_DOUBT_PX,
     MIN_COUNT,
@@ -69,7 +69,7 @@ def locate(
     views: list[View],
     tracks: Tracks,
     matches: Mapping[Pair, PairResult],
-    read: ReadGray,
+    read: Reader,
     *,
     config: Refinement,
     own_camera: bool,

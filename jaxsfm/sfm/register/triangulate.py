@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from jaxsfm.colmap.model_arrays import Tracks, View, errors_px, select
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.refine.image_readers import ReadGray
+from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
 TAKEN_PX = 4.0
@@ -115,7 +115,7 @@ def new_points(
     tracks: Tracks,
     fresh: Collection[str],
     matches: Mapping[Pair, PairResult],
-    read: ReadGray,
+    read: Reader,
     *,
     refinement: Refinement | None,
 ) -> Tracks:

@@ -1,0 +1,73 @@
+"""The photos of a run and the readers of their pixels at working size."""
+
+import functools
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.io.images import ImageFile, WorkingImage, read_image, working_size
+from jaxsfm.io.pixels import Pixels
+
+Reader = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
+"""A photo's name -> the pixels of its working image, and original pixels per working pixel."""
+GRAYS = 64
+"""Grey images that are kept in memory; one takes 8 MB at 1600 x 1200."""
+LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
+"""The weights of red, green and blue in the intensity of a pixel (ITU-R BT.601)."""
+
+
+def intensities(rgb: np.ndarray) -> np.ndarray:
+    """The intensities float32 (h, w) of an image uint8 (h, w, 3)."""
+    return rgb.astype(np.float32) @ LUMA
+
+
+class Photos(Mapping[str, ImageFile]):
+    """Image files by name, in the given order, and the size at which they are worked on.
+
+    The reading methods raise ImageError if a file cannot be decoded or has changed.
+    """
+
+    def __init__(self, files: Iterable[ImageFile], config: Config) -> None:
+        """Photos whose working size is given by `config.max_size` and `config.enlarge`."""
+        self._files = {file.name: file for file in files}
+        self._config = config
+        # The cache belongs to the object, so that its images go when the object goes.
+        self.gray = functools.lru_cache(maxsize=GRAYS)(self._gray)
+
+    def __getitem__(self, name: str) -> ImageFile:
+        return self._files[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def working_size(self, name: str) -> tuple[int, int]:
+        """(width, height) of the working image."""
+        return working_size(self[name].size, self._config.max_size, self._config.enlarge)
+
+    def pixels(self, name: str) -> Pixels:
+        """How the pixels of the working image lie on those of the photo."""
+        (width, height), (w, h) = self[name].size, self.working_size(name)
+        return Pixels((width / w, height / h))
+
+    def median_scale(self) -> float:
+        """The median over the photos of original pixels per working pixel, on the longer side."""
+        ratios = [max(self[name].size) / max(self.working_size(name)) for name in self]
+        return float(np.median(ratios))
+
+    def read(self, name: str) -> WorkingImage:
+        """The working image."""
+        return read_image(self[name], max_size=self._config.max_size, enlarge=self._config.enlarge)
+
+    def rgb(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        """Colours uint8 (h, w, 3) of the working image; original pixels per working pixel."""
+        working = self.read(name)
+        return working.rgb, working.scale
+
+    def _gray(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        """Intensities float32 (h, w) of the working image; original pixels per working pixel."""
+        rgb, scale = self.rgb(name)
+        return intensities(rgb), scale
