@@ -6,7 +6,7 @@ import numpy as np
 from jaxsfm.config import Config
 from jaxsfm.core.features import extract
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.io.features import padded_size, room_of
+from jaxsfm.io.features import feature_capacity, padded_size
 from jaxsfm.io.images import WorkingImage
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import extraction_settings
@@ -16,7 +16,7 @@ def compute_features(weights: Weights, working: WorkingImage, *, config: Config)
     height, width = working.rgb.shape[:2]
     image = np.zeros((*padded_size((width, height)), 3), np.uint8)
     image[:height, :width] = working.rgb
-    num_coarse = room_of((width, height)).num_coarse
+    num_coarse = feature_capacity((width, height)).num_coarse
     return jax.device_get(
         extract(
             weights.params,

@@ -24,7 +24,7 @@ from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.errors import UserError
-from jaxsfm.io.features import ImageFeatures, image_room
+from jaxsfm.io.features import ImageFeatures, image_capacity
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.io.versions import package_versions
 from jaxsfm.io.weights import chosen_weights
@@ -102,7 +102,9 @@ def _dense_models(
     def features(name: str) -> ImageFeatures:
         return image_features(weights, scene.images[name], config=config)
 
-    rooms = {name: image_room(image, config=config) for name, image in scene.images.items()}
+    capacities = {
+        name: image_capacity(image, config=config) for name, image in scene.images.items()
+    }
     last_use = {
         pair: k
         for k, subset in enumerate(scene.subsets)
@@ -114,7 +116,7 @@ def _dense_models(
     for k, subset in enumerate(scene.subsets):
         pairs = exhaustive_pairs([*subset.day, subset.night])
         missing = [pair for pair in pairs if pair not in results]
-        for result in matched(features, rooms, missing, config=config, seed=seed):
+        for result in matched(features, capacities, missing, config=config, seed=seed):
             results[result.pair] = result
         made = reconstruct(
             [scene.images[name] for name in sorted({*subset.day, subset.night})],

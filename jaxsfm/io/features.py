@@ -34,7 +34,7 @@ _MENU = tuple(1024 * n // 2 for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
 """Coarse capacities: 512 .. 32768, half an octave apart."""
 
 
-class Room(NamedTuple):
+class FeatureCapacity(NamedTuple):
     """What fixes the shapes of a pair's program."""
 
     num_coarse: int
@@ -53,12 +53,12 @@ class ImageFeatures(NamedTuple):
     """numpy arrays."""
 
     @property
-    def room(self) -> Room:
-        """As `room_of` the working image."""
-        return Room(self.dense.coarse[0].shape[0], int(self.dense.coarse_grid[1]))
+    def capacity(self) -> FeatureCapacity:
+        """As `feature_capacity` the working image."""
+        return FeatureCapacity(self.dense.coarse[0].shape[0], int(self.dense.coarse_grid[1]))
 
 
-def capacity(num_coarse: int) -> int:
+def padded_cells(num_coarse: int) -> int:
     """The smallest capacity of the menu that holds `num_coarse` cells (multiples of its largest
     beyond that)."""
     for size in _MENU:
@@ -73,18 +73,18 @@ def padded_size(size: tuple[int, int]) -> tuple[int, int]:
     return -(-height // SIDE_BUCKET) * SIDE_BUCKET, -(-width // SIDE_BUCKET) * SIDE_BUCKET
 
 
-def room_of(size: tuple[int, int]) -> Room:
+def feature_capacity(size: tuple[int, int]) -> FeatureCapacity:
     """For the cells of a working image of (width, height)."""
     width, height = size
     # 4 cells of pool3 to one of pool4, and the odd last row and column.
     odd = height // 8 * (width // 8) - 4 * (height // 16) * (width // 16)
     cells = height // 16 * (width // 16) + -(-odd // 4)
-    return Room(capacity(cells), width // 16)
+    return FeatureCapacity(padded_cells(cells), width // 16)
 
 
-def image_room(image: ImageFile, *, config: Config) -> Room:
+def image_capacity(image: ImageFile, *, config: Config) -> FeatureCapacity:
     """The room of an image's features, known before it is decoded."""
-    return room_of(working_size(image.size, config.max_size, config.enlarge))
+    return feature_capacity(working_size(image.size, config.max_size, config.enlarge))
 
 
 def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:

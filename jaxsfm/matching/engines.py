@@ -5,7 +5,7 @@ from typing import Protocol
 
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
-from jaxsfm.io.features import ImageFeatures, Room
+from jaxsfm.io.features import FeatureCapacity, ImageFeatures
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.weights import Weights
@@ -31,7 +31,7 @@ class Engine(Protocol):
     def matched(
         self,
         load: Callable[[str], ImageFeatures],
-        rooms: Mapping[str, Room],
+        capacities: Mapping[str, FeatureCapacity],
         pairs: Iterable[tuple[str, str]],
         *,
         config: Config,

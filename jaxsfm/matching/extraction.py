@@ -16,7 +16,7 @@ from jaxsfm.config import Config
 from jaxsfm.core.features import Extraction
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.io.features import ImageFeatures, check_memory, padded_size, room_of
+from jaxsfm.io.features import ImageFeatures, check_memory, feature_capacity, padded_size
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import SINGLE, Execution, chosen_devices, images_at_once, one_ahead
@@ -68,7 +68,7 @@ def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Ex
 
 def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
     """Padded size and capacity of a working image of (width, height): they fix the program."""
-    return padded_size(size), room_of(size).num_coarse
+    return padded_size(size), feature_capacity(size).num_coarse
 
 
 def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:

@@ -21,7 +21,7 @@ from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 from jaxsfm.core.vocabulary import Vocabulary, fit_vocabulary
 from jaxsfm.io import interrupt
 from jaxsfm.io.converted import read_extras
-from jaxsfm.io.features import capacity, padded_size
+from jaxsfm.io.features import padded_cells, padded_size
 from jaxsfm.io.images import ImageError, ImageFile, read_image
 from jaxsfm.io.store import Store, digest
 from jaxsfm.io.weights import Weights
@@ -181,8 +181,8 @@ def _side(image: ImageFile, least: int = SIDE) -> int:
 
 
 def _padded(rows: np.ndarray) -> np.ndarray:
-    """float32, with zero rows up to a capacity, so that few programs are compiled."""
-    full = np.zeros((capacity(len(rows)), rows.shape[1]), np.float32)
+    """float32, with zero rows up to `padded_cells`, so that few programs are compiled."""
+    full = np.zeros((padded_cells(len(rows)), rows.shape[1]), np.float32)
     full[: len(rows)] = rows
     return full
 

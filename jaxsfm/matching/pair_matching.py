@@ -17,7 +17,7 @@ from jaxsfm.config import Config, PairShape
 from jaxsfm.core.grid import rescale
 from jaxsfm.core.sharded import match_batch, pick
 from jaxsfm.core.types import JoinedFeatures, PairMatches, Status, Thresholds
-from jaxsfm.io.features import ImageFeatures, Room
+from jaxsfm.io.features import FeatureCapacity, ImageFeatures
 from jaxsfm.io.pairs import PairResult, make_pair
 from jaxsfm.matching.device_cache import OnDevice, Resident, by_tiles, join
 from jaxsfm.matching.execution import (
@@ -37,13 +37,13 @@ def match_features(
 ) -> PairResult:
     """Verified matches of two images, in the order given."""
     both = {0: features0, 1: features1}
-    rooms = {side: features.room for side, features in both.items()}
-    return next(_matched(both.__getitem__, rooms, [(0, 1)], config, seed, SINGLE))
+    capacities = {side: features.capacity for side, features in both.items()}
+    return next(_matched(both.__getitem__, capacities, [(0, 1)], config, seed, SINGLE))
 
 
 def matched(
     load: Callable[[str], ImageFeatures],
-    rooms: Mapping[str, Room],
+    capacities: Mapping[str, FeatureCapacity],
     pairs: Iterable[tuple[str, str]],
     *,
     config: Config,
@@ -58,10 +58,10 @@ def matched(
 
     Args:
       load: an image's features by its name; asked again when they have left the device.
-      rooms: of all images.
+      capacities: the feature capacity of every image.
     """
     named = [make_pair(a, b) for a, b in pairs]
-    return _matched(load, rooms, named, config, seed, execution or Execution())
+    return _matched(load, capacities, named, config, seed, execution or Execution())
 
 
 def thresholds(config: Config) -> Thresholds:
@@ -81,11 +81,11 @@ class _Program(NamedTuple):
     shape: PairShape
 
 
-def _program(room0: Room, room1: Room, config: Config) -> _Program:
-    shape, widest = config.pair, max(room0.columns, room1.columns)
+def _program(capacity0: FeatureCapacity, capacity1: FeatureCapacity, config: Config) -> _Program:
+    shape, widest = config.pair, max(capacity0.columns, capacity1.columns)
     if shape.consensus and widest > shape.coarse_columns:
         shape = dataclasses.replace(shape, coarse_columns=-(-widest // 64) * 64)
-    return _Program(max(room0.num_coarse, room1.num_coarse), shape)
+    return _Program(max(capacity0.num_coarse, capacity1.num_coarse), shape)
 
 
 class _Started(NamedTuple):
@@ -97,7 +97,7 @@ class _Started(NamedTuple):
 
 def _matched(
     load: Callable[[Name], ImageFeatures],
-    rooms: Mapping[Name, Room],
+    capacities: Mapping[Name, FeatureCapacity],
     pairs: Sequence[tuple[Name, Name]],
     config: Config,
     seed: int,
@@ -106,7 +106,7 @@ def _matched(
     mesh, root = chosen_devices(execution), jax.random.key(seed)
     programs: dict[_Program, list[tuple[Name, Name]]] = {}
     for a, b in pairs:
-        programs.setdefault(_program(rooms[a], rooms[b], config), []).append((a, b))
+        programs.setdefault(_program(capacities[a], capacities[b], config), []).append((a, b))
 
     def batches() -> Iterator[_Batch]:
         for program, some in programs.items():

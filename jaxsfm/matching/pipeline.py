@@ -68,8 +68,8 @@ def match(
 
     A pair's result depends on the two images, the config and the seed; not on other pairs.
     """
-    rooms = {name: each.room for name, each in features.items()}
+    capacities = {name: each.capacity for name, each in features.items()}
     results = matched(
-        features.__getitem__, rooms, pairs, config=config, seed=seed, execution=execution
+        features.__getitem__, capacities, pairs, config=config, seed=seed, execution=execution
     )
     return {result.pair: result for result in results}

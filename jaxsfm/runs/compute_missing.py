@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from jaxsfm.config import Config
 from jaxsfm.io import interrupt
-from jaxsfm.io.features import ImageFeatures, image_room
+from jaxsfm.io.features import ImageFeatures, image_capacity
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.weights import Weights
@@ -61,9 +61,9 @@ def match_missing(
             folder.save_features(found)
         return found
 
-    rooms = {name: image_room(image, config=config) for name, image in images.items()}
+    capacities = {name: image_capacity(image, config=config) for name, image in images.items()}
     stream = chosen_engine(options.engine).matched(
-        load, rooms, pairs, config=config, seed=options.seed, execution=options.execution
+        load, capacities, pairs, config=config, seed=options.seed, execution=options.execution
     )
     for result in _bar(stream, len(pairs), "matching", "pair", options):
         folder.save_matches(result)

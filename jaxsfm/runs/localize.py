@@ -19,7 +19,7 @@ from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.model_arrays import part_of
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
-from jaxsfm.io.features import ImageFeatures, room_of
+from jaxsfm.io.features import ImageFeatures, feature_capacity
 from jaxsfm.io.images import (
     ImageError,
     ImageFile,
@@ -222,10 +222,12 @@ def _matches(
         return own if name == image.name else load(name)
 
     sizes = {view.name: view.size for view in model.views}
-    rooms = {name: room_of(sizes[name]) for name in shortlist} | {image.name: own.room}
+    capacities = {name: feature_capacity(sizes[name]) for name in shortlist} | {
+        image.name: own.capacity
+    }
     results = matched(
         either,
-        rooms,
+        capacities,
         [(image.name, name) for name in shortlist],
         config=model.config,
         seed=model.seed,

@@ -18,7 +18,7 @@ from jaxsfm.core import pair
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pairs, pair_key
 from jaxsfm.core.types import Status, Thresholds
-from jaxsfm.io.features import ImageFeatures, capacity, pad_features
+from jaxsfm.io.features import ImageFeatures, pad_features, padded_cells
 from jaxsfm.io.images import ImageFile, WorkingImage
 from jaxsfm.matching.pair_matching import match_features
 
@@ -210,6 +210,6 @@ def test_grid_keypoints_are_the_cells_centres(weights, warped):
 
 
 def test_capacities_hold_what_they_must_and_are_few():
-    sizes = {capacity(n) for n in range(1, 7501)}
+    sizes = {padded_cells(n) for n in range(1, 7501)}
     assert len(sizes) <= 8
-    assert all(capacity(n) >= n for n in range(1, 70_000, 997))
+    assert all(padded_cells(n) >= n for n in range(1, 70_000, 997))

@@ -133,7 +133,11 @@ def arrays(rng, folder) -> str:
     if found is None:
         return "none"
     if what == "features":
-        assert found.room.num_coarse == len(found.dense.coarse[0]) >= found.dense.coarse_grid.prod()
+        assert (
+            found.capacity.num_coarse
+            == len(found.dense.coarse[0])
+            >= found.dense.coarse_grid.prod()
+        )
         assert np.isfinite(found.dense.keypoints).all()
     else:
         names = dict(zip(PAIR, FILES, strict=True))

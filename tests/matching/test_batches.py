@@ -21,7 +21,7 @@ from jaxsfm.core.features import stored
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.sharded import device_mesh
 from jaxsfm.errors import UserError
-from jaxsfm.io.features import room_of
+from jaxsfm.io.features import feature_capacity
 from jaxsfm.io.images import ImageError, read_image
 from jaxsfm.matching import execution
 from jaxsfm.matching.device_cache import Resident, by_tiles
@@ -141,7 +141,7 @@ def test_features_are_the_programs_rounded_once(weights, images):
     ):
         np.testing.assert_array_equal(one, other)
     assert found.dense.coarse[0].dtype == np.float16
-    assert found.room == room_of(image.size)
+    assert found.capacity == feature_capacity(image.size)
 
 
 def test_a_photo_that_went_away_is_told_and_the_others_are_there(weights, images, tmp_path):
@@ -207,10 +207,10 @@ def test_memory_is_what_the_formula_says(features):
     (one, *_) = features.values()
     joined = jax.jit(join_octaves)(one.dense)
     size = sum(x.nbytes for x in jax.tree.leaves(joined))
-    assert execution.joined_bytes(one.room.num_coarse, octaves=4) == size
+    assert execution.joined_bytes(one.capacity.num_coarse, octaves=4) == size
     for budget, most in ((10.5 * size, 10), (size, 2)):
         chosen = Execution(memory_gb=budget / 1e9)
-        found = execution.resident_images(chosen, MESH, one.room.num_coarse, config=config)
+        found = execution.resident_images(chosen, MESH, one.capacity.num_coarse, config=config)
         assert found == most
 
 

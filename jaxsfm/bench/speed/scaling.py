@@ -45,13 +45,13 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
         return
     config = dataclasses.replace(preset("default"), max_size=SMALL)
     features = jaxsfm.extract(load_weights(), photos, config=config)
-    rooms = {name: each.room for name, each in features.items()}
+    capacities = {name: each.capacity for name, each in features.items()}
     names = [str(name) for name in np.random.default_rng(0).permutation(sorted(features))]
 
     def per_pair(some: list[str]) -> float:
         pairs = list(itertools.combinations(some, 2))
         start = time.perf_counter()
-        for _ in matched(features.__getitem__, rooms, pairs, config=config):
+        for _ in matched(features.__getitem__, capacities, pairs, config=config):
             pass
         return (time.perf_counter() - start) / len(pairs)
 

@@ -17,7 +17,7 @@ import jax
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jaxsfm.config import Config
-from jaxsfm.io.features import ImageFeatures, Room
+from jaxsfm.io.features import FeatureCapacity, ImageFeatures
 from jaxsfm.io.images import ImageError, ImageFile, image_bytes, working_size
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.weights import Weights
@@ -75,7 +75,7 @@ class RayEngine:
     def matched(
         self,
         load: Callable[[str], ImageFeatures],
-        rooms: Mapping[str, Room],
+        capacities: Mapping[str, FeatureCapacity],
         pairs: Iterable[tuple[str, str]],
         *,
         config: Config,
@@ -90,7 +90,7 @@ class RayEngine:
         named = [make_pair(a, b) for a, b in pairs]
         if not named:
             return
-        work = Matching(dict(rooms), config, seed, execution or Execution())
+        work = Matching(dict(capacities), config, seed, execution or Execution())
         with crew(work, address=self.address, workers=self.workers) as workers:
             blocks = cut_pairs(named, _size(len(named), len(workers), TILE * TILE))
             touched = [_images(block) for block in blocks]
@@ -175,7 +175,7 @@ class Extracting:
 class Matching:
     """What a worker does with pairs."""
 
-    rooms: Mapping[str, Room]
+    capacities: Mapping[str, FeatureCapacity]
     config: Config
     seed: int
     execution: Execution
@@ -186,7 +186,7 @@ class Matching:
         """Verified matches of pairs."""
         stream = matched(
             features.__getitem__,
-            self.rooms,
+            self.capacities,
             pairs,
             config=self.config,
             seed=self.seed,
