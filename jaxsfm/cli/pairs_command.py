@@ -37,22 +37,22 @@ def pairs(
     from tqdm import tqdm
 
     from jaxsfm.io.atomic import write_atomic
-    from jaxsfm.io.pair_selection import planned_pairs, read_plan
+    from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.pipeline import open_images
     from jaxsfm.matching.retrieval import described_alone, nearest_pairs
 
-    plan = read_plan(pairs)
+    selection = parse_pair_selection(pairs)
     usable, skipped = open_images(images, progress=True)
     names = [image.name for image in usable]
     if len(names) < 2:
         raise UserError(f"{images}: {len(names)} usable images, at least 2 are needed")
-    found = set(planned_pairs(plan, names, [*names, *skipped]))
-    if plan.retrieval:
+    found = set(selected_pairs(selection, names, [*names, *skipped]))
+    if selection.retrieval:
         weights = chosen_weights(network, backbone)
         with tqdm(total=len(usable), desc="retrieval", unit="image") as bar:
             alone = described_alone(weights, usable, kind=retrieval, on_image=bar.update)
-        found.update(nearest_pairs(alone.vectors, plan.retrieval))
+        found.update(nearest_pairs(alone.vectors, selection.retrieval))
         skipped |= {image.name: str(error) for image, error in alone.lost}
         found = {pair for pair in found if not skipped.keys() & set(pair)}
     for why in skipped.values():

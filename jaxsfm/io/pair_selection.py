@@ -17,7 +17,7 @@ Retrieval = Literal["gem", "vlad", "netvlad"]
 """How a photo is described as a whole (`jaxsfm.core.pooling`)."""
 
 
-class Plan(NamedTuple):
+class PairSelection(NamedTuple):
     """The parts of `--pairs`."""
 
     exhaustive: bool = False
@@ -28,29 +28,29 @@ class Plan(NamedTuple):
     """So many most similar images of each; 0: none."""
 
 
-def read_plan(text: str) -> Plan:
-    """The plan of a value of `--pairs`; a file of that very name comes first.
+def parse_pair_selection(text: str) -> PairSelection:
+    """The selection of a value of `--pairs`; a file of that very name comes first.
 
     Raises:
       UserError: a part is nothing of all that.
     """
     parts = [text] if os.path.isfile(text) else text.split("+")
-    plan = Plan()
+    selection = PairSelection()
     for part in parts:
         kind, colon, number = part.partition(":")
         if os.path.isfile(part):
-            plan = plan._replace(files=(*plan.files, Path(part)))
+            selection = selection._replace(files=(*selection.files, Path(part)))
         elif part == "exhaustive":
-            plan = plan._replace(exhaustive=True)
+            selection = selection._replace(exhaustive=True)
         elif colon and kind in ("sequential", "retrieval"):
-            count = max(getattr(plan, kind), _count(part, number))
-            plan = plan._replace(**{kind: count})
+            count = max(getattr(selection, kind), _count(part, number))
+            selection = selection._replace(**{kind: count})
         else:
             raise UserError(
                 f"--pairs {text}: {part!r} is neither a file nor exhaustive, sequential:K or "
                 "retrieval:K"
             )
-    return plan
+    return selection
 
 
 def _count(part: str, number: str) -> int:
@@ -71,8 +71,10 @@ def sequential_pairs(names: Iterable[str], k: int) -> list[Pair]:
     return sorted(make_pair(a, b) for i, a in enumerate(row) for b in row[i + 1 : i + 1 + k])
 
 
-def planned_pairs(plan: Plan, names: Iterable[str], known: Iterable[str]) -> list[Pair]:
-    """The pairs of a plan that need no photo to be looked at: all but those by retrieval.
+def selected_pairs(
+    selection: PairSelection, names: Iterable[str], known: Iterable[str]
+) -> list[Pair]:
+    """The pairs of a selection that need no photo to be looked at: all but those by retrieval.
 
     Args:
       names: the images that can be used.
@@ -82,9 +84,9 @@ def planned_pairs(plan: Plan, names: Iterable[str], known: Iterable[str]) -> lis
       UserError: as `read_pairs`.
     """
     names, known = list(names), list(known)
-    pairs = set(exhaustive_pairs(names)) if plan.exhaustive else set()
-    for path in plan.files:
+    pairs = set(exhaustive_pairs(names)) if selection.exhaustive else set()
+    for path in selection.files:
         pairs.update(read_pairs(path, known))
-    if plan.sequential:
-        pairs.update(sequential_pairs(names, plan.sequential))
+    if selection.sequential:
+        pairs.update(sequential_pairs(names, selection.sequential))
     return sorted(pairs)

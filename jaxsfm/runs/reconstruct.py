@@ -20,7 +20,7 @@ from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import ImageFile
-from jaxsfm.io.pair_selection import planned_pairs, read_plan
+from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair, PairCounts, PairResult, best_pairs
 from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.weights import Weights, chosen_weights
@@ -53,8 +53,8 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, skipped = open_images(images, progress=options.progress)
     names = [*(image.name for image in usable), *skipped]
-    plan = read_plan(options.pairs)
-    pairs = planned_pairs(plan, (image.name for image in usable), names)
+    plan = parse_pair_selection(options.pairs)
+    pairs = selected_pairs(plan, (image.name for image in usable), names)
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})

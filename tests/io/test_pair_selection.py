@@ -7,7 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.pair_selection import Plan, natural, planned_pairs, read_plan, sequential_pairs
+from jaxsfm.io.pair_selection import (
+    PairSelection,
+    natural,
+    parse_pair_selection,
+    selected_pairs,
+    sequential_pairs,
+)
 from jaxsfm.io.pairs import exhaustive_pairs
 
 NAMES = ["img1.png", "img2.png", "img10.png", "img11.png"]
@@ -21,25 +27,25 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("text", "plan"),
+    ("text", "selection"),
     [
-        ("exhaustive", Plan(exhaustive=True)),
-        ("pairs.txt", Plan(files=(Path("pairs.txt"),))),
-        ("retrieval:20", Plan(retrieval=20)),
-        ("sequential:3", Plan(sequential=3)),
-        ("sequential:3+retrieval:20", Plan(sequential=3, retrieval=20)),
-        ("retrieval:5+retrieval:20+retrieval:7", Plan(retrieval=20)),
-        ("pairs.txt+sequential:1", Plan(files=(Path("pairs.txt"),), sequential=1)),
+        ("exhaustive", PairSelection(exhaustive=True)),
+        ("pairs.txt", PairSelection(files=(Path("pairs.txt"),))),
+        ("retrieval:20", PairSelection(retrieval=20)),
+        ("sequential:3", PairSelection(sequential=3)),
+        ("sequential:3+retrieval:20", PairSelection(sequential=3, retrieval=20)),
+        ("retrieval:5+retrieval:20+retrieval:7", PairSelection(retrieval=20)),
+        ("pairs.txt+sequential:1", PairSelection(files=(Path("pairs.txt"),), sequential=1)),
     ],
 )
-def test_a_plan_is_the_union_of_its_parts(text, plan):
-    assert read_plan(text) == plan
+def test_a_selection_is_the_union_of_its_parts(text, selection):
+    assert parse_pair_selection(text) == selection
 
 
 @pytest.mark.parametrize("name", ["exhaustive", "retrieval:2", "a+b", "sequential:2+exhaustive"])
 def test_a_file_of_that_very_name_comes_first(folder, name):
     (folder / name).write_text("img1.png img2.png\n")
-    assert read_plan(name) == Plan(files=(Path(name),))
+    assert parse_pair_selection(name) == PairSelection(files=(Path(name),))
 
 
 @pytest.mark.parametrize(
@@ -55,7 +61,7 @@ def test_a_file_of_that_very_name_comes_first(folder, name):
 )
 def test_a_number_that_is_none_is_refused(text):
     with pytest.raises(UserError, match=f"--pairs {text}: a whole number of at least 1"):
-        read_plan(f"exhaustive+{text}")
+        parse_pair_selection(f"exhaustive+{text}")
 
 
 @pytest.mark.parametrize(
@@ -63,15 +69,17 @@ def test_a_number_that_is_none_is_refused(text):
 )
 def test_what_is_no_part_is_refused(text):
     with pytest.raises(UserError, match="is neither a file nor exhaustive, sequential:K or"):
-        read_plan(text)
+        parse_pair_selection(text)
 
 
 def test_pairs_of_several_parts_are_united_once():
-    pairs = planned_pairs(read_plan("pairs.txt+sequential:1+sequential:2"), NAMES, NAMES)
+    pairs = selected_pairs(
+        parse_pair_selection("pairs.txt+sequential:1+sequential:2"), NAMES, NAMES
+    )
     assert pairs == sorted({("img1.png", "img11.png"), *sequential_pairs(NAMES, 2)})
-    everything = planned_pairs(read_plan("exhaustive+pairs.txt"), NAMES, NAMES)
+    everything = selected_pairs(parse_pair_selection("exhaustive+pairs.txt"), NAMES, NAMES)
     assert everything == exhaustive_pairs(NAMES)
-    assert planned_pairs(read_plan("retrieval:2"), NAMES, NAMES) == []
+    assert selected_pairs(parse_pair_selection("retrieval:2"), NAMES, NAMES) == []
 
 
 def test_a_sequence_follows_the_numbers_in_names():
