@@ -7,8 +7,8 @@ from typing import Literal
 
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
-from jaxsfm.io.converted import FORMAT, is_converted, save_weights
 from jaxsfm.io.hashes import sha256_of
+from jaxsfm.io.weight_files import FORMAT, is_converted, save_weights
 from weights_conversion.keras_files import Kernels, read_keras
 from weights_conversion.matlab_files import read_matlab
 from weights_conversion.source import (
@@ -91,7 +91,7 @@ def read_source(
 
 
 def write_converted(source: Source, out: Path) -> None:
-    """Write a source in jaxsfm's format (`jaxsfm.io.converted`).
+    """Write a source in jaxsfm's format (`jaxsfm.io.weight_files`).
 
     Raises:
       UserError: it cannot be written, or is the source's own file.

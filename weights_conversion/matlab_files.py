@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxsfm.core.vgg import LAYERS, Preprocessing
 from jaxsfm.errors import UserError
-from jaxsfm.io.converted import EXTRAS
+from jaxsfm.io.weight_files import EXTRAS
 from weights_conversion.mat5 import read_variables
 from weights_conversion.source import Convention, Source, check_layers
 

@@ -29,7 +29,7 @@ class Source:
     """A file's convolutions, as they are in it."""
 
     architecture: str = "vgg16"
-    """One of `jaxsfm.io.converted.ARCHITECTURES`."""
+    """One of `jaxsfm.io.weight_files.ARCHITECTURES`."""
     family: Family
     path: Path
     sha256: str
@@ -39,7 +39,7 @@ class Source:
     preprocessing: Preprocessing
     """Mean and std in the order of the source's channels."""
     extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """`jaxsfm.io.converted.EXTRAS`, already in their documented form."""
+    """`jaxsfm.io.weight_files.EXTRAS`, already in their documented form."""
     notes: tuple[str, ...] = ()
     """What the user should know, in sentences."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsfm.core.blocks import Layer, convolve, pool
 from jaxsfm.core.vgg import preprocess
 from jaxsfm.errors import UserError
-from jaxsfm.io.converted import Converted, read_converted, read_extras
+from jaxsfm.io.weight_files import ConvertedWeights, read_converted, read_extras
 from weights_conversion.forward import layer_maps
 from weights_conversion.source import Source
 
@@ -45,7 +45,7 @@ def noise_image(size: tuple[int, int]) -> np.ndarray:
     return (colours * (0.3 + 0.7 * slope)).astype(np.uint8)
 
 
-def converted_maps(found: Converted, rgb: np.ndarray) -> dict[str, np.ndarray]:
+def converted_maps(found: ConvertedWeights, rgb: np.ndarray) -> dict[str, np.ndarray]:
     """The same maps as `layer_maps`, by jaxsfm's network."""
     size = jnp.asarray([rgb.shape[:2]], jnp.int32)
     x = preprocess(jnp.asarray(rgb), found.preprocessing)[None]

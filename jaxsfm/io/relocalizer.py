@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxsfm.core.scores import PLACES, WALKED, Head
 from jaxsfm.errors import UserError
-from jaxsfm.io.tensors import Tensors, open_tensors, save_tensors
+from jaxsfm.io.safetensors_files import TensorFile, open_tensors, save_tensors
 
 FORMAT = "jaxsfm relocalizer 1"
 SHIPPED = "relocalizer.safetensors"
@@ -63,7 +63,7 @@ def load_relocalizer(path: Path) -> Relocalizer:
         return Relocalizer(params={"params": levels}, sha256=file.sha256, about=file.about)
 
 
-def _checked(file: Tensors, level: str) -> dict[str, np.ndarray]:
+def _checked(file: TensorFile, level: str) -> dict[str, np.ndarray]:
     hidden = int(np.prod(file.shapes.get(f"{level}.bias", (1,))))
     if not 1 <= hidden <= MAX_HIDDEN:
         raise UserError(f"{file.path}: {level} must have 1 to {MAX_HIDDEN} units; got {hidden}")

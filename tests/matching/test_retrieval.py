@@ -12,11 +12,11 @@ import pytest
 import jaxsfm
 from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
-from jaxsfm.io.converted import EXTRAS
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pair_selection import sequential_pairs
 from jaxsfm.io.pairs import read_pairs
 from jaxsfm.io.store import Store
+from jaxsfm.io.weight_files import EXTRAS
 from jaxsfm.matching import global_descriptors
 from jaxsfm.matching.retrieval import described, nearest_pairs
 

@@ -30,7 +30,7 @@ def sources(files) -> dict[str, Source]:
 @pytest.fixture
 def small_head(monkeypatch):
     """NetVLAD's head with few numbers: 32 channels, 4 clusters, 8 dimensions after whitening."""
-    from jaxsfm.io.converted import EXTRAS
+    from jaxsfm.io.weight_files import EXTRAS
 
     for name, shape in {
         "netvlad.assignment": (32, 4),

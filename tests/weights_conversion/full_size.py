@@ -14,7 +14,7 @@ sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
 from imitations import WRITERS, Layers, netvlad, random_layers  # noqa: E402
 
 from jaxsfm.core.vgg import LAYERS  # noqa: E402
-from jaxsfm.io.converted import EXTRAS  # noqa: E402
+from jaxsfm.io.weight_files import EXTRAS  # noqa: E402
 from jaxsfm.io.weights import load_weights  # noqa: E402
 from weights_conversion.convert import read_source, write_converted  # noqa: E402
 from weights_conversion.verify import SIZE, Compared, compare  # noqa: E402

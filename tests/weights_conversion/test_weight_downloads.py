@@ -8,7 +8,7 @@ from imitations import SMALL
 from local_server import url
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.converted import read_converted
+from jaxsfm.io.weight_files import read_converted
 from weights_conversion import fetch
 from weights_conversion.fetch import PUBLIC, Public, fetch_weights
 

@@ -22,7 +22,7 @@ from imitations import (
 
 from jaxsfm.core.vgg import BLOCKS_19, layers_of
 from jaxsfm.errors import UserError
-from jaxsfm.io.converted import read_converted, read_extras
+from jaxsfm.io.weight_files import read_converted, read_extras
 from jaxsfm.io.weights import TORCHVISION
 from weights_conversion.convert import read_source, write_converted
 from weights_conversion.torchvision import numbered

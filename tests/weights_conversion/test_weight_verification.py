@@ -10,7 +10,7 @@ from imitations import SMALL, WRITERS, netvlad, random_layers, torchvision_names
 from scipy.signal import convolve2d, correlate2d
 
 from jaxsfm.core.vgg import LAYERS, VGG16, preprocess
-from jaxsfm.io.converted import read_converted
+from jaxsfm.io.weight_files import read_converted
 from jaxsfm.io.weights import TORCHVISION, load_weights
 from weights_conversion.convert import read_source, write_converted
 from weights_conversion.forward import layer_maps

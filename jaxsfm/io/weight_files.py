@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxsfm.core.vgg import BLOCKS_19, LAYERS, Preprocessing, layers_of
 from jaxsfm.errors import UserError
-from jaxsfm.io.tensors import Tensors, has_marker, open_tensors, save_tensors
+from jaxsfm.io.safetensors_files import TensorFile, has_marker, open_tensors, save_tensors
 
 FORMAT = "jaxsfm weights 1"
 """Of converted weights: arrays LAYER.kernel and LAYER.bias, of NetVLAD also `EXTRAS`."""
@@ -32,7 +32,7 @@ Shapes = Mapping[str, tuple[int, int]]
 """Layer name -> (input channels, output channels)."""
 
 
-class Converted(NamedTuple):
+class ConvertedWeights(NamedTuple):
     """What such a file holds, without its extras."""
 
     architecture: str
@@ -84,7 +84,7 @@ def is_converted(path: Path) -> bool:
     return has_marker(path, FORMAT)
 
 
-def read_converted(path: Path, *, shapes: Shapes | None = None) -> Converted:
+def read_converted(path: Path, *, shapes: Shapes | None = None) -> ConvertedWeights:
     """Read and check converted weights; the extras' shapes are checked, not their values.
 
     Args:
@@ -114,7 +114,9 @@ def read_converted(path: Path, *, shapes: Shapes | None = None) -> Converted:
             for name, (inputs, outputs) in shapes.items()
         }
         preprocessing = _preprocessing(file)
-        return Converted(architecture, layers, family, preprocessing, file.about, file.sha256)
+        return ConvertedWeights(
+            architecture, layers, family, preprocessing, file.about, file.sha256
+        )
 
 
 def read_extras(path: Path) -> dict[str, np.ndarray]:
@@ -133,11 +135,11 @@ def has_extras(path: Path) -> bool:
         return all(name in file.shapes for name in EXTRAS)
 
 
-def _open(path: Path) -> AbstractContextManager[Tensors]:
+def _open(path: Path) -> AbstractContextManager[TensorFile]:
     return open_tensors(path, marker=FORMAT, what="weights file", made_by="jaxsfm weights convert")
 
 
-def _preprocessing(file: Tensors) -> Preprocessing:
+def _preprocessing(file: TensorFile) -> Preprocessing:
     try:
         about = file.about["preprocessing"]
         mean, std = _three(about["mean"]), _three(about["std"])

@@ -36,7 +36,7 @@ def save_tensors(
     write_atomic(path, safetensors.numpy.save(arrays, metadata=metadata))
 
 
-class Tensors:
+class TensorFile:
     """An open file; `open_tensors`."""
 
     def __init__(self, path: Path, file: Any, about: dict[str, Any], sha256: str) -> None:
@@ -79,7 +79,7 @@ def has_marker(path: Path, marker: str) -> bool:
 
 
 @contextlib.contextmanager
-def open_tensors(path: Path, *, marker: str, what: str, made_by: str) -> Iterator[Tensors]:
+def open_tensors(path: Path, *, marker: str, what: str, made_by: str) -> Iterator[TensorFile]:
     """Open a file that `save_tensors` wrote.
 
     Args:
@@ -97,7 +97,7 @@ def open_tensors(path: Path, *, marker: str, what: str, made_by: str) -> Iterato
         file = safetensors.safe_open(path, framework="numpy")
         metadata = file.metadata() or {}
         about = json.loads(metadata.get(marker, "{}"))
-        opened = Tensors(path, file, about, digest)
+        opened = TensorFile(path, file, about, digest)
     except Exception as error:  # a damaged file can raise more than safetensors' own error
         raise UserError(f"{path}: not a readable safetensors file ({error})") from error
     if marker not in metadata or not isinstance(about, dict):

@@ -11,8 +11,8 @@ from jaxsfm.config import preset
 from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
 from jaxsfm.io import weights
-from jaxsfm.io.converted import FORMAT, is_converted, read_converted, save_weights
 from jaxsfm.io.relocalizer import Relocalizer, save_relocalizer, shipped_relocalizer
+from jaxsfm.io.weight_files import FORMAT, is_converted, read_converted, save_weights
 from jaxsfm.io.weights import load_weights
 
 SHAPES = {"conv1_1": (3, 2), "conv1_2": (2, 4)}
