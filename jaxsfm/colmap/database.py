@@ -18,7 +18,7 @@ import pycolmap
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.native import native
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import SPARE_BYTES, check_room
+from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile, shown_name
 from jaxsfm.io.pairs import Pair, PairResult, describe
 
@@ -125,7 +125,7 @@ def write_database(
         if (xy < -0.5).any() or (xy > np.asarray(names[name].size) - 0.5).any():
             raise ValueError(f"{name}: keypoints outside the image {names[name].size}")
     rows = sum(len(xy) for _, xy in tables.values()) + 2 * matched
-    check_room(path.parent, SPARE_BYTES + 2 * 8 * rows)  # and as much for SQLite's journal
+    check_disk_space(path.parent, SPARE_BYTES + 2 * 8 * rows)  # and as much for SQLite's journal
     empty = np.zeros((0, 2), np.float32)
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):

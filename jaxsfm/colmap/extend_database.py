@@ -10,7 +10,7 @@ import pycolmap
 
 from jaxsfm.colmap.database import PIXEL_OFFSET, read_images, verify
 from jaxsfm.colmap.two_views import read_two_views
-from jaxsfm.io.atomic import SPARE_BYTES, check_room
+from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 
@@ -43,7 +43,7 @@ def copy_database(source: Path, target: Path, matches: int) -> None:
     # Each match: a keypoint in both images at most, itself and its verification; 8 bytes each.
     rows = 4 * matches
     size = source.stat().st_size
-    check_room(target.parent, SPARE_BYTES + 3 * size + 16 * rows)
+    check_disk_space(target.parent, SPARE_BYTES + 3 * size + 16 * rows)
     shutil.copyfile(source, target)
 
 

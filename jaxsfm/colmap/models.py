@@ -8,7 +8,7 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
-from jaxsfm.io.atomic import SPARE_BYTES, check_room
+from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageError
 
 
@@ -20,7 +20,7 @@ def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
         target.mkdir(parents=True)
         points2d = sum(image.num_points2D() for image in model.images.values())
         rows = 24 * points2d + 8 * model.compute_num_observations() + 51 * model.num_points3D()
-        check_room(target, SPARE_BYTES + rows)
+        check_disk_space(target, SPARE_BYTES + rows)
         model.write_binary(target)
 
 

@@ -90,7 +90,7 @@ def read_json(path: Path) -> Any:
         return None
 
 
-def check_room(folder: Path, needed: int) -> None:
+def check_disk_space(folder: Path, needed: int) -> None:
     """Refuse what would not fit on the disk, before code that does not survive that begins.
 
     COLMAP ends the process where a database cannot grow, and writes models that are cut off.
