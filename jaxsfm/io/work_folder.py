@@ -197,7 +197,7 @@ def _check_photos(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
 
 
 @contextlib.contextmanager
-def locked(path: Path) -> Iterator[None]:
+def lock_folder(path: Path) -> Iterator[None]:
     """Create or find a run's folder, hold its lock, and finish what a killed run was publishing.
 
     Raises:
@@ -227,12 +227,12 @@ def open_folder(path: Path, identity: dict[str, Any]) -> Iterator[WorkFolder]:
     Raises:
       UserError: a file, not writable, in use, or a run of other photos.
     """
-    with locked(path):
-        yield locked_folder(path, identity)
+    with lock_folder(path):
+        yield open_locked_folder(path, identity)
 
 
-def locked_folder(path: Path, identity: dict[str, Any]) -> WorkFolder:
-    """As `open_folder`, by who holds the lock (`locked`)."""
+def open_locked_folder(path: Path, identity: dict[str, Any]) -> WorkFolder:
+    """As `open_folder`, by who holds the lock (`lock_folder`)."""
     new = json.loads(json.dumps(identity))
     old = _former(path)
     if old is not None:

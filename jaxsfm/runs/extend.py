@@ -25,7 +25,7 @@ from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
-from jaxsfm.io.work_folder import RECORD, WorkFolder, locked, locked_folder
+from jaxsfm.io.work_folder import RECORD, WorkFolder, lock_folder, open_locked_folder
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.finished_run import KeptRun, read_run
 from jaxsfm.report.page.after_run import page_after_run
@@ -63,7 +63,7 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
     """
     if not (run / RECORD).exists():
         raise UserError(f"{run}: no finished run here ({RECORD} is missing)")
-    with locked(run):  # before anything is read: another one may be publishing
+    with lock_folder(run):  # before anything is read: another one may be publishing
         return _extend(run, options)
 
 
@@ -104,7 +104,7 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
         execution=options.execution,
         progress=options.progress,
     )
-    folder = locked_folder(run, identity)
+    folder = open_locked_folder(run, identity)
     shortlist = options.chosen_shortlist(kept, weights, new)
     shortlists, unread = {}, {}
     for name, image in new.items():

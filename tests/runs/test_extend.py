@@ -15,7 +15,7 @@ from jaxsfm.bench.synthetic import render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.poses import model_poses, read_model, read_poses
-from jaxsfm.io.work_folder import RESULTS, locked
+from jaxsfm.io.work_folder import RESULTS, lock_folder
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.schema import read_report
 from jaxsfm.runs import extend as extend_module
@@ -188,7 +188,7 @@ def test_killed_while_publishing_or_beside_another_run_the_report_is_the_newest(
     (run / "publishing" / "moves.json").write_text(json.dumps(moves))
     assert main(["extend", str(run)]) == 0
     assert "no new photos" in capsys.readouterr().out and (run / "report.json").exists()
-    with locked(run), monkeypatch.context() as patch:
+    with lock_folder(run), monkeypatch.context() as patch:
         patch.setattr(extend_module, "read_run", None)  # what it says may be old soon
         assert main(["extend", str(run)]) == 2
     assert "another run" in capsys.readouterr().err
