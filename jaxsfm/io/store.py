@@ -123,7 +123,7 @@ class Store:
         reason = self._unusable().get(digest(self.identity.get("version"), image.sha256))
         return reason if isinstance(reason, str) else None
 
-    def note_failure(self, image: ImageFile, error: ImageError) -> None:
+    def record_failure(self, image: ImageFile, error: ImageError) -> None:
         """What is damaged stays so; another failure may be over the next time."""
         if isinstance(error, DamagedImage):
             self.mark_unusable(image, str(error))

@@ -37,7 +37,7 @@ def extract_missing(
     stream = engine.extracted(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
-            folder.note_failure(image, found)
+            folder.record_failure(image, found)
             skipped[image.name] = str(found)
         else:
             folder.save_features(found)

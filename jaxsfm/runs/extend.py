@@ -113,7 +113,7 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
             shortlists[name] = shortlist(image, others)
         except ImageError as error:
             unread[name] = str(error)
-            folder.note_failure(image, error)
+            folder.record_failure(image, error)
     pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
     missing = [pair for pair in pairs if folder.load_matches(pair) is None]
     undecoded = unread | extract_missing(folder, weights, files, missing, config, run_options)

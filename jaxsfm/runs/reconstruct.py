@@ -218,7 +218,7 @@ def _retrieve(
             on_image=bar.update,
         )
     for image, error in found.lost:
-        folder.note_failure(image, error)
+        folder.record_failure(image, error)
     lost = {image.name: str(error) for image, error in found.lost}
     return nearest_pairs(found.vectors, k), lost
 
