@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.model_arrays import build_model
+from jaxsfm.colmap.model import build_model
 from jaxsfm.colmap.models import colour_points, read_models, write_models
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic

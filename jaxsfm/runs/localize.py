@@ -16,7 +16,7 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.model_arrays import part_of
+from jaxsfm.colmap.model import part_of
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures, room_of

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from jaxsfm.colmap.model_arrays import View
+from jaxsfm.colmap.model import View
 from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name

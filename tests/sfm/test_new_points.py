@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from room_scene import Room, exact_tracks, read_of
 
-from jaxsfm.colmap.model_arrays import Tracks, select
+from jaxsfm.colmap.model import Tracks, select
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs

@@ -7,7 +7,7 @@ import pytest
 from room_scene import Room, camera, exact_tracks, other_scene, read_of
 from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 
-from jaxsfm.colmap.model_arrays import Tracks, View, part_of
+from jaxsfm.colmap.model import Tracks, View, part_of
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.register.locate_view import Located, locate
 

@@ -21,7 +21,7 @@ from room_scene import (
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.colmap.mapper import registered
-from jaxsfm.colmap.model_arrays import View, build_model, read_model_arrays
+from jaxsfm.colmap.model import View, build_model, read_model_arrays
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status

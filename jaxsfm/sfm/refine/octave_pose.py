@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Tracks, View
 from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.photos import Reader

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import (
+from jaxsfm.colmap.model import (
     Sizes,
     Tracks,
     View,

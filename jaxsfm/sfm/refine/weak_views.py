@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Sizes, Tracks, View, build_model, part_of, read_model_arrays
+from jaxsfm.colmap.model import Sizes, Tracks, View, build_model, part_of, read_model_arrays
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair

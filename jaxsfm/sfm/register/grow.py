@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View, part_of
+from jaxsfm.colmap.model import Tracks, View, part_of
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import Reader

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Tracks, View
 from jaxsfm.colmap.resection import MIN_POINTS, find_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
