@@ -151,13 +151,13 @@ def _paired(row: dict[str, Any]) -> dict[str, Any]:
 
 def _figures(row: dict[str, Any] | None) -> "RefinementFigures | None":
     from jaxsfm.sfm.refine.passes import PassFigures, RefinementFigures
-    from jaxsfm.sfm.refine.weak_views import Placed
+    from jaxsfm.sfm.refine.weak_views import Placement
 
     if row is None:
         return None
     return RefinementFigures(
         passes=[PassFigures(**each) for each in row["passes"]],
-        placed=[Placed(**each) for each in row["placed"]],
+        placed=[Placement(**each) for each in row["placed"]],
     )
 
 
@@ -233,11 +233,11 @@ def _refine(
 ) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
     from jaxsfm.colmap.mapper import registered
     from jaxsfm.sfm.refine.passes import refine_model
-    from jaxsfm.sfm.refine.weak_views import Evidence, LeftOut
+    from jaxsfm.sfm.refine.weak_views import Evidence, UnmappedImage
 
     refined, figures = [], []
     mapped = {name for model in models for name in registered(model)}
-    left_out = [LeftOut(name, *cameras[name]) for name in sorted(cameras.keys() - mapped)]
+    left_out = [UnmappedImage(name, *cameras[name]) for name in sorted(cameras.keys() - mapped)]
     for model in models:
         try:
             new, done = refine_model(
