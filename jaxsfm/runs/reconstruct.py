@@ -33,7 +33,7 @@ from jaxsfm.runs.reconstruct_report import Done, run_report
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.reconstruction import Reconstructed, reconstruct
-from jaxsfm.sfm.stages import Kept
+from jaxsfm.sfm.stages import StageCache
 
 logger = logging.getLogger("jaxsfm")
 
@@ -100,7 +100,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
             [[*pair, folder.match_key(pair)] for pair in chosen],
             given.about and given.about["sha256"],
         )
-        kept = Kept(folder, matches_key)
+        kept = StageCache(folder, matches_key)
         with folder.publish() as fresh:
             made = _map(fresh, good, handed_on, intrinsics, kept, config, options, seconds)
             report = run_report(
@@ -139,7 +139,7 @@ def _map(
     images: list[ImageFile],
     matches: Mapping[Pair, PairResult],
     intrinsics: Intrinsics | None,
-    kept: Kept,
+    kept: StageCache,
     config: Config,
     options: RunOptions,
     seconds: dict[str, float],
