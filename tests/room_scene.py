@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, render, room
-from jaxsfm.colmap.model_arrays import Tracks, View, build_model, bundle_adjust
+from jaxsfm.colmap.model import Tracks, View, build_model, bundle_adjust
 from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.evaluation import evaluate

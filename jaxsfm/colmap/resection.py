@@ -6,7 +6,7 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.model_arrays import View
+from jaxsfm.colmap.model import View
 
 MIN_POINTS = 6
 MIN_INLIER_SHARE = 0.05

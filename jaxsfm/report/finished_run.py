@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View, errors_px, point_colours, read_model_arrays
+from jaxsfm.colmap.model import Tracks, View, errors_px, point_colours, read_model_arrays
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.config import Config, PairShape, Refinement
 from jaxsfm.errors import UserError

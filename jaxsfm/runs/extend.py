@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.model_arrays import build_model
+from jaxsfm.colmap.model import build_model
 from jaxsfm.colmap.models import colour_points, read_models, write_models
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
@@ -42,7 +42,7 @@ from jaxsfm.runs.finished_model import (
 )
 from jaxsfm.runs.localize import LocalizeOptions
 from jaxsfm.runs.run_options import RunOptions
-from jaxsfm.sfm.register.grow import Grown, Newcomer, grow
+from jaxsfm.sfm.register.grow import ExtendedModel, UnregisteredView, grow
 
 if TYPE_CHECKING:
     import pycolmap
@@ -166,7 +166,7 @@ def _extended(
         scale=Photos(files.values(), config).median_scale(),
     )
     newcomers = {
-        name: Newcomer(
+        name: UnregisteredView(
             dataclasses.replace(
                 view_of(image, chosen[name], config),
                 image_id=added[name][0],
@@ -203,7 +203,7 @@ def _extended(
 def _models(
     home: Path,
     database: Path,
-    grown: Grown,
+    grown: ExtendedModel,
     files: Mapping[str, ImageFile],
     model: KnownModel,
 ) -> "list[pycolmap.Reconstruction]":

@@ -16,7 +16,7 @@ from jaxsfm.report.lost_photos import explained
 from jaxsfm.report.pair_outcomes import PairOutcomes
 from jaxsfm.report.summary import model_figures, pair_figures
 from jaxsfm.sfm.evaluation import evaluate
-from jaxsfm.sfm.register.grow import Grown
+from jaxsfm.sfm.register.grow import ExtendedModel
 from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class New(NamedTuple):
 def extended_report(
     kept: KeptRun,
     models: "list[pycolmap.Reconstruction]",
-    grown: Grown,
+    grown: ExtendedModel,
     new: New,
     matches: SavedMatches,
     verified: Mapping[Pair, int],

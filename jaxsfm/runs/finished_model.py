@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxsfm.colmap.database import camera_for
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
-from jaxsfm.colmap.model_arrays import Tracks, View, read_model_arrays
+from jaxsfm.colmap.model import Tracks, View, read_model_arrays
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.config import Config
 from jaxsfm.core.pooling import TIE

@@ -16,7 +16,7 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.model_arrays import part_of
+from jaxsfm.colmap.model import part_of
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures, feature_capacity
@@ -47,7 +47,7 @@ from jaxsfm.runs.finished_model import (
     view_of,
 )
 from jaxsfm.runs.localize_report import UNUSABLE, error_against, located_figures
-from jaxsfm.sfm.register.locate_view import Located, locate
+from jaxsfm.sfm.register.locate_view import Localization, locate
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ def locate_photo(
     shortlist: Sequence[str],
     matches: Mapping[Pair, PairResult],
     read: Reader,
-) -> Located:
+) -> Localization:
     """The pose of a photo from its matches with the shortlisted photos of a model."""
     views, tracks, _ = part_of(model.views, model.tracks, shortlist)
     return locate(

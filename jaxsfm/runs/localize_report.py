@@ -4,13 +4,13 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from jaxsfm.colmap.model_arrays import View
+from jaxsfm.colmap.model import View
 from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.evaluation import evaluate, pair_names
-from jaxsfm.sfm.register.locate_view import Located
+from jaxsfm.sfm.register.locate_view import Localization
 
 LOCALIZED, DOUBTFUL, LOST, UNUSABLE = "localized", "doubtful", "lost", "unusable"
 """A trusted pose; one that hangs on matches alone; none; not a photo."""
@@ -35,7 +35,7 @@ def _pose(view: View) -> dict[str, Any]:
 
 
 def located_figures(
-    found: Located, source: str, matches: Mapping[Pair, PairResult]
+    found: Localization, source: str, matches: Mapping[Pair, PairResult]
 ) -> dict[str, Any]:
     """A photo's row, beside its names.
 

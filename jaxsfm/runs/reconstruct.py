@@ -11,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.external_matches import Beside, read_given
+from jaxsfm.colmap.external_matches import JoinedMatches, read_external_matches
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions
 from jaxsfm.colmap.models import write_models
@@ -33,7 +33,7 @@ from jaxsfm.runs.reconstruct_report import Done, run_report
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.reconstruction import Reconstructed, reconstruct
-from jaxsfm.sfm.stages import Kept
+from jaxsfm.sfm.stages import StageCache
 
 logger = logging.getLogger("jaxsfm")
 
@@ -58,7 +58,7 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
-    given = read_given(options.with_database, options.with_hloc, usable, intrinsics)
+    given = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
     weights = chosen_weights(options.network, config.backbone)
     if plan.retrieval:
         check_retrieval(options.retrieval, weights)
@@ -95,12 +95,12 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
                 results[result.pair] = result.counts
         chosen = sorted(_choose(results, options.best_pairs))
         ours = SavedMatches(folder, chosen)
-        handed_on = Beside(ours, given, {image.name for image in good})
+        handed_on = JoinedMatches(ours, given, {image.name for image in good})
         matches_key = digest(
             [[*pair, folder.match_key(pair)] for pair in chosen],
             given.about and given.about["sha256"],
         )
-        kept = Kept(folder, matches_key)
+        kept = StageCache(folder, matches_key)
         with folder.publish() as fresh:
             made = _map(fresh, good, handed_on, intrinsics, kept, config, options, seconds)
             report = run_report(
@@ -139,7 +139,7 @@ def _map(
     images: list[ImageFile],
     matches: Mapping[Pair, PairResult],
     intrinsics: Intrinsics | None,
-    kept: Kept,
+    kept: StageCache,
     config: Config,
     options: RunOptions,
     seconds: dict[str, float],

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from jaxsfm.colmap.external_matches import Given
+from jaxsfm.colmap.external_matches import ExternalMatches
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairCounts
@@ -33,7 +33,7 @@ class Done:
     results: Mapping[Pair, PairCounts]
     """Of every pair tried."""
     handed_on: Collection[Pair]
-    given: Given
+    given: ExternalMatches
     made: Reconstructed
     weights: dict[str, Any]
     """What the report says of them."""

@@ -19,7 +19,7 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
-from jaxsfm.sfm.stages import InScratch, Kept, made
+from jaxsfm.sfm.stages import StageCache, TemporaryStages, run_stage
 from jaxsfm.sfm.view_graph import Verdict, trusted_pairs
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def reconstruct(
     config: Config,
     intrinsics: "Intrinsics | None" = None,
     options: "MapOptions | None" = None,
-    kept: Kept | None = None,
+    kept: StageCache | None = None,
     on_image: Callable[[], None] = lambda: None,
     on_pass: Callable[[], None] = lambda: None,
     on_mapped: Callable[[], None] = lambda: None,
@@ -110,17 +110,17 @@ def reconstruct(
         _write_json(folder, [each and dataclasses.asdict(each) for each in figures])
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        stages, key = kept or (InScratch(scratch), "")
+        stages, key = kept or (TemporaryStages(scratch), "")
         by_image = [[image.name, image.sha256, image.size] for image in images]
         camera = intrinsics and dataclasses.asdict(intrinsics)
         verifying = [options.seed, options.threads, options.scale, config.view_graph]
         key = digest(key, by_image, camera, verifying, package_versions())
-        checked = made(stages, "verified", key, verify)
+        checked = run_stage(stages, "verified", key, verify)
         key = digest(key, dataclasses.asdict(options))
-        mapped = made(stages, "mapped", key, build)
+        mapped = run_stage(stages, "mapped", key, build)
         on_mapped()
         key = digest(key, config.refinement and dataclasses.asdict(config.refinement))
-        refined = made(stages, "refined", key, refine)
+        refined = run_stage(stages, "refined", key, refine)
         shutil.copyfile(checked / DATABASE, database)
         verification, refinement = _read_json(checked), _read_json(refined)
         models = colmap_models.read_models(refined / SPARSE, database)
@@ -151,13 +151,13 @@ def _paired(row: dict[str, Any]) -> dict[str, Any]:
 
 def _figures(row: dict[str, Any] | None) -> "RefinementFigures | None":
     from jaxsfm.sfm.refine.passes import PassFigures, RefinementFigures
-    from jaxsfm.sfm.refine.weak_views import Placed
+    from jaxsfm.sfm.refine.weak_views import Placement
 
     if row is None:
         return None
     return RefinementFigures(
         passes=[PassFigures(**each) for each in row["passes"]],
-        placed=[Placed(**each) for each in row["placed"]],
+        placed=[Placement(**each) for each in row["placed"]],
     )
 
 
@@ -233,11 +233,11 @@ def _refine(
 ) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
     from jaxsfm.colmap.mapper import registered
     from jaxsfm.sfm.refine.passes import refine_model
-    from jaxsfm.sfm.refine.weak_views import Evidence, LeftOut
+    from jaxsfm.sfm.refine.weak_views import Evidence, UnmappedImage
 
     refined, figures = [], []
     mapped = {name for model in models for name in registered(model)}
-    left_out = [LeftOut(name, *cameras[name]) for name in sorted(cameras.keys() - mapped)]
+    left_out = [UnmappedImage(name, *cameras[name]) for name in sorted(cameras.keys() - mapped)]
     for model in models:
         try:
             new, done = refine_model(

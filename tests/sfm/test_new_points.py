@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from room_scene import Room, exact_tracks, read_of
 
-from jaxsfm.colmap.model_arrays import Tracks, select
+from jaxsfm.colmap.model import Tracks, select
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
-from jaxsfm.sfm.register.grow import Newcomer, grow
+from jaxsfm.sfm.register.grow import UnregisteredView, grow
 from jaxsfm.sfm.register.triangulate import matched_tracks, new_points, triangulated
 
 NEW = "3.png"
@@ -117,8 +117,8 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
     tracks = exact_tracks(rendered, use=use)
     every = {view.name: view for view in rendered.views}
     newcomers = {
-        NEW: Newcomer(every[NEW], False, ["0.png", "1.png", "2.png", "4.png"]),
-        "4.png": Newcomer(every["4.png"], False, [NEW]),
+        NEW: UnregisteredView(every[NEW], False, ["0.png", "1.png", "2.png", "4.png"]),
+        "4.png": UnregisteredView(every["4.png"], False, [NEW]),
     }
     grown = grow(
         rendered.views[:3],

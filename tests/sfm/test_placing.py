@@ -10,8 +10,8 @@ from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine import octave_pose
 from jaxsfm.sfm.refine.octave_pose import (
-    Followed,
-    Observed,
+    PoseHypothesis,
+    AlignedPoints,
     Pose,
     _doubt,
     at_octave,
@@ -24,12 +24,12 @@ from jaxsfm.sfm.view_graph import rotation_angle_deg
 NIGHT = 2
 
 
-def observed(scene: Room, rows: np.ndarray, sigma: float) -> Observed:
+def observed(scene: Room, rows: np.ndarray, sigma: float) -> AlignedPoints:
     """Points as the night view would show them, off by noise."""
     points = scene.points[rows]
     xy = scene.views[NIGHT].project(points)[0]
     noise = np.random.default_rng(0).normal(0, sigma, xy.shape)
-    return Observed(rows, points, xy + noise, scene.points[scene.visible[:, NIGHT]])
+    return AlignedPoints(rows, points, xy + noise, scene.points[scene.visible[:, NIGHT]])
 
 
 @pytest.mark.parametrize("sigma", [0.3, 2.0])
@@ -106,7 +106,7 @@ def test_a_pose_is_trusted_with_little_doubt_and_enough_that_agrees(
     view = rendered.views[NIGHT]
     seen = observed(rendered, np.arange(40), 1.0)
     best = Pose(view, 2, seen, 40, 1.0, doubt_px)
-    pose = Followed(view=view, own_camera=False, best=best, share=share)
+    pose = PoseHypothesis(view=view, own_camera=False, best=best, share=share)
     assert trusted(pose) is (best if right else None)
     assert trusted(dataclasses.replace(pose, best=None)) is None
 
@@ -117,7 +117,7 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
     start, end, last = rendered.views[NIGHT], rendered.views[0], rendered.views[1]
     seen = observed(rendered, np.arange(40), 1.0)
     found = {"doubtful": 0.8, "sure": 0.3, "lost": None}
-    poses = {name: Followed(view=start, own_camera=False) for name in found}
+    poses = {name: PoseHypothesis(view=start, own_camera=False) for name in found}
     began = []
 
     def descend(moving, *_):

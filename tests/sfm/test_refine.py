@@ -19,7 +19,7 @@ from room_scene import (
 )
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, room
-from jaxsfm.colmap.model_arrays import Tracks, build_model, read_model_arrays
+from jaxsfm.colmap.model import Tracks, build_model, read_model_arrays
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.evaluation import evaluate

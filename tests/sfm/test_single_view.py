@@ -7,9 +7,9 @@ import pytest
 from room_scene import Room, camera, exact_tracks, other_scene, read_of
 from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 
-from jaxsfm.colmap.model_arrays import Tracks, View, part_of
+from jaxsfm.colmap.model import Tracks, View, part_of
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.register.locate_view import Located, locate
+from jaxsfm.sfm.register.locate_view import Localization, locate
 
 
 def known(scene: Room) -> tuple[list[View], Tracks]:
@@ -19,7 +19,7 @@ def known(scene: Room) -> tuple[list[View], Tracks]:
     return part_of(scene.views, exact_tracks(scene, use=use), set(scene.images) - {NIGHT_NAME})[:2]
 
 
-def found(scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, focal=1.0) -> Located:
+def found(scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, focal=1.0) -> Localization:
     unknown = camera()
     unknown.params = [*(focal * np.asarray(unknown.params[:2])), *unknown.params[2:]]
     image = dataclasses.replace(
@@ -35,7 +35,7 @@ def found(scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, foc
     )
 
 
-def errors(located: Located, scene: Room) -> tuple[float, float]:
+def errors(located: Localization, scene: Room) -> tuple[float, float]:
     """Of centre and rotation (degrees)."""
     assert located.view is not None
     truth = scene.views[NIGHT]

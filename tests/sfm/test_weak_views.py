@@ -21,7 +21,7 @@ from room_scene import (
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.colmap.mapper import registered
-from jaxsfm.colmap.model_arrays import View, build_model, read_model_arrays
+from jaxsfm.colmap.model import View, build_model, read_model_arrays
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
@@ -29,14 +29,14 @@ from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import PairResult, make_pair
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry, weak_views
-from jaxsfm.sfm.refine.octave_pose import Followed, follow
+from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 from jaxsfm.sfm.refine.weak_views import (
     NO_EVIDENCE,
     Evidence,
-    LeftOut,
-    Placed,
+    UnmappedImage,
+    Placement,
     place_weak_views,
     take_out,
 )
@@ -186,7 +186,7 @@ def test_a_view_that_alignment_confirms_stays_however_little_held_it(rendered):
 def test_two_views_are_a_model_whatever_holds_them(rendered):
     model = lost_view(rendered, seen=0)
     weak = [
-        Placed(name=n, registered=True, octave_px=None, candidates=9, agreed=0, error_px=None)
+        Placement(name=n, registered=True, octave_px=None, candidates=9, agreed=0, error_px=None)
         for n in sorted(registered(model))
     ]
     few = read_model_arrays(model, sizes(rendered))
@@ -259,7 +259,7 @@ def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
             num_dropped=0,
             status=Status.VERIFIED,
         )
-    return Evidence(results, [LeftOut(NIGHT_NAME, NIGHT + 1, camera())], 0)
+    return Evidence(results, [UnmappedImage(NIGHT_NAME, NIGHT + 1, camera())], 0)
 
 
 def test_an_image_that_was_left_out_is_registered_from_a_few_right_matches(rendered):
@@ -371,7 +371,7 @@ def test_only_points_that_a_target_may_show_are_looked_at(rendered):
     np.testing.assert_array_equal(some.rows[some.found.point], every.rows[every.found.point][mine])
     np.testing.assert_array_equal(some.moved, every.moved[mine])
     assert aligned(turned(180), [len(views)]) == []
-    behind = Followed(view=turned(180), own_camera=False)
+    behind = PoseHypothesis(view=turned(180), own_camera=False)
     follow([behind], views, tracks, read_of(rendered), config)
     assert behind.best is None and behind.agreed == 0
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Tracks, View
 from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.photos import Reader
@@ -47,7 +47,7 @@ MAX_SIGMA_PX = 1.0
 """Largest standard deviation of an observation, pixels of its octave; hundreds make the pose."""
 
 
-class Observed(NamedTuple):
+class AlignedPoints(NamedTuple):
     """Points that one view shows, by alignment."""
 
     rows: np.ndarray
@@ -66,7 +66,7 @@ class Pose(NamedTuple):
     view: View
     octave_px: int
     """Working pixels per pixel of the octave."""
-    observed: Observed
+    observed: AlignedPoints
     """In working pixels; those within the error limit."""
     agreed: int
     error_px: float
@@ -122,10 +122,10 @@ def at_octave(
 
 def _observe(
     views: list[View], tracks: Tracks, read: Reader, targets: Sequence[int], config: Refinement
-) -> list[Observed]:
+) -> list[AlignedPoints]:
     """Where each of the target views shows the points of `tracks`, which has no observations of
     them."""
-    nothing = Observed(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 3)))
+    nothing = AlignedPoints(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 3)))
     parts = [[nothing] for _ in targets]
     gate = dataclasses.replace(config, min_score=config.weak_min_score, max_sigma_px=MAX_SIGMA_PX)
     for b in align_blocks(tracks, views, read, gate, config.max_shift_px, targets=targets):
@@ -134,9 +134,9 @@ def _observe(
             good = np.flatnonzero(own & b.agrees)
             at = b.found.point[good]
             could = b.points[b.found.point[own]]
-            part.append(Observed(b.rows[at], b.points[at], b.moved[good], could))
+            part.append(AlignedPoints(b.rows[at], b.points[at], b.moved[good], could))
     return [
-        Observed(
+        AlignedPoints(
             np.concatenate([o.rows for o in part]),
             np.concatenate([o.points for o in part]),
             np.concatenate([o.xy for o in part]),
@@ -185,7 +185,7 @@ def _covariance(own: np.ndarray, xy: np.ndarray, error_px: float, side: float) -
     return variance * np.linalg.inv(information)
 
 
-def _doubt(view: View, seen: Observed, error_px: float, side: int) -> float:
+def _doubt(view: View, seen: AlignedPoints, error_px: float, side: int) -> float:
     """How far off the projections of what a view could show are expected to be, root mean square
     along an axis, pixels: the covariance of least squares, carried over to those points.
 
@@ -229,7 +229,7 @@ def pose_doubt(
     return PoseDoubt(_reach(view, points) * shift, float(np.degrees(turn)))
 
 
-def _step(pose: Followed, view: View, seen: Observed, px: int, config: Refinement) -> bool:
+def _step(pose: Followed, view: View, seen: AlignedPoints, px: int, config: Refinement) -> bool:
     """Move a pose to where an octave's points want it; whether that is far.
 
     Args:
@@ -250,7 +250,7 @@ def _step(pose: Followed, view: View, seen: Observed, px: int, config: Refinemen
     if pose.best is None or doubt_px < pose.best.doubt_px:
         near = errors <= config.max_error_px
         xy = (seen.xy[near] + 0.5) * px - 0.5
-        kept = Observed(seen.rows[near], seen.points[near], xy, seen.could)
+        kept = AlignedPoints(seen.rows[near], seen.points[near], xy, seen.could)
         pose.best = Pose(pose.view, px, kept, pose.agreed, error_px * px, doubt_px)
     way = moved.project(seen.points)[0] - view.project(seen.points)[0]
     return bool(np.median(np.linalg.norm(way, axis=1)) > STILL_PX)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import (
+from jaxsfm.colmap.model import (
     Sizes,
     Tracks,
     View,
@@ -29,7 +29,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
-from jaxsfm.sfm.refine.weak_views import NO_EVIDENCE, Evidence, Placed, place_weak_views, take_out
+from jaxsfm.sfm.refine.weak_views import NO_EVIDENCE, Evidence, Placement, place_weak_views, take_out
 
 if TYPE_CHECKING:
     import pycolmap
@@ -67,7 +67,7 @@ class RefinementFigures:
     """What the refinement of a model did."""
 
     passes: list[PassFigures]
-    placed: list[Placed]
+    placed: list[Placement]
     """The weak views of any pass, and images that the mapper left out."""
 
 
@@ -175,7 +175,7 @@ def refine_model(
         on_pass()
         if not accepted:
             break
-    placed: list[Placed] = []
+    placed: list[Placement] = []
     # Weak in one pass is weak: what little agreed looks like much in the next (58 of 153
     # observations after 22 of 393, and the camera 0.4 m off).
     weak_names = sorted({name for f in figures if f.accepted for name in f.weak_views})

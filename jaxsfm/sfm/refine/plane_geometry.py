@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Tracks, View
 
 MIN_NORMAL_COSINE = 0.05
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Tracks, View
 from jaxsfm.config import Refinement
 from jaxsfm.core import align as align_core
 from jaxsfm.io.photos import Reader

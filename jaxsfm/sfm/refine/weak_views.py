@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Sizes, Tracks, View, build_model, part_of, read_model_arrays
+from jaxsfm.colmap.model import Sizes, Tracks, View, build_model, part_of, read_model_arrays
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, Followed, Pose, follow, trusted
+from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, PoseHypothesis, Pose, follow, trusted
 
 if TYPE_CHECKING:
     import pycolmap
@@ -32,7 +32,7 @@ off, and cells are 8 px wide."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Placed:
+class Placement:
     """What became of a weak view, or of an image that was not in the model."""
 
     name: str
@@ -51,7 +51,7 @@ class Placed:
     """Taken out of the model, for so few observations held it there; None: it was not."""
 
 
-class LeftOut(NamedTuple):
+class UnmappedImage(NamedTuple):
     """An image that is in no model."""
 
     name: str
@@ -64,7 +64,7 @@ class Evidence(NamedTuple):
 
     matches: Mapping[Pair, PairResult]
     """Verified matches by pair, original pixels."""
-    left_out: Sequence[LeftOut]
+    left_out: Sequence[UnmappedImage]
     seed: int
     """Of the resection from matches."""
 
@@ -116,7 +116,7 @@ def matched_points(
     return np.concatenate(xy), np.concatenate(points)
 
 
-def _outside(left_out: Sequence[LeftOut], sizes: Sizes) -> list[View]:
+def _outside(left_out: Sequence[UnmappedImage], sizes: Sizes) -> list[View]:
     """Views of images without a pose."""
     return [
         View(
@@ -141,7 +141,7 @@ def place_weak_views(
     config: Refinement,
     refine_intrinsics: bool,
     evidence: Evidence,
-) -> "tuple[pycolmap.Reconstruction, list[Placed]]":
+) -> "tuple[pycolmap.Reconstruction, list[Placement]]":
     """The model with its weak views, and images left out, placed on the structure of the other
     views, which stays as it is.
 
@@ -159,7 +159,7 @@ def place_weak_views(
     weak_ones = [k for k, view in enumerate(views) if view.name in weak]
     wanted = [*weak_ones, *range(len(views), len(images))]
     structure, rows = _structure(tracks, weak_ones)
-    poses: dict[int, list[Followed]] = {k: [] for k in wanted}
+    poses: dict[int, list[PoseHypothesis]] = {k: [] for k in wanted}
     if len(rows) and config.weak_octaves:
         poses = _starts(images, views, structure, wanted, evidence, config, refine_intrinsics)
         follow([pose for mine in poses.values() for pose in mine], views, structure, read, config)
@@ -175,8 +175,8 @@ def place_weak_views(
 
 
 def take_out(
-    model: "pycolmap.Reconstruction", placed: Sequence[Placed], sizes: Sizes
-) -> "tuple[pycolmap.Reconstruction, list[Placed]]":
+    model: "pycolmap.Reconstruction", placed: Sequence[Placement], sizes: Sizes
+) -> "tuple[pycolmap.Reconstruction, list[Placement]]":
     """The model without the views that nothing holds: alignment does not confirm their poses, and
     they have fewer observations than COLMAP asks for to register an image (`MIN_COUNT` too).
 
@@ -213,7 +213,7 @@ def _starts(
     evidence: Evidence,
     config: Refinement,
     refine_intrinsics: bool,
-) -> dict[int, list[Followed]]:
+) -> dict[int, list[PoseHypothesis]]:
     """The poses to follow, per wanted image."""
     normal = plane_geometry.normals(structure, views, neighbours=config.neighbours)
     cameras = [view.camera.camera_id for view in images]
@@ -228,15 +228,15 @@ def _starts(
             seed=evidence.seed,
         )
         starts[k] = [
-            Followed(view=view, own_camera=own)
+            PoseHypothesis(view=view, own_camera=own)
             for view in ([views[k]] if k < len(views) else []) + ([found] if found else [])
         ]
     return starts
 
 
-def _figures(name: str, registered: bool, mine: list[Followed], best: Pose | None) -> Placed:
+def _figures(name: str, registered: bool, mine: list[PoseHypothesis], best: Pose | None) -> Placement:
     most = max(mine, key=lambda pose: pose.agreed, default=None)
-    return Placed(
+    return Placement(
         name=name,
         registered=registered,
         octave_px=best.octave_px if best else None,

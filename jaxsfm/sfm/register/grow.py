@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View, part_of
+from jaxsfm.colmap.model import Tracks, View, part_of
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import Reader
-from jaxsfm.sfm.register.locate_view import Located, locate
+from jaxsfm.sfm.register.locate_view import Localization, locate
 from jaxsfm.sfm.register.triangulate import new_points
 
 
-class Newcomer(NamedTuple):
+class UnregisteredView(NamedTuple):
     """A view that has no pose yet."""
 
     view: View
@@ -29,7 +29,7 @@ class Newcomer(NamedTuple):
     """Views that it is matched with."""
 
 
-class Grown(NamedTuple):
+class ExtendedModel(NamedTuple):
     """A model with new views."""
 
     views: list[View]
@@ -38,7 +38,7 @@ class Grown(NamedTuple):
     """The old points first."""
     placed: list[str]
     """In the order of their rounds."""
-    located: dict[str, Located]
+    located: dict[str, Localization]
     """What became of every newcomer at its last attempt."""
     rounds: int
 
@@ -46,14 +46,14 @@ class Grown(NamedTuple):
 def grow(
     views: list[View],
     tracks: Tracks,
-    newcomers: Mapping[str, Newcomer],
+    newcomers: Mapping[str, UnregisteredView],
     matches: Mapping[Pair, PairResult],
     read: Reader,
     *,
     refinement: Refinement | None,
     seed: int = 0,
     on_view: Callable[[], None] = lambda: None,
-) -> Grown:
+) -> ExtendedModel:
     """Place newcomers until a round places none. Those of one round do not see each other.
 
     Args:
@@ -63,7 +63,7 @@ def grow(
       on_view: told of every view that is placed.
     """
     placed: list[str] = []
-    located: dict[str, Located] = {}
+    located: dict[str, Localization] = {}
     rounds, latest = 0, set()
     while True:
         fresh = {}
@@ -88,7 +88,7 @@ def grow(
                 fresh[name] = rows
                 on_view()
         if not fresh:
-            return Grown(views, tracks, placed, located, rounds)
+            return ExtendedModel(views, tracks, placed, located, rounds)
         rounds += 1
         views, tracks = _joined(views, tracks, {name: located[name] for name in fresh}, fresh)
         placed += sorted(fresh)
@@ -113,7 +113,7 @@ def matches_with(
 def _joined(
     views: list[View],
     tracks: Tracks,
-    located: Mapping[str, Located],
+    located: Mapping[str, Localization],
     rows: Mapping[str, np.ndarray],
 ) -> tuple[list[View], Tracks]:
     """The model with views that have found their poses, and what they show of its points.

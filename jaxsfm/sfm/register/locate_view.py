@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Tracks, View
 from jaxsfm.colmap.resection import MIN_POINTS, find_view
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
@@ -20,8 +20,8 @@ from jaxsfm.sfm.refine.octave_pose import (
     MAX_DOUBT_PX,
     MIN_COUNT,
     MIN_SHARE,
-    Followed,
-    Observed,
+    PoseHypothesis,
+    AlignedPoints,
     follow,
     pose_doubt,
     trusted,
@@ -33,7 +33,7 @@ CELL_PX = 8
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Located:
+class Localization:
     """What became of a photo."""
 
     view: View | None
@@ -60,7 +60,7 @@ class Located:
     """Expected error of the centre, units of the model, beside the model's own."""
     rotation_error_deg: float | None
     """Likewise, of the rotation."""
-    observed: Observed | None = None
+    observed: AlignedPoints | None = None
     """The points that it shows, of a trusted pose."""
 
 
@@ -74,7 +74,7 @@ def locate(
     config: Refinement,
     own_camera: bool,
     seed: int = 0,
-) -> Located:
+) -> Localization:
     """The pose of a photo among views of a model.
 
     Args:
@@ -104,7 +104,7 @@ def locate(
     near = np.isfinite(errors) & (errors <= MATCH_ERROR_PX)
     if near.sum() < MIN_POINTS:  # of the camera after its refinement
         return _nowhere(len(xy), matches)
-    pose = Followed(view=found, own_camera=own_camera)
+    pose = PoseHypothesis(view=found, own_camera=own_camera)
     if config.weak_octaves:
         follow([pose], views, tracks, read, config)
     best = trusted(pose)
@@ -124,7 +124,7 @@ def locate(
         seen = best.observed.points, best.observed.xy
         side = best.octave_px * (2 * config.radius + 1)
     doubt = pose_doubt(view, *seen, error_px, side, focal=own_camera)
-    return Located(
+    return Localization(
         view=view,
         trusted=best is not None,
         why=None if best else _doubtful(pose, int(near.sum()), len(xy)),
@@ -141,7 +141,7 @@ def locate(
     )
 
 
-def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Located:
+def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Localization:
     """No pose."""
     most = max((result.num_inliers for result in matches.values()), default=0)
     if most == 0:
@@ -154,7 +154,7 @@ def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Located:
         )
     else:
         why = f"no pose agrees with enough of the {on_surface} matches on the model's surface"
-    return Located(
+    return Localization(
         view=None,
         trusted=False,
         why=why,
@@ -170,7 +170,7 @@ def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Located:
     )
 
 
-def _doubtful(pose: Followed, inliers: int, on_surface: int) -> str:
+def _doubtful(pose: PoseHypothesis, inliers: int, on_surface: int) -> str:
     """Why a pose from matches is not trusted."""
     start = f"a pose agrees with {inliers} of {on_surface} matches, but "
     if pose.best is None:

@@ -7,7 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from jaxsfm.colmap.model_arrays import Tracks, View, errors_px, select
+from jaxsfm.colmap.model import Tracks, View, errors_px, select
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Reader
