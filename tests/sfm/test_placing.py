@@ -10,9 +10,9 @@ from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine import octave_pose
 from jaxsfm.sfm.refine.octave_pose import (
-    PoseHypothesis,
     AlignedPoints,
     Pose,
+    PoseHypothesis,
     _doubt,
     at_octave,
     follow,

@@ -19,7 +19,9 @@ def known(scene: Room) -> tuple[list[View], Tracks]:
     return part_of(scene.views, exact_tracks(scene, use=use), set(scene.images) - {NIGHT_NAME})[:2]
 
 
-def found(scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, focal=1.0) -> Localization:
+def found(
+    scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, focal=1.0
+) -> Localization:
     unknown = camera()
     unknown.params = [*(focal * np.asarray(unknown.params[:2])), *unknown.params[2:]]
     image = dataclasses.replace(

@@ -35,8 +35,8 @@ from jaxsfm.sfm.refine.track_alignment import align_blocks
 from jaxsfm.sfm.refine.weak_views import (
     NO_EVIDENCE,
     Evidence,
-    UnmappedImage,
     Placement,
+    UnmappedImage,
     place_weak_views,
     take_out,
 )

@@ -77,7 +77,7 @@ class Pose(NamedTuple):
 
 
 @dataclasses.dataclass(kw_only=True)
-class Followed:
+class PoseHypothesis:
     """A pose that is followed from octave to octave."""
 
     view: View
@@ -93,7 +93,7 @@ class Followed:
     """Largest share of the candidates that agreed at an octave."""
 
 
-def trusted(pose: Followed) -> Pose | None:
+def trusted(pose: PoseHypothesis) -> Pose | None:
     """The best octave's pose, if the evidence is enough for it."""
     best = pose.best
     enough = best is not None and pose.share >= MIN_SHARE and best.doubt_px <= MAX_DOUBT_PX
@@ -229,7 +229,9 @@ def pose_doubt(
     return PoseDoubt(_reach(view, points) * shift, float(np.degrees(turn)))
 
 
-def _step(pose: Followed, view: View, seen: AlignedPoints, px: int, config: Refinement) -> bool:
+def _step(
+    pose: PoseHypothesis, view: View, seen: AlignedPoints, px: int, config: Refinement
+) -> bool:
     """Move a pose to where an octave's points want it; whether that is far.
 
     Args:
@@ -257,7 +259,7 @@ def _step(pose: Followed, view: View, seen: AlignedPoints, px: int, config: Refi
 
 
 def follow(
-    poses: Sequence[Followed],
+    poses: Sequence[PoseHypothesis],
     views: Sequence[View],
     structure: Tracks,
     read: Reader,
@@ -279,7 +281,7 @@ def follow(
 
 
 def _descend(
-    poses: Sequence[Followed],
+    poses: Sequence[PoseHypothesis],
     views: Sequence[View],
     structure: Tracks,
     read: Reader,

@@ -29,7 +29,13 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
-from jaxsfm.sfm.refine.weak_views import NO_EVIDENCE, Evidence, Placement, place_weak_views, take_out
+from jaxsfm.sfm.refine.weak_views import (
+    NO_EVIDENCE,
+    Evidence,
+    Placement,
+    place_weak_views,
+    take_out,
+)
 
 if TYPE_CHECKING:
     import pycolmap

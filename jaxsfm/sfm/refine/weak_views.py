@@ -18,7 +18,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, PoseHypothesis, Pose, follow, trusted
+from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, Pose, PoseHypothesis, follow, trusted
 
 if TYPE_CHECKING:
     import pycolmap
@@ -234,7 +234,9 @@ def _starts(
     return starts
 
 
-def _figures(name: str, registered: bool, mine: list[PoseHypothesis], best: Pose | None) -> Placement:
+def _figures(
+    name: str, registered: bool, mine: list[PoseHypothesis], best: Pose | None
+) -> Placement:
     most = max(mine, key=lambda pose: pose.agreed, default=None)
     return Placement(
         name=name,
