@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.formats.lens import Lens, check_one_focal, lens_of, point_tracks, registered_images
+from jaxsfm.colmap.formats.lens import (
+    Lens,
+    check_one_focal,
+    lens_of,
+    point_tracks,
+    registered_images,
+)
 from jaxsfm.colmap.formats.tables import Tables
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
