@@ -3,14 +3,17 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model import Tracks, View, errors_px, point_colours, read_model_arrays
+from jaxsfm.colmap.model import Model as ModelArrays
+from jaxsfm.colmap.model import point_colours
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Config, PairShape, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, inspect_image, read_image
@@ -24,9 +27,9 @@ logger = logging.getLogger(__name__)
 
 
 class Model(NamedTuple):
-    """The best model, in original pixels (`View.scale` is 1)."""
+    """The best model, in original pixels (`View.pixels` are theirs)."""
 
-    views: list[View]
+    views: Sequence[View]
     tracks: Tracks
     colours: np.ndarray
     """uint8 (n, 3), RGB of the points."""
@@ -123,9 +126,9 @@ def _model(folder: Path) -> tuple[Model, Poses] | None:
     model = read_model(folder / "sparse" / "0")
     cameras = {model.image(i).name: model.camera(model.image(i).camera_id) for i in model.images}
     sizes = {name: ((c.width, c.height), (1.0, 1.0)) for name, c in cameras.items()}
-    views, tracks = read_model_arrays(model, sizes)
-    errors = errors_px(views, tracks)
-    return Model(views, tracks, point_colours(model), errors), model_poses(model)
+    arrays = ModelArrays.from_colmap(model, sizes)
+    shown = Model(arrays.views, arrays.tracks, point_colours(model), arrays.errors_px())
+    return shown, model_poses(model)
 
 
 def _reference(report: dict[str, Any], poses: Poses, given: Path | None) -> Reference | None:

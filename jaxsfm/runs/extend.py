@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
+from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.model import build_model
 from jaxsfm.colmap.models import colour_points, read_models, write_models
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
@@ -161,9 +161,11 @@ def _extended(
     verified = add_matches(
         database,
         matches,
-        seed=model.seed,
-        threads=kept.report["options"]["threads"],
-        scale=Photos(files.values(), config).median_scale(),
+        VerificationOptions(
+            seed=model.seed,
+            threads=kept.report["options"]["threads"],
+            scale=Photos(files.values(), config).median_scale(),
+        ),
     )
     newcomers = {
         name: UnregisteredView(
@@ -185,8 +187,7 @@ def _extended(
             bar.update()
 
         grown = grow(
-            model.views,
-            model.tracks,
+            model.model,
             newcomers,
             matches,
             Photos(files.values(), config).gray,
@@ -210,6 +211,6 @@ def _models(
     """The run's models, the best one grown."""
     models = read_models(home / "sparse", database)
     if grown.placed:
-        models[0] = build_model(models[0], grown.views, grown.tracks)
+        models[0] = grown.model.to_colmap()
         colour_points(models[0], Photos(files.values(), model.config).rgb)
     return models

@@ -14,12 +14,14 @@ import numpy as np
 
 from jaxsfm.colmap.database import camera_for
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
-from jaxsfm.colmap.model import Tracks, View, read_model_arrays
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import read_model
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
 from jaxsfm.core.pooling import TIE
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, shown_name, working_size
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.execution import Execution
@@ -35,10 +37,14 @@ Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
 class KnownModel(NamedTuple):
     """The best model of a run, in working pixels."""
 
-    views: list[View]
-    tracks: Tracks
+    model: Model
     config: Config
     seed: int
+
+    @property
+    def views(self) -> Sequence[View]:
+        """The views of the model."""
+        return self.model.views
 
 
 class ChosenCamera(NamedTuple):
@@ -67,7 +73,7 @@ def known_model(folder: Path, config: Config, *, seed: int = 0) -> KnownModel:
     for name, camera in cameras.items():
         width, height = working_size((camera.width, camera.height), config.max_size, config.enlarge)
         sizes[name] = (width, height), (camera.width / width, camera.height / height)
-    return KnownModel(*read_model_arrays(model, sizes), config, seed)
+    return KnownModel(Model.from_colmap(model, sizes), config, seed)
 
 
 def choose_camera(
@@ -95,15 +101,8 @@ def choose_camera(
 def view_of(image: ImageFile, chosen: ChosenCamera, config: Config) -> View:
     """A photo that has no pose yet."""
     width, height = working_size(image.size, config.max_size, config.enlarge)
-    return View(
-        image_id=0,
-        name=image.name,
-        rotation=np.eye(3),
-        centre=np.zeros(3),
-        camera=chosen.camera,
-        scale=np.asarray([image.size[0] / width, image.size[1] / height]),
-        size=(width, height),
-    )
+    pixels = Pixels((image.size[0] / width, image.size[1] / height))
+    return View.without_pose(image.name, 0, chosen.camera, (width, height), pixels)
 
 
 def run_weights(run: KeptRun, choice: WeightsChoice) -> Weights:

@@ -16,7 +16,6 @@ from typing import Any
 from tqdm import tqdm
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.model import part_of
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures, feature_capacity
@@ -88,14 +87,13 @@ def locate_photo(
     read: Reader,
 ) -> Localization:
     """The pose of a photo from its matches with the shortlisted photos of a model."""
-    views, tracks, _ = part_of(model.views, model.tracks, shortlist)
+    part, _ = model.model.part(shortlist)
     return locate(
         view_of(image, chosen, model.config),
-        views,
-        tracks,
+        part,
         matches,
         read,
-        config=model.config.refinement or Refinement(),
+        refinement=model.config.refinement or Refinement(),
         own_camera=chosen.own,
         seed=model.seed,
     )

@@ -4,8 +4,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from jaxsfm.colmap.model import View
 from jaxsfm.colmap.poses import CameraPose, Poses
+from jaxsfm.colmap.view import View
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult

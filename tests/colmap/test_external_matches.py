@@ -17,7 +17,7 @@ from jaxsfm.colmap.formats.database import read_database
 from jaxsfm.colmap.formats.hloc import FEATURES, MATCHES, write_hloc
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions
-from jaxsfm.colmap.model import read_model_arrays
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import UserError
 
@@ -132,7 +132,7 @@ def test_refinement_reads_tracks_whatever_the_order_of_keypoints():
         for element in point.track.elements:
             track.add_element(element.image_id, int(place[element.image_id][element.point2D_idx]))
         shuffled.add_point3D(point.xyz, track, point.color)
-    (_, one), (_, other) = (read_model_arrays(m, sizes) for m in (MODEL, shuffled))
+    one, other = (Model.from_colmap(m, sizes).tracks for m in (MODEL, shuffled))
     for a, b in zip(one, other, strict=True):
         assert np.array_equal(a, b)
 

@@ -55,13 +55,13 @@ def verified(run: KeptRun, files: dict[str, ImageFile], scratch: Path) -> Path:
     pairs = [tuple(row["pair"]) for row in rows if row["handed_on"]]
     partial, options = scratch / "partial.db", map_options(run, files)
     colmap.write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
-    colmap.verify(
-        partial,
+    verification = colmap.VerificationOptions(
         seed=options.seed,
         threads=options.threads,
         scale=options.scale,
         relative_poses=run.config.view_graph,
     )
+    colmap.verify(partial, verification)
     return partial.rename(database)
 
 
@@ -97,7 +97,7 @@ def without(
         models[0], _ = refine_model(
             models[0],
             Photos(files.values(), run.config).gray,
-            config=run.config.refinement,
+            refinement=run.config.refinement,
             refine_intrinsics=options.refine_intrinsics,
             threads=options.threads,
         )
