@@ -153,7 +153,7 @@ def reconstruct(
     )
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
-    from jaxsfm.runs.reconstruct import run_folder
+    from jaxsfm.runs.reconstruct import reconstruct_folder
     from jaxsfm.runs.run_options import RunOptions
 
     try:
@@ -183,9 +183,9 @@ def reconstruct(
         keep_features=keep_features,
         progress=True,
     )
-    report = run_folder(images, out, config=config, options=options)
+    report = reconstruct_folder(images, out, config=config, options=options)
     print("\n".join(summary_lines(report)))
-    if not report["models"]:
+    if not report.models:
         where = out / "failed" if (out / "sparse").exists() else out
         print(
             f"jaxsfm: no model: see the lost images above and {where / 'report.json'}",

@@ -11,13 +11,13 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.features import ImageFeatures, feature_capacity
 from jaxsfm.io.images import (
     ImageError,
@@ -33,7 +33,7 @@ from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.extraction import extracted, image_features
 from jaxsfm.matching.pair_matching import matched
 from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
-from jaxsfm.report.finished_run import KeptRun, read_run
+from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.runs.finished_model import (
     ChosenCamera,
     KnownModel,
@@ -45,7 +45,13 @@ from jaxsfm.runs.finished_model import (
     run_weights,
     view_of,
 )
-from jaxsfm.runs.localize_report import UNUSABLE, error_against, located_figures
+from jaxsfm.runs.localize_report import (
+    LocalizationReport,
+    LocalizedPhoto,
+    UnusablePhoto,
+    error_against,
+    localized_photo,
+)
 from jaxsfm.sfm.register.locate_view import Localization, locate
 
 
@@ -70,7 +76,7 @@ class LocalizeOptions:
     progress: bool = False
 
     def chosen_shortlist(
-        self, run: KeptRun, weights: Weights, new: Mapping[str, ImageFile]
+        self, run: FinishedRun, weights: Weights, new: Mapping[str, ImageFile]
     ) -> Shortlist:
         """As a function; `new` as in `by_similarity`."""
         if isinstance(self.shortlist, int):
@@ -123,11 +129,11 @@ def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, st
 
 @contextmanager
 def _features(
-    run: KeptRun, weights: Weights, files: Mapping[str, ImageFile], options: LocalizeOptions
+    run: FinishedRun, weights: Weights, files: Mapping[str, ImageFile], options: LocalizeOptions
 ) -> Iterator[Callable[[str], ImageFeatures]]:
     """Features of the run's photos by name: kept ones, else computed once, on disk (meanwhile)."""
     with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-        apart = Store(Path(scratch), run.report["identity"])
+        apart = Store(Path(scratch), run.report.identity.to_json())
         fresh = run.matches if options.keep_features else apart
         todo = [image for image in files.values() if not run.matches.has_features(image)]
         stream = extracted(weights, todo, config=run.config, execution=options.execution)
@@ -146,8 +152,18 @@ def _features(
         yield load
 
 
-def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> dict[str, Any]:
-    """Localize photos in a finished run; returns plain JSON, a row for each photo.
+def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> dict[str, Json]:
+    """Localize photos in a finished run; returns plain JSON, with a row for each photo.
+
+    See `localize_photos`, which returns the result as an object.
+    """
+    return localize_photos(photos, run, options=options).to_json()
+
+
+def localize_photos(
+    photos: Sequence[Path], run: Path, *, options: LocalizeOptions
+) -> LocalizationReport:
+    """Localize photos in a finished run.
 
     Args:
       photos: files, or folders of them.
@@ -160,7 +176,7 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     kept = read_run(run, images=options.images, reference=options.reference)
     if kept.model is None:
         raise UserError(f"{run}: this run has no model to localize photos in")
-    seed = kept.report["options"]["seed"]
+    seed = kept.report.options.seed
     model = known_model(kept.folder / "sparse" / "0", kept.config, seed=seed)
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, unusable = _queries(photos)
@@ -170,39 +186,47 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     shortlists, unknown = {}, {image.name: image for image in usable.values()}
     shortlist = options.chosen_shortlist(kept, weights, unknown)
     for path, image in usable.items():
-        own = kept.photos.called(image.sha256)
+        own = kept.photos.name_of(image.sha256)
         try:
             shortlists[path] = shortlist(image, [name for name in names if name != own])
         except ImageError as error:
             unusable[path] = str(error)
     files = run_files(kept, sorted({name for some in shortlists.values() for name in some}))
-    rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
+    rows: list[LocalizedPhoto | UnusablePhoto] = [
+        UnusablePhoto(photo=path, why=why) for path, why in unusable.items()
+    ]
     with _features(kept, weights, files, options) as load:
         todo = {path: usable[path] for path in shortlists}
         read = Photos([*files.values(), *todo.values()], model.config).gray
         each = tqdm(todo.items(), desc="localizing", unit="photo", disable=not options.progress)
         for path, image in each:
-            row: dict[str, Any] = {
-                "photo": path,
-                "in_run": kept.photos.called(image.sha256),
-                "shortlist": sorted(shortlists[path]),
-            }
             try:
                 matches = _matches(image, shortlists[path], load, weights, model, options)
                 found = locate_photo(image, cameras[path], model, shortlists[path], matches, read)
             except ImageError as error:
-                rows.append(row | {"status": UNUSABLE, "why": str(error)})
+                listed = sorted(shortlists[path])
+                rows.append(UnusablePhoto(photo=path, shortlist=listed, why=str(error)))
                 continue
-            row |= located_figures(found, cameras[path].source, matches)
+            error = None
             if found.view is not None and kept.reference is not None:
                 name, reference = Path(path).name, kept.reference.poses
-                row["error"] = error_against(name, found.view, model.views, reference)
-            rows.append(row)
-    return {
-        "version": importlib.metadata.version("jaxsfm"),
-        "model": str(run.absolute()),
-        "photos": sorted(rows, key=lambda row: row["photo"]),
-    }
+                error = error_against(name, found.view, model.views, reference)
+            rows.append(
+                localized_photo(
+                    path,
+                    found,
+                    matches,
+                    source=cameras[path].source,
+                    in_run=kept.photos.name_of(image.sha256),
+                    shortlist=shortlists[path],
+                    error=error,
+                )
+            )
+    return LocalizationReport(
+        version=importlib.metadata.version("jaxsfm"),
+        model=str(run.absolute()),
+        photos=sorted(rows, key=lambda row: row.photo),
+    )
 
 
 def _matches(

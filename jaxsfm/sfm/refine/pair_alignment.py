@@ -86,7 +86,7 @@ def align_matches(
             found = align_patches(
                 image1, templates, at1, affine[piece], patch, iterations=DEFAULTS.iterations
             )
-            moved = octave.to_original(found.xy).astype(np.float32)
+            moved = octave.to_original(np.asarray(found.xy)).astype(np.float32)
             off_plane = np.linalg.norm(moved - on_plane[piece], axis=1)
             good = (limits.accept(found, at1) & (off_plane < max_error_px))[:count]
             rows = piece[:count][good]
