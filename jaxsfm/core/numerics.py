@@ -1,7 +1,7 @@
 """Small numerically careful pieces shared by the stages."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -52,10 +52,14 @@ def compact(mask: Bool[Array, " k"], *, size: int) -> tuple[Int[Array, " size"],
     )
 
 
-def one_by_one(function: Callable[[Any], Any], items: Any, *, batch_size: int) -> Any:
-    """`function` over the leading axis of `items`, `batch_size` of them vmapped at a time.
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
-    A single item is no loop: XLA then sees what it sees without a batch.
+
+def one_by_one(function: Callable[[Item], Result], items: Item, *, batch_size: int) -> Result:
+    """`function` over the leading axis of the arrays in `items`, `batch_size` vmapped at a time.
+
+    A single item is not computed in a loop, so that XLA compiles what it compiles without a batch.
     """
     if jax.tree.leaves(items)[0].shape[0] == 1:
         result = function(jax.tree.map(lambda x: x[0], items))

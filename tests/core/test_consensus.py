@@ -12,13 +12,15 @@ from tolerances import NEAR_TIE
 from jaxsfm.core.consensus import consensus_nn, weights
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.types import DescriptorGrid
 
 join = jax.jit(join_octaves)
 _match = jax.jit(consensus_nn, static_argnames=("radius", "columns", "tile"))
 
 
-def match(*args, columns: int = 16, **kwargs):
-    return _match(*args, columns=columns, **kwargs)
+def match(a, b, grid0, grid1, *, parts=(), columns: int = 16, **kwargs):
+    cells = DescriptorGrid(a, grid0, parts), DescriptorGrid(b, grid1)
+    return _match(*cells, columns=columns, **kwargs)
 
 
 def padded(x: np.ndarray, rows: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from strategies import random_homography, rng_of
 from jaxsfm.config import PairShape
 from jaxsfm.core.planes import nearest_plane, settle
 from jaxsfm.core.ransac import peel_planes
-from jaxsfm.core.types import Thresholds
+from jaxsfm.core.types import Correspondences, Thresholds
 
 peel = jax.jit(peel_planes, static_argnames=("shape",))
 LIMITS = Thresholds(np.float32(4), np.int32(20), np.float32(0.999))
@@ -83,9 +83,7 @@ def test_a_plane_without_points_of_its_own_is_given_up():
     homographies, num, plane = settle(
         planes,
         jnp.asarray([300, 300, 0], jnp.int32),
-        xy0,
-        xy1,
-        jnp.ones(len(xy0), bool),
+        Correspondences(xy0, xy1, jnp.ones(len(xy0), bool)),
         jnp.float32(4),
         jnp.int32(20),
         rounds=10,
@@ -104,9 +102,11 @@ def alone(h, num, xy0, xy1, *, rounds, threshold=4.0, floor=20):
     return settle(
         jnp.asarray(h, jnp.float32),
         jnp.asarray(num, jnp.int32),
-        jnp.asarray(xy0, jnp.float32),
-        jnp.asarray(xy1, jnp.float32),
-        jnp.ones(len(xy0), bool),
+        Correspondences(
+            jnp.asarray(xy0, jnp.float32),
+            jnp.asarray(xy1, jnp.float32),
+            jnp.ones(len(xy0), bool),
+        ),
         jnp.float32(threshold),
         jnp.int32(floor),
         rounds=rounds,
@@ -181,9 +181,7 @@ def test_without_planes_nothing_is_a_member():
     none = nearest_plane(
         jnp.zeros((3, 3, 3)),
         jnp.zeros(3, bool),
-        xy0,
-        xy1,
-        jnp.ones(len(xy0), bool),
+        Correspondences(xy0, xy1, jnp.ones(len(xy0), bool)),
         jnp.float32(4),
     )
     assert (np.asarray(none) == -1).all()
