@@ -21,7 +21,8 @@ from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits, align_patches, ma
 
 DEFAULTS = Refinement()
 """The radius of patches, the iterations and the limits are those of the refinement. In unlike light
-and seasons, a lower score (0.6) lets in patches that only look alike (docs/design.md)."""
+and seasons, a lower score (0.6) lets in patches that only look alike
+(docs/decisions/refinement.md)."""
 
 
 class AlignedMatches(NamedTuple):
