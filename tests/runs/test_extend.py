@@ -131,6 +131,7 @@ def test_without_new_photos_nothing_changes(extended, capsys):
     assert contents(extended.run) == before
 
 
+@pytest.mark.slow
 def test_reconstruct_goes_on_from_what_extend_matched(extended, scene, tmp_path, capsys):
     run = Path(shutil.copytree(extended.run, tmp_path / "run"))
     args = ["--out", str(run), "--intrinsics", str(scene / "K.txt"), "--refine", "0"]
@@ -149,6 +150,7 @@ def copied(plain, scene, tmp_path) -> tuple[Path, Path]:
     return run, photos
 
 
+@pytest.mark.slow
 def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_path, capsys):
     run, photos = copied
     bad = {"broken.png": b"not an image", "cut.png": b""}
@@ -178,6 +180,7 @@ def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_
     assert "evaluation" not in report and "reference" in report["evaluation_failed"]
 
 
+@pytest.mark.slow
 def test_killed_while_publishing_or_beside_another_run_the_report_is_the_newest(
     copied, capsys, monkeypatch
 ):

@@ -62,6 +62,7 @@ def test_windows_depend_on_the_step_alone(weights, inputs, pairs):
     assert not np.array_equal(pairs.draw(5, weights).known, pairs.draw(6, weights).known)
 
 
+@pytest.mark.slow
 def test_posed_pairs_are_a_loss_of_their_own(weights, inputs, pairs):
     import jax
 

@@ -62,6 +62,7 @@ def test_training_lowers_the_loss_on_the_views_it_sees(weights, images, tmp_path
 
 
 @pytest.mark.parametrize(("at", "reached"), [("train_step", 3), ("mean_shares", 2)])
+@pytest.mark.slow
 def test_an_interrupted_training_ends_with_the_same_parameters(
     weights, images, tmp_path, monkeypatch, few_measurements, at, reached
 ):
@@ -160,6 +161,7 @@ def test_wrong_objectives_are_refused_by_name(field):
 # -- command line -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_trained_file_is_used_by_reconstruct_and_match(
     folder, scene, tmp_path, capsys, few_measurements
 ):

@@ -122,6 +122,7 @@ def test_the_independent_network_is_what_scipy_computes(layout, convolution, bgr
         np.testing.assert_allclose(found[..., k], sum(planes) + bias[k], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_installed_weights_through_a_file_are_the_installed_weights(tmp_path):
     import safetensors.numpy
 
