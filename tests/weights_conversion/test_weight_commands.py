@@ -1,4 +1,4 @@
-"""`jaxsfm weights`: what the commands do with good files and bad ones."""
+"""The commands `jaxsfm weights` convert good files and refuse bad ones."""
 
 import pytest
 from imitations import SMALL, random_layers, torchvision_legacy
@@ -12,7 +12,7 @@ from weights_conversion.torchvision import CONVENTION
 
 @pytest.fixture(scope="session")
 def other(tmp_path_factory):
-    """Whole VGG-16 of random weights: its source and its conversion."""
+    """The source and the conversion of a whole VGG-16 with random weights."""
     folder = tmp_path_factory.mktemp("whole")
     source = torchvision_legacy(folder, random_layers(LAYERS))
     target = folder / "random.safetensors"
