@@ -1,4 +1,4 @@
-"""`jaxsfm weights`: what the commands do with good files and bad ones."""
+"""The commands `jaxsfm weights` convert good files and refuse bad ones."""
 
 import pytest
 from imitations import SMALL, random_layers, torchvision_legacy
