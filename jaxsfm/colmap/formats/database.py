@@ -8,11 +8,11 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
+from jaxsfm.colmap.database import PIXEL_OFFSET
 from jaxsfm.colmap.formats.tables import (
     MAX_KEYPOINTS,
     CameraRow,
@@ -26,12 +26,10 @@ from jaxsfm.io.pairs import Pair
 
 MAX_IMAGES = 2**31 - 1
 """An id of a pair is this times the lesser image's id, plus the other's."""
-PIXEL_OFFSET = np.float32(0.5)
-"""COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
 _DAMAGED = (sqlite3.Error, TypeError, ValueError, OverflowError, KeyError)
 
 
-def _blob(rows: int, columns: int, data: Any, dtype: type, where: str) -> np.ndarray:
+def _blob(rows: int, columns: int, data: object, dtype: type, where: str) -> np.ndarray:
     """A table of a blob; COLMAP leaves it out where it has no rows."""
     if data is None or rows == 0:
         return np.zeros((0, max(int(columns), 2)), dtype)

@@ -17,7 +17,6 @@ floats: here they are int32 and float32.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -90,7 +89,7 @@ def _check_names(names: Iterable[str]) -> None:
             )
 
 
-def _dataset(group: Any, key: str, where: str, max_rows: int) -> np.ndarray:
+def _dataset(group: h5py.Group, key: str, where: str, max_rows: int) -> np.ndarray:
     found = group.get(key)
     if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu":
         raise UserError(f"{where}: no numbers {key!r}")
@@ -100,7 +99,7 @@ def _dataset(group: Any, key: str, where: str, max_rows: int) -> np.ndarray:
     return np.asarray(found)
 
 
-def _pairs_in(file: Any, names: Mapping[str, str]) -> Iterator[tuple[str, str, Any]]:
+def _pairs_in(file: h5py.Group, names: Mapping[str, str]) -> Iterator[tuple[str, str, h5py.Group]]:
     """Every pair of known images, and its group.
 
     Args:
@@ -165,7 +164,7 @@ def read_hloc(features: Path, matches: Path, names: Iterable[str], *, where: str
 
 
 def _matches_of(
-    group: Any, names: tuple[str, str], keypoints: dict[str, np.ndarray], where: str
+    group: h5py.Group, names: tuple[str, str], keypoints: dict[str, np.ndarray], where: str
 ) -> tuple[Pair, np.ndarray]:
     own = f"{where}: {describe(names)}"
     second = _dataset(group, "matches0", own, MAX_KEYPOINTS)

@@ -8,7 +8,6 @@ are COLMAP's: rays leave through (column + 0.5, row + 0.5) (cameras.py, `get_ima
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -21,7 +20,7 @@ APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """World to nerfstudio's world."""
 
 
-def _intrinsics(lens: Lens) -> dict[str, Any]:
+def _intrinsics(lens: Lens) -> dict[str, float]:
     names = ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2")
     return {
         "w": lens.size[0],

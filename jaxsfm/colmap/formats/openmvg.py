@@ -10,7 +10,6 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -32,10 +31,10 @@ _NEW, _EXACT = 1 << 31, 1 << 30
 """Cereal's marks of a first occurrence, and of a pointer to the very type it is declared for."""
 
 
-def _intrinsic(lens: Lens) -> tuple[str, dict[str, Any]]:
+def _intrinsic(lens: Lens) -> tuple[str, dict[str, object]]:
     """OpenMVG's name of the camera, and its numbers."""
     check_one_focal(lens, "openmvg")
-    data: dict[str, Any] = {
+    data: dict[str, object] = {
         "width": lens.size[0],
         "height": lens.size[1],
         "focal_length": lens.fx,
@@ -53,7 +52,7 @@ def _intrinsic(lens: Lens) -> tuple[str, dict[str, Any]]:
     return "pinhole", data
 
 
-def _keyed(values: Iterable[tuple[int, Any]]) -> list[dict[str, Any]]:
+def _keyed(values: Iterable[tuple[int, object]]) -> list[dict[str, object]]:
     return [{"key": key, "value": value} for key, value in values]
 
 
@@ -61,7 +60,7 @@ def sfm_data(
     cameras: Mapping[str, pycolmap.Camera],
     model: pycolmap.Reconstruction | None,
     root: Path | None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """The record of views, cameras, poses and points.
 
     Args:
@@ -93,7 +92,7 @@ def sfm_data(
     intrinsics = []
     for k, lens in enumerate(distinct):
         kind, data = _intrinsic(lens)
-        value: dict[str, Any] = {"polymorphic_id": types.get(kind, _NEW + len(types) + 1)}
+        value: dict[str, object] = {"polymorphic_id": types.get(kind, _NEW + len(types) + 1)}
         if kind not in types:
             types[kind] = len(types) + 1
             value["polymorphic_name"] = kind
@@ -153,7 +152,7 @@ def _write_matches(path: Path, names: list[str], found: Mapping[Pair, np.ndarray
             file.writelines(f"{i} {j}\n" for i, j in rows.tolist())
 
 
-def write_openmvg(folder: Path, record: dict[str, Any], tables: Tables | None) -> None:
+def write_openmvg(folder: Path, record: dict[str, object], tables: Tables | None) -> None:
     """sfm_data.json, and features and matches in `matches`.
 
     `id_feat` counts the model's own keypoints, which refinement moves; the features and matches
