@@ -1,4 +1,4 @@
-"""COLMAP's database and its two-view verification (pycolmap 4.2).
+"""COLMAP's database (pycolmap 4.2).
 
 Everything is checked before COLMAP sees it, because a match index out of range ends the process in
 native code, and some unset options fail silently.
@@ -8,7 +8,6 @@ that one is loaded first, every later deflate (zlib.compress, PNG by OpenCV or P
 heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so, and is not used.
 """
 
-import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -17,7 +16,6 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.native import native
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile, shown_name
@@ -161,53 +159,6 @@ def write_database(
                 columns = zip((a, b), cells.T, strict=True)
                 index = [np.searchsorted(tables[name][0], column) for name, column in columns]
                 db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VerificationOptions:
-    """Settings of COLMAP's two-view verification."""
-
-    seed: int = 0
-    """For RANSAC."""
-    threads: int = -1
-    """-1 takes all cores."""
-    scale: float = 1.0
-    """Original pixels per working pixel. COLMAP's 4 px are multiplied by it."""
-    relative_poses: bool = True
-    """Also find the relative pose of every pair, which the view graph needs."""
-    min_inliers: int | None = None
-    """A pair with fewer inliers has none; None: COLMAP's 15."""
-
-    def for_colmap(self) -> pycolmap.TwoViewGeometryOptions:
-        """As COLMAP takes them."""
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = self.seed
-        options.ransac.max_error *= self.scale
-        options.compute_relative_pose = self.relative_poses
-        if self.min_inliers is not None:
-            options.min_num_inliers = self.min_inliers
-        return options
-
-
-def verify(path: Path, options: VerificationOptions) -> None:
-    """Run COLMAP's own two-view verification on all pairs of a database (paper, section 4).
-
-    Cameras with a known or prior focal length are verified as calibrated (essential matrices).
-
-    Raises:
-      UserError: COLMAP failed.
-    """
-    verifier = pycolmap.GeometricVerifierOptions()
-    verifier.num_threads = options.threads
-    native(
-        lambda token: pycolmap.geometric_verification(
-            path,
-            verifier_options=verifier,
-            two_view_geometry_options=options.for_colmap(),
-            cancellation_token=token,
-        ),
-        path,
-    )
 
 
 def read_matches(

@@ -8,8 +8,9 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET, VerificationOptions, read_images, verify
+from jaxsfm.colmap.database import PIXEL_OFFSET, read_images
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions, verify
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
 
-from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.native import native
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair
