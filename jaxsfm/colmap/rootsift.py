@@ -78,4 +78,4 @@ def write_rootsift_database(
     with pycolmap.Database.open(path) as db:
         there = {image.name for image in db.read_all_images()}
     if lost := sorted({image.name for image in images} - there):
-        raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, so not for RootSIFT")
+        raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, which RootSIFT needs")

@@ -1,4 +1,4 @@
-"""What COLMAP's two-view verification found, read from a database."""
+"""The results of COLMAP's two-view verification, read from a database."""
 
 import dataclasses
 from pathlib import Path
@@ -16,7 +16,7 @@ PLANAR = (4, 6)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairGeometry:
-    """What the view graph needs to know of a verified pair."""
+    """The geometry of a verified pair, as the view graph uses it."""
 
     num_inliers: int
     rotation: np.ndarray | None
@@ -36,7 +36,7 @@ def spread(xy: np.ndarray, size: tuple[int, int], *, cells: int = 8) -> float:
 
 
 class TwoView(NamedTuple):
-    """What COLMAP's verification found for a pair."""
+    """The result of COLMAP's verification for a pair."""
 
     geometry: PairGeometry
     tri_angle_deg: float

@@ -46,7 +46,7 @@ class Reconstructed:
     models: "list[pycolmap.Reconstruction]"
     """The model with most images first; empty if there is none."""
     verdicts: dict[Pair, Verdict]
-    """What the view graph says of each pair; empty where it is switched off."""
+    """The view graph's decision on each pair; empty if it is switched off."""
     verified: dict[Pair, int]
     """Number of COLMAP's two-view inliers, by pair that has any."""
     angles: dict[Pair, float]
