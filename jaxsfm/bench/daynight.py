@@ -21,11 +21,12 @@ from jaxsfm.bench.methods import RUN_ABLATED, method_config
 from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Scene, Subset
-from jaxsfm.colmap.database import VerificationOptions, drop_pairs
+from jaxsfm.colmap.database import drop_pairs
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures, image_capacity
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs

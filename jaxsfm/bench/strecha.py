@@ -15,13 +15,13 @@ from jaxsfm.bench.figures import collect
 from jaxsfm.bench.inputs import check_root, choose_sets, read_rows
 from jaxsfm.bench.methods import RUN_ABLATED, method_config
 from jaxsfm.bench.options import StrechaOptions
-from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.models import write_models
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.models import colour_points, read_models, write_models
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile

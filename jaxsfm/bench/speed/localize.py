@@ -26,6 +26,7 @@ from jaxsfm.colmap import models as colmap_models
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions, verify
 from jaxsfm.io.atomic import read_json, write_atomic
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photos import Photos
@@ -58,13 +59,13 @@ def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Pa
     pairs = [row.pair for row in run.report.pairs.each if row.handed_on]
     partial, options = scratch / "partial.db", map_options(run, files)
     colmap.write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
-    verification = colmap.VerificationOptions(
+    verification = VerificationOptions(
         seed=options.seed,
         threads=options.threads,
         scale=options.scale,
         relative_poses=run.config.view_graph,
     )
-    colmap.verify(partial, verification)
+    verify(partial, verification)
     return partial.rename(database)
 
 

@@ -10,7 +10,7 @@ from jaxsfm.report.page.embedded import Embedded, embed
 from jaxsfm.report.page.figures import count, figures3
 from jaxsfm.report.page.pair_states import USED, state
 from jaxsfm.report.run_results import LostPhoto
-from jaxsfm.sfm.evaluation import ImageError
+from jaxsfm.sfm.evaluation import PoseError
 
 MAX_PHOTOS = 60
 """The most rows of the table. How many photos are left out is said below it."""
@@ -40,7 +40,7 @@ class PhotoRow(NamedTuple):
     """The number of points that were seen in it; None if it is not in the model."""
     reprojection_px: float | None
     """Mean over the observations, original pixels."""
-    error: ImageError | None
+    error: PoseError | None
     """The error against the reference poses."""
     lost: LostPhoto | None
     """Why the photo was lost; None if it is in the model."""
