@@ -68,10 +68,9 @@ def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Pa
 def map_options(run: FinishedRun, files: dict[str, ImageFile]) -> MapOptions:
     """The run's."""
     options = run.report.options
-    refines, mapper = options.others["refine_intrinsics"], options.others["mapper"]
-    assert mapper == "incremental" or mapper == "global"  # noqa: PLR1714
+    refines = options.others["refine_intrinsics"]
     return MapOptions(
-        mapper=mapper,
+        mapper="global" if options.others["mapper"] == "global" else "incremental",
         refine_intrinsics=options.intrinsics is None if refines == "auto" else refines == "yes",
         seed=options.seed,
         threads=options.threads,
