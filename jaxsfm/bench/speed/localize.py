@@ -72,9 +72,9 @@ def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Pa
 def map_options(run: FinishedRun, files: dict[str, ImageFile]) -> MapOptions:
     """The mapper's options of the run."""
     options = run.report.options
-    refines, mapper = options.others["refine_intrinsics"], options.others["mapper"]
+    refines = options.others["refine_intrinsics"]
     return MapOptions(
-        mapper="global" if mapper == "global" else "incremental",
+        mapper="global" if options.others["mapper"] == "global" else "incremental",
         refine_intrinsics=options.intrinsics is None if refines == "auto" else refines == "yes",
         seed=options.seed,
         threads=options.threads,
