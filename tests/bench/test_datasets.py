@@ -164,7 +164,7 @@ def test_a_data_set_is_fetched_unpacked_and_found(server, small, tmp_path, capsy
     assert len(server.asked) == asked
     assert main(["data", "list"]) == 0
     text = capsys.readouterr().out
-    assert "small      there" in text and "strecha    not fetched" in text
+    assert "small      fetched" in text and "strecha    not fetched" in text
 
 
 def test_an_interrupted_fetch_is_not_complete_and_goes_on(server, small, tmp_path):

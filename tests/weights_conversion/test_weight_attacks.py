@@ -206,7 +206,7 @@ def test_a_mutated_file_is_converted_or_refused(files, tmp_path, name):
 @pytest.mark.parametrize(
     "script, words",
     [
-        ("import time; time.sleep(60)", "not done after 0.5 s"),
+        ("import time; time.sleep(60)", "not finished after 0.5 s"),
         ("import os; os.abort()", "the HDF5 library crashed"),
         ("raise SystemExit(3)", "the HDF5 library crashed"),
     ],
