@@ -253,7 +253,7 @@ def test_a_report_says_which_weights_and_with_other_ones_all_is_done_again(
     assert main([*map(str, again), "--threads", "1"]) == 1
     said = capsys.readouterr().err
     assert "--weights: 2ecbe4" in said and "matched before" not in said
-    assert "no model this time: the earlier one stays" in said
+    assert "this run made no model, so the earlier model stays" in said
 
 
 @pytest.mark.parametrize("name", ["strecha", "daynight", "wxbs", "homography", "warps"])

@@ -21,7 +21,7 @@ from weights_conversion.verify import SIZE, MapComparison, compare  # noqa: E402
 
 
 def full_netvlad(path: Path, layers: Layers) -> Path:
-    """With a random head of NetVLAD's true size."""
+    """A random head of NetVLAD's true size is added."""
     rng = np.random.default_rng(1)
     names = ("assignment", "minus_centres", "whitening", "bias")
     head = {

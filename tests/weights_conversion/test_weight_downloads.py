@@ -1,4 +1,4 @@
-"""Public weights: fetched, compared with their hash, converted."""
+"""Public weights are fetched, compared with their hash, and converted."""
 
 import hashlib
 

@@ -1,4 +1,4 @@
-"""Every format holds the same network, and comes out as the same converted weights."""
+"""All formats hold the same network and are converted to the same weights."""
 
 import shutil
 
@@ -254,7 +254,7 @@ def test_a_converted_file_is_no_source_and_no_source_is_overwritten(files, sourc
 
 
 def test_vgg19_of_torchvision_is_known_by_its_last_layer(sources, tmp_path):
-    """Its modules are numbered past three more convolutions; the halves of a VGG-16 are none."""
+    """VGG-19 has three more convolutions, so its modules have other numbers than VGG-16's."""
     layers = random_layers({n: (3 if i == 3 else i // 16, o // 16) for n, (i, o) in DEEP.items()})
     tensors = {}
     for module, layer in numbered(BLOCKS_19).items():
