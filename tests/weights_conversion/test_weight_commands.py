@@ -13,7 +13,7 @@ from weights_conversion.torchvision import CONVENTION
 
 @pytest.fixture(scope="session")
 def other(tmp_path_factory):
-    """A whole VGG-16 of random weights: its source and its conversion."""
+    """The source and the conversion of a whole VGG-16 with random weights."""
     target = "random.safetensors"
 
     def make(folder):
