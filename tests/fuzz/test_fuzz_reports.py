@@ -47,7 +47,10 @@ def whole(folder) -> dict:
         },
         "weights": {"backbone": "vgg16"},
         "options": {
-            "config": {"max_size": 640, "enlarge": 1.0, "octaves": 2},
+            "config": {"max_size": 640, "enlarge": 1.0, "octaves": 2, "min_inliers": 26},
+            "mapper": "incremental",
+            "best_pairs": None,
+            "execution": {"devices": None, "memory_gb": None},
             "seed": 0,
             "threads": -1,
             "pairs": "exhaustive",
