@@ -59,7 +59,7 @@ def export(
     images = images or _recorded_photos(run)
     if copy_images and images is None:
         raise UserError(
-            f"--copy-images: {run} does not say where its photos are; name the folder with --images"
+            f"--copy-images: {run} does not say where its photos are; name them with --images"
         )
     if to in FILES:
         check_writable(out, "--out", (FILES[to],))
@@ -171,9 +171,7 @@ def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -
 
     tables = _tables(run)
     if tables is None:
-        raise UserError(
-            f"{run}: there is no database.db in it, so there are no matches to write for hloc"
-        )
+        raise UserError(f"{run}: no database.db here, so there are no matches to write for hloc")
     try:
         config = read_part(run, RecordedConfig, "options", "config")
         limits = config.max_size, config.enlarge

@@ -266,7 +266,7 @@ def test_a_run_in_parts_says_what_parts_them_and_what_may_help(plain, tmp_path):
     body = without_scripts((out / "report.html").read_text())
     assert "Groups of photos that trusted pairs join" in body
     assert "7 matches, 26 are needed" in body and HOSTILE not in body
-    assert "What may help: --some &lt;option&gt; (small); far." in body
+    assert "<li><code>--some &lt;option&gt;</code>: small</li><li>far</li>" in body
     change_report(out, lambda report: report.update(models=[], no_model="nothing <fits>"))
     assert main(["report", str(out)]) == 0
     assert "<p>Nothing &lt;fits&gt;.</p>" in (out / "report.html").read_text()

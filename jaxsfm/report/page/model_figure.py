@@ -87,9 +87,7 @@ def model_figure(scene: Scene, unit: str) -> Figure:
         notes += f" {MAX_POINTS} of {n} points are drawn, taken at random."
     if scene.far:
         notes += f" {scene.far} points far away from the others are left out."
-    reference = " Orange pyramids, a little larger, are the reference poses." * bool(
-        scene.reference
-    )
+    reference = " Orange pyramids, a little larger, show the reference." * bool(scene.reference)
     axis = {"showbackground": False, "title": {"text": ""}, "nticks": 6}
     return figure(
         "model",
