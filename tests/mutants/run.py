@@ -61,9 +61,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/sharded": (BATCHES,),
     "core/types": (PAIR,),
     "core/winograd": ("tests/core/test_winograd.py", "tests/core/test_vgg.py"),
-    "refine/image_readers": (REFINE, WEAK),
+    "refine/candidates": (REFINE, WEAK),
+    "refine/evidence": (WEAK,),
     "refine/octave_pose": ("tests/sfm/test_placing.py", WEAK),
-    "refine/pair_alignment": ("tests/sfm/test_pair_alignment.py",),
+    "refine/padding": ("tests/sfm/test_pair_alignment.py", REFINE),
+    "refine/patch_alignment": (REFINE, WEAK),
+    "refine/pose_doubt": ("tests/sfm/test_placing.py",),
     "refine/passes": (REFINE, WEAK),
     "refine/plane_geometry": (REFINE, WEAK),
     "refine/track_alignment": (REFINE, WEAK),
@@ -74,7 +77,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "sfm/view_graph": ("tests/sfm/test_viewgraph.py", "tests/sfm/test_placing.py"),
 }
 """Module (last two parts of its path) -> the tests that should notice a mistake in it, quickest
-first; otherwise tests/PACKAGE/test_MODULE.py. tests/*/test_MODULE_laws.py comes before them."""
+first; otherwise tests/core/test_MODULE.py or tests/sfm/test_MODULE.py. tests/*/test_MODULE_laws.py comes before them."""
 SLOW: tuple[str, ...] = (
     "test_an_octave_is_the_smaller_image_described_alone",
     "test_more_room_changes_no_octave",
@@ -84,6 +87,9 @@ SLOW: tuple[str, ...] = (
 """Tests left out, by parts of their names: quicker ones cover the same."""
 EXAMPLES = 15
 """Most examples of a property test."""
+
+
+_Plain = argparse.RawDescriptionHelpFormatter
 
 
 class Outcome(NamedTuple):
@@ -146,17 +152,13 @@ def _without_mistakes(
 
 
 def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=_Raw)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=_Plain)
     parser.add_argument("--count", type=int, default=160, help="how many mistakes")
     parser.add_argument("--seed", type=int, default=0, help="which of them")
     parser.add_argument("--only", action="append", help="a file or folder; may be repeated")
     parser.add_argument("--jobs", type=int, default=2, help="how many at a time")
     parser.add_argument("--again", action="store_true", help="repeat what survived before")
     return parser.parse_args()
-
-
-class _Raw(argparse.RawDescriptionHelpFormatter):
-    pass
 
 
 def _files(only: list[str] | None) -> list[str]:
@@ -187,10 +189,10 @@ def _sample(places: dict[str, list[Edit]], options: argparse.Namespace) -> list[
 
 
 def _tests_of(path: str) -> tuple[str, ...]:
-    package, module = Path(path).parts[-2], Path(path).stem
-    usual = (f"tests/{package}/test_{module}.py",)
+    parts, module = Path(path).parts, Path(path).stem
+    usual = (f"tests/{parts[1]}/test_{module}.py",)
     laws = sorted(str(p.relative_to(ROOT)) for p in ROOT.glob(f"tests/*/test_{module}_laws.py"))
-    tests = (*laws, *TESTS.get(f"{package}/{module}", usual))
+    tests = (*laws, *TESTS.get(f"{parts[-2]}/{module}", usual))
     return tuple(dict.fromkeys(t for t in tests if (ROOT / t).exists()))
 
 
