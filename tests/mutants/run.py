@@ -77,7 +77,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "sfm/view_graph": ("tests/sfm/test_viewgraph.py", "tests/sfm/test_placing.py"),
 }
 """Module (last two parts of its path) -> the tests that should notice a mistake in it, quickest
-first; otherwise tests/core/test_MODULE.py or tests/sfm/test_MODULE.py. tests/*/test_MODULE_laws.py comes before them."""
+first; otherwise tests/core/test_MODULE.py or tests/sfm/test_MODULE.py. A test_MODULE_laws.py of
+either folder comes before them."""
 SLOW: tuple[str, ...] = (
     "test_an_octave_is_the_smaller_image_described_alone",
     "test_more_room_changes_no_octave",
