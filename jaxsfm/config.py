@@ -1,8 +1,8 @@
 """Configuration: frozen, hashable dataclasses and the named presets.
 
-What fixes an array shape or a branch of a compiled program is *static* and lives in `PairShape`;
-numeric thresholds are *traced* (`Thresholds` in `jaxsfm.core.types`), so sweeping them does not
-recompile. Imports neither jax nor cv2.
+Settings that fix an array shape or a branch of a compiled program are static and live in
+`PairShape`. Numeric thresholds are traced (`Thresholds` in `jaxsfm.core.types`), so other values do
+not recompile a program. This module imports neither jax nor cv2.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ EXTRACTED_BY = (
     "convolutions",
     "keypoints",
 )
-"""Fields of `Config` that an image's features depend on."""
+"""Fields of `Config` that the features of an image depend on."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,31 +32,34 @@ class Refinement:
     """Multi-view keypoint refinement after mapping (`jaxsfm.sfm.refine.passes`)."""
 
     passes: int = 2
-    """Alignment, bundle adjustment and filtering, this many times."""
+    """How many times alignment, bundle adjustment and filtering are repeated."""
     radius: int = 7
     """Patches are (2 radius + 1)^2 pixels of the working image."""
     iterations: int = 10
-    """Gauss-Newton steps of an alignment."""
+    """Number of Gauss-Newton steps of an alignment."""
     min_score: float = 0.8
     """Least normalised cross-correlation of an observation with its reference patch."""
     max_sigma_px: float = 0.25
-    """Largest standard deviation of an observation along its worst direction."""
+    """Largest standard deviation of an observation along its least certain direction."""
     max_shift_px: float = 4.0
-    """Furthest an observation may end from where the model puts it; half of it in later passes."""
+    """Largest distance of an aligned observation from where the model puts it; half of it in later
+    passes."""
     max_error_px: float = 1.0
     """Largest reprojection error of an observation after bundle adjustment."""
     min_cosine: float = 0.25
-    """Views steeper than this towards the surface get no new observations (75 deg)."""
+    """Smallest cosine between a view's direction and the surface normal for new observations (75
+    deg)."""
     max_stretch: float = 6.0
-    """Nor views that see the surface at an area scale this far from the reference view's."""
+    """Largest ratio between the areas at which a view and the reference view see the surface, for
+    new observations."""
     neighbours: int = 16
-    """3-D points that give a point its surface normal."""
+    """Number of 3-D points from which the surface normal at a point is estimated."""
     weak_octaves: int = 4
-    """Sizes (working size, half of it, ...) at which views are placed that have too little to
-    align, as a night among days (`jaxsfm.sfm.refine.weak_views`); 0: they keep what the
-    mapper gave them."""
+    """Number of sizes (working size, half of it, ...) at which weak views are placed. These are
+    views with too few aligned observations, as a night photo among day photos
+    (`jaxsfm.sfm.refine.weak_views`). With 0 they keep the pose of the mapper."""
     weak_min_score: float = 0.6
-    """`min_score` in those views."""
+    """`min_score` in weak views."""
 
     def __post_init__(self) -> None:
         for name in ("passes", "radius", "iterations", "neighbours"):
@@ -76,46 +79,49 @@ class Refinement:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:
-    """Everything that decides which matches a pair of images has, and what is made of them."""
+    """The settings of matching and of what follows it."""
 
     max_size: int = 1600
     """Longer side of the working image, pixels; larger images are reduced."""
     enlarge: float = 1.0
-    """Smaller images are enlarged up to this factor, no further than `max_size`."""
+    """Smaller images are enlarged by up to this factor, but not beyond `max_size`."""
     octaves: int = 1
-    """Sizes at which an image is described: working size, half of it, ..."""
+    """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
-    """Subtract an image's mean descriptor from its descriptors."""
+    """Whether the mean descriptor of an image is subtracted from its descriptors."""
     backbone: BackboneName = "vgg16"
     """The network (`jaxsfm.core.backbones`)."""
     convolutions: Convolutions = "float32"
-    """What the network multiplies; sums are float32, then rounded alike. Meant for accelerators
-    (where no gain has been measured yet); CPUs round and gain nothing."""
+    """Type of the operands of the network's convolutions. Sums are float32 and are then rounded to
+    this type. bfloat16 is meant for accelerators, where no gain has been measured yet; on CPUs it
+    only rounds."""
     keypoints: Keypoints = "relocalized"
-    """Where a fine cell's keypoint lies: at the pixel it walks to by the largest norms (the paper's
-    rule), or by learned scores (`jaxsfm.io.relocalizer`), or at the cell's centre."""
+    """Where the keypoint of a fine cell lies: at the pixel that it walks to by the largest norms
+    (the rule of the paper) or by learned scores (`jaxsfm.io.relocalizer`), or at the centre of the
+    cell."""
     threshold_px: float = 10.0
-    """Inlier radius of a homography, pixels of the working image."""
+    """Largest transfer error of an inlier of a homography, pixels of the working image."""
     min_inliers: int = 26
-    """Fewest inliers of an accepted plane."""
+    """Smallest number of inliers of a plane."""
     confidence: float = 0.999
-    """RANSAC stops when a better plane has been missed with less than 1 - confidence."""
+    """RANSAC stops when the probability of having missed a better plane is below 1 - confidence."""
     pair: PairShape = dataclasses.field(default_factory=PairShape)
     aligned_octaves: int = 0
-    """Sizes (working size, half of it, ...) at which the matches of a single pair are aligned to a
-    fraction of a pixel (`jaxsfm.sfm.refine.pair_alignment`); 0: they stay as they were
-    verified. Models have aligned tracks instead."""
+    """Number of sizes (working size, half of it, ...) at which the matches of a single pair are
+    aligned to a fraction of a pixel (`jaxsfm.sfm.refine.pair_alignment`). With 0 they stay as they
+    were verified. In models the tracks are aligned instead."""
     view_graph: bool = False
-    """Hand on only pairs that the view graph trusts (`jaxsfm.sfm.view_graph`)."""
+    """Whether only pairs that the view graph trusts are given to the mapper
+    (`jaxsfm.sfm.view_graph`)."""
     refinement: Refinement | None = None
-    """None: the mapper's model is the last."""
+    """Settings of the refinement. With `None` the model of the mapper is not refined."""
 
     def extraction(self) -> "Config":
-        """The part that an image's features depend on; the rest at its defaults."""
+        """The settings that the features of an image depend on; the others have their defaults."""
         return Config(**{name: getattr(self, name) for name in EXTRACTED_BY})
 
     def matching(self) -> dict[str, object]:
-        """The part that the matches depend on, as plain data."""
+        """The settings that matches depend on, as plain data."""
         parts = dataclasses.asdict(self)
         del parts["aligned_octaves"], parts["view_graph"], parts["refinement"]
         return parts
@@ -156,10 +162,10 @@ class Config:
 
 
 MIN_SIDE = 48
-"""Shortest usable side, pixels: three coarse cells, one full window of the coarse-to-fine step."""
+"""Shortest usable side, pixels: three coarse cells, one window of the coarse-to-fine step."""
 
 MAX_OCTAVES = 4
-"""At an eighth of a 1600 px image 12 x 9 coarse cells are left."""
+"""Largest number of octaves. At an eighth of 1600 px there are only 12 x 9 coarse cells left."""
 
 _DEFAULT = Config(
     octaves=4,
@@ -178,16 +184,24 @@ PRESETS: dict[str, Config] = {
         pair=dataclasses.replace(_DEFAULT.pair, local_refits=10),
     ),
 }
-"""`paper`: the constants of the authors' code. `default`: octaves, centred descriptors and
-neighbourhood consensus (night, seasons, weather), local refits iterated (one refit leaves up to a
-fifth of a plane's inliers behind, tests/core/test_ransac.py), planes that compete, the most similar
-of a cell's several matches, aligned matches of single pairs, the view graph and the refinement.
-`robust`: default, and small images enlarged up to twice (they then take as long as large ones);
-planes are refitted until they gain nothing: matches that depend less on the seed."""
+"""The named presets.
+
+- `paper` has the constants of the authors' code.
+- `default` adds octaves, centred descriptors and neighbourhood consensus (for night, seasons and
+  weather), repeated local refits (one refit leaves up to a fifth of a plane's inliers behind,
+  tests/core/test_ransac.py), planes that compete, the most similar of several matches of a cell,
+  aligned matches of single pairs, the view graph and the refinement.
+- `robust` also enlarges small images up to twice, which then take as long as large ones, and refits
+  planes until they gain nothing, so that matches depend less on the seed.
+"""
 
 
 def preset(name: str) -> Config:
-    """The named preset; ValueError names the ones there are."""
+    """The preset of this name.
+
+    Raises:
+      ValueError: there is no such preset; the message names the presets.
+    """
     if name not in PRESETS:
         raise ValueError(f"preset must be one of {sorted(PRESETS)}; got {name!r}")
     return PRESETS[name]

@@ -1,1 +1,4 @@
-"""Pure JAX functions: no files, clocks, prints, OpenCV or COLMAP (import-linter holds this)."""
+"""Pure JAX functions of arrays, without files, clocks, printing, OpenCV or COLMAP.
+
+An import-linter contract checks this.
+"""

@@ -1,14 +1,14 @@
-"""AlexNet as a backbone: a second network, shallower and with other strides than VGG.
+"""AlexNet as a backbone: a network that is shallower than VGG and has other strides.
 
 Its first convolution looks at 11 x 11 pixels in steps of 4, so no map of the network is finer than
-4 pixels. Keypoints walk through the same convolution in steps of 1, and the largest of 2 x 2 and of
-4 x 4 of it. Descriptors are the network's own: conv2 (8 pixels) and conv5 (16 pixels), rectified.
-Windows are laid so that cells are centred as grids here are, (u + 0.5) s - 0.5: within half a pixel
-for conv2, 3.5 pixels before it for conv5 (windows of three, of which two are a cell's).
+4 pixels. Keypoints walk through the same convolution in steps of 1 pixel, and through its maxima
+over 2 x 2 and 4 x 4 pixels. The descriptors are the rectified maps of the network: conv2 (stride 8)
+and conv5 (stride 16). Cells are centred at (u + 0.5) s - 0.5, within half a pixel for conv2 and 3.5
+pixels before it for conv5, whose windows are three cells wide.
 
-Padding is exact, as for VGG: past an image's valid size every map is zero.
+Padding is exact, as for VGG: every map is zero beyond the valid size of an image.
 
-Source: Krizhevsky 2014, "One weird trick", as torchvision has it.
+Source: Krizhevsky 2014, "One weird trick", in the version of torchvision.
 """
 
 import functools
@@ -32,9 +32,10 @@ KERNELS: dict[str, tuple[int, int, int, int]] = {
     "conv5": (3, 3, 256, 256),
 }
 STRIP_ROWS = 16
-"""Of the image, for which the first convolution exists at every pixel; a multiple of 4."""
+"""Rows of the image whose first convolution exists at every pixel at a time; a multiple of 4."""
 BEFORE = 5
-"""Rows and columns that conv1's first window reaches out: it is centred on pixel 4 i."""
+"""Rows and columns by which the first window of conv1 reaches beyond the image. Windows are centred
+on pixels 4 i."""
 
 
 class _Convolution(nn.Module):
@@ -42,20 +43,20 @@ class _Convolution(nn.Module):
 
     @nn.compact
     def __call__(self) -> tuple[Array, Array]:
-        """Kernel and bias."""
+        """The kernel and the bias."""
         kernel = self.param("kernel", nn.initializers.lecun_normal(), self.shape)
         bias = self.param("bias", nn.initializers.zeros_init(), self.shape[3:])
         return jnp.asarray(kernel), jnp.asarray(bias)
 
 
 class AlexNet(nn.Module):
-    """`apply(params, images, size, heads, method="levels")` -> Levels; pure."""
+    """A flax module: `apply(params, images, size, heads, method="levels")` gives `Levels`."""
 
     bfloat16: bool = False
     """Operands and results rounded to bfloat16; sums are float32."""
 
     def setup(self) -> None:
-        """Five convolutions."""
+        """Make the five convolutions."""
         for name, shape in KERNELS.items():
             setattr(self, name, _Convolution(shape))
 
@@ -65,12 +66,15 @@ class AlexNet(nn.Module):
         size: Int[Array, "b 2"],
         heads: Sequence[Head | None] = (None, None, None),
     ) -> Levels:
-        """What features are made of; sides are multiples of 16.
+        """The maps that features are made of.
 
         Args:
-          images: network input, zero past `size`.
+          images: network input, zero beyond `size`; sides are multiples of 16.
           size: valid (rows, columns) of each image.
-          heads: none: learned scores are those of VGG's maps.
+          heads: all `None`, because learned scores exist for the maps of VGG only.
+
+        Raises:
+          ValueError: a head is given.
         """
         if any(head is not None for head in heads):
             raise ValueError("AlexNet has no learned scores: heads must be None")
@@ -82,7 +86,7 @@ class AlexNet(nn.Module):
         grid = size // 4
         x = clear_padding(nn.relu(conv(x, first, pad=(BEFORE, 2), stride=4)), grid)
         grid = grid // 2
-        # Three wide, in steps of two, centred between a cell's two: (2 j + 1).
+        # Windows are three wide, in steps of two, and centred on 2 j + 1.
         x = clear_padding(_pool(x, (0, 1)), grid)
         fine = x = clear_padding(nn.relu(conv(x, self.conv2(), pad=(2, 2))), grid)
         grid = grid // 2
@@ -113,7 +117,7 @@ def _conv(
 
 
 def _pool(x: Float[Array, "b h w c"], pad: tuple[int, int]) -> Float[Array, "b h2 w2 c"]:
-    """The largest of 3 x 3, in steps of two; x is rectified."""
+    """The maximum of 3 x 3 cells, in steps of two; x is rectified."""
     padded = jnp.pad(x, ((0, 0), pad, pad, (0, 0)))  # zeros change no maximum
     return nn.max_pool(padded, (3, 3), strides=(2, 2))
 
@@ -125,8 +129,11 @@ def _walked(
     layer: tuple[Array, Array],
     bfloat16: bool,
 ) -> tuple[Float[Array, "h w"], Float[Array, "h2 w2"], Float[Array, "h4 w4"]]:
-    """Squared norms of conv1 at every pixel (before its rectifier, as VGG's conv1_2) and of its
-    largest of 2 x 2 and 4 x 4; STRIP_ROWS at a time, for at full size one map is 400 MB."""
+    """Squared norms of conv1 at every pixel, before its rectifier (as for conv1_2 of VGG), and of
+    its rectified maxima over 2 x 2 and 4 x 4 pixels.
+
+    They are computed STRIP_ROWS at a time, because a single map takes 400 MB at full size.
+    """
     height, width = image.shape[:2]
     kernel = layer[0].shape[0]
     rows = min(STRIP_ROWS, height)

@@ -1,8 +1,8 @@
 """The networks that features can be made of.
 
-A backbone is a flax module whose method `levels(images, size, heads)` gives `Levels`: score maps of
-strides 1, 2 and 4 that keypoints walk down, descriptors of strides 8 and 16. Nothing after it knows
-which network it was (docs/guide/backbones.md).
+A backbone is a flax module with a method `levels(images, size, heads)` that returns `Levels`: score
+maps of strides 1, 2 and 4, which keypoints walk down, and descriptors of strides 8 and 16. Later
+stages do not depend on which network it was (docs/guide/backbones.md).
 """
 
 from typing import NamedTuple
@@ -14,18 +14,18 @@ from jaxsfm.core.vgg import BLOCKS, BLOCKS_19, VGG16, VGG19, Blocks, layers_of
 
 
 class Backbone(NamedTuple):
-    """One network."""
+    """A network and its shapes."""
 
     module: type[nn.Module]
-    """Called with `bfloat16`."""
+    """The flax module; its constructor takes `bfloat16`."""
     kernels: dict[str, tuple[int, int, int, int]]
-    """Layer -> HWIO shape of its kernel; a layer's parameters are `kernel` and `bias`."""
+    """Layer name -> HWIO shape of its kernel. The parameters of a layer are `kernel` and `bias`."""
     fine: int
-    """Channels of the descriptors of stride 8."""
+    """Number of channels of the descriptors of stride 8."""
     coarse: int
-    """Channels of the descriptors of stride 16."""
+    """Number of channels of the descriptors of stride 16."""
     learned: bool
-    """Whether there are learned scores for its maps."""
+    """Whether relocalizers can be learned for its maps."""
 
 
 def _vgg(module: type[nn.Module], blocks: Blocks, *, learned: bool) -> Backbone:

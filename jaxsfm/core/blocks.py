@@ -1,8 +1,9 @@
-"""A block of the network: 3 x 3 convolutions, each rectified, then the largest of 2 x 2.
+"""A block of the network: 3 x 3 convolutions, each rectified, and then a 2 x 2 maximum pooling.
 
-On CPUs the large maps are computed strip by strip and the deep ones by Winograd's convolution;
-elsewhere the library's convolutions see whole maps. What is past an image's valid size is set to
-zero after every layer, so that the valid part equals what the unpadded image gives.
+On CPUs the large maps are computed strip by strip, and the deep ones by Winograd's convolution. On
+accelerators the convolutions of the library are applied to whole maps. After every layer, the cells
+beyond the valid size of an image are set to zero, so that the valid part equals the maps of the
+unpadded image.
 """
 
 import functools
@@ -20,11 +21,12 @@ from jaxsfm.core.scores import Head, score
 from jaxsfm.core.winograd import conv3x3
 
 WINOGRAD_CHANNELS = 256
-"""Input channels from which Winograd's transforms cost less than they save on CPUs."""
+"""Number of input channels from which Winograd's convolution is faster on CPUs."""
 WINOGRAD_PIXELS = 1 << 13
-"""Of a map, from which it is worth compiling: a second for each layer."""
+"""Number of pixels of a map from which it is used. Compiling it takes a second for each layer."""
 STRIP_ROWS = 16
-"""Of a block's input, even; 8 to 32 take the same time, 128 a fifth more."""
+"""Rows of the input of a block that are computed at once; even. 8 to 32 rows take the same time,
+128 rows a fifth more."""
 
 
 class Layer(NamedTuple):
@@ -35,7 +37,7 @@ class Layer(NamedTuple):
 
 
 def clear_padding(x: Float[Array, "b h w c"], size: Int[Array, "b 2"]) -> Float[Array, "b h w c"]:
-    """Zero past the valid (rows, columns) of each image."""
+    """The maps with zeros beyond the valid (rows, columns) of each image."""
     rows = lax.broadcasted_iota(jnp.int32, x.shape[:3], 1) < size[:, 0, None, None]
     cols = lax.broadcasted_iota(jnp.int32, x.shape[:3], 2) < size[:, 1, None, None]
     return jnp.where((rows & cols)[..., None], x, 0.0)
@@ -56,17 +58,19 @@ def _library(
 
 
 def rounded(x: Array, bfloat16: bool) -> Array:
-    """As bfloat16 has it: CPUs multiply float32 and get what accelerators get."""
+    """x rounded to the precision of bfloat16, as float32: on CPUs products of float32 then equal
+    those of bfloat16 on accelerators."""
     return lax.reduce_precision(x, exponent_bits=8, mantissa_bits=7) if bfloat16 else x
 
 
 def conv(
     x: Float[Array, "b h w c"], layer: Layer, *, bfloat16: bool = False
 ) -> Float[Array, "b h w o"]:
-    """3 x 3 convolution with zero padding of one, plus bias.
+    """3 x 3 convolution with zero padding of one cell, plus bias.
 
     Args:
-      bfloat16: products of bfloat16, summed in float32, rounded, before the bias is added.
+      bfloat16: operands are rounded to bfloat16 and their products summed in float32. The sums are
+        rounded to bfloat16 before the bias is added.
     """
     height, width, channels = x.shape[1:]
     small = channels < WINOGRAD_CHANNELS or height * width < WINOGRAD_PIXELS
@@ -80,7 +84,7 @@ def conv(
     def elsewhere(x, kernel):
         if not bfloat16:
             return _library(x, kernel)
-        # Operands and result of one type: XLA has no mixed convolution for GPUs.
+        # Operands and result have one type, because XLA has no mixed convolution for GPUs.
         return _library(x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)).astype(x.dtype)
 
     if small and not bfloat16:
@@ -89,8 +93,8 @@ def conv(
 
 
 def pool(x: Float[Array, "b h w c"], size: Int[Array, "b 2"]) -> Float[Array, "b h2 w2 c"]:
-    """Rectified, and the largest of 2 x 2; zero past half of `size`."""
-    # An odd last row is pooled with padding; a floor pooling has no such cell.
+    """The rectified maximum of 2 x 2 cells, stride 2; zero beyond half of `size`."""
+    # An odd last row was pooled with padding. Pooling that rounds down has no such cell.
     return clear_padding(nn.max_pool(nn.relu(x), (2, 2), strides=(2, 2)), size // 2)
 
 
@@ -101,7 +105,7 @@ def convolve(
     *,
     bfloat16: bool = False,
 ) -> Float[Array, "b h w o"]:
-    """A block's last convolution, before its rectifier."""
+    """The last convolution of a block, before its rectifier."""
     for k, layer in enumerate(layers):
         x = clear_padding(conv(nn.relu(x) if k else x, layer, bfloat16=bfloat16), size)
     return x
@@ -116,11 +120,12 @@ def scores_and_pool(
     head: Head | None = None,
     bfloat16: bool = False,
 ) -> tuple[Float[Array, "b h w"], Float[Array, "b h2 w2 o"]]:
-    """Scores of a block's last convolution, and its pooled map.
+    """The scores of the last convolution of a block, and its pooled map.
 
     Args:
-      head: of the score; None: squared norms.
-      large: the block's maps are far beyond any cache: CPUs compute them strip by strip.
+      large: the maps of the block exceed any cache, so CPUs compute them strip by strip.
+      head: the learned head of the scores; `None` gives squared norms.
+      bfloat16: as in `conv`.
     """
 
     def whole(x, size, layers, head):
@@ -144,8 +149,11 @@ def _strips(
     head: Head | None,
     bfloat16: bool,
 ) -> tuple[Float[Array, "h w"], Float[Array, "h2 w2 o"]]:
-    """Scores of a block's last convolution and its pooled map, STRIP_ROWS at a time: with a row
-    more on either side for every layer, nothing else of the maps ever exists."""
+    """The scores and the pooled map of one image, STRIP_ROWS at a time.
+
+    A strip is computed with one more row on either side for every layer that follows. The maps
+    never exist as a whole.
+    """
     height, width, depth = *x.shape[:2], len(layers)
     rows = min(STRIP_ROWS, height)
     strips = -(-height // rows)

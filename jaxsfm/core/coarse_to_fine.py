@@ -1,13 +1,13 @@
 """From coarse (pool4) matches to fine (pool3) correspondences.
 
-Around each mutual coarse match lie 3 x 3 coarse cells in either image, that is 6 x 6 fine cells;
-the fine cells of the two windows are matched by mutual nearest neighbours inside them. Windows
-overlap, so a fine cell may end with several different partners; repeated pairs are removed
-(authors' code; the paper, section 3.2, gives the principle).
+Around each mutual coarse match lie 3 x 3 coarse cells in either image, that is 6 x 6 fine cells.
+The fine cells of these two windows are matched by mutual nearest neighbours inside the windows.
+Windows overlap, so a fine cell may have several partners; repeated pairs are removed. The paper,
+section 3.2, gives the principle, and the authors' code the details.
 
-A fine cell lies in at most nine windows, those centred on the 3 x 3 coarse cells around it, and
-each coarse cell has at most one mutual match. So all candidates of a cell fit in nine slots that
-are *gathered*: no sorting of pairs, no scatter, no data-dependent shape.
+A fine cell lies in at most nine windows, centred on the 3 x 3 coarse cells around it, and each
+coarse cell has at most one mutual match. So all partners of a cell fit into nine slots, which are
+gathered without sorting pairs, without a scatter and without a data-dependent shape.
 """
 
 import jax
@@ -31,9 +31,9 @@ _CENTRES = tuple((dr, dc) for dr in range(-RADIUS, RADIUS + 1) for dc in range(-
 def window_cells(
     cell: Int[Array, " b"], coarse_grid: Int[Array, " 2"], fine_grid: Int[Array, " 2"]
 ) -> tuple[Int[Array, "b w"], Bool[Array, "b w"]]:
-    """Fine cells of the window around each coarse cell, row by row, and which of them exist.
+    """The fine cells of the window around each coarse cell, row by row, and which of them exist.
 
-    The window is cut at the border of the *coarse* grid: fine cells of an odd last row or column
+    The window is cut at the border of the coarse grid. Fine cells of an odd last row or column
     belong to no coarse cell and are not reached.
     """
     row, col = cell // coarse_grid[1], cell % coarse_grid[1]
@@ -45,7 +45,7 @@ def window_cells(
 
 
 def rows_of(table: Float[Array, "m d"], index: Int[Array, "*b"]) -> Float[Array, "*b d"]:
-    """Rows of a table; out of range there is none, so nothing has to be looked for."""
+    """Rows of a table. Indices must be in range, which spares a check."""
     return jnp.take(table, index, axis=0, mode="clip")
 
 
@@ -72,10 +72,10 @@ def _match_windows(
 def match_windows(
     f0: JoinedFeatures, f1: JoinedFeatures, coarse: Int[Array, " n"], *, chunk: int = 16
 ) -> Int[Array, "n w"]:
-    """`_match_windows` for every coarse match, `chunk` at a time; -1 where there is none.
+    """`_match_windows` for every coarse match, `chunk` matches at a time; -1 where there is none.
 
-    The loop ends with the last real match: unmatched cells cost nothing. Windows of 1024 channels
-    take 5 MB for 16 matches and stay in the cache: half the time of 128.
+    The loop ends with the last match, so unmatched cells cost nothing. The windows of 16 matches
+    with 1024 channels take 5 MB and stay in the cache, which halves the time of 128 matches.
     """
     n = coarse.shape[0]
     shown = jnp.any(f0.fine != 0, axis=-1), jnp.any(f1.fine != 0, axis=-1)
@@ -84,7 +84,7 @@ def match_windows(
 
     def body(state):
         i, table = state
-        # The last chunk is moved back to fit; the rows it repeats are written twice, alike.
+        # The last chunk is moved back to fit. The rows that it repeats are written twice, alike.
         start = jnp.minimum(i * chunk, n - chunk)
         cell0 = lax.dynamic_slice(matched, (start,), (chunk,))
         live = start + jnp.arange(chunk) < count
@@ -98,7 +98,7 @@ def match_windows(
 
 
 def candidates(windows: Int[Array, "n w"], f0: JoinedFeatures) -> Int[Array, "m slots"]:
-    """The distinct partners of every fine cell of image 0, ascending, then -1.
+    """The different partners of every fine cell of image 0 in ascending order, followed by -1.
 
     Args:
       windows: from `match_windows`.
@@ -123,9 +123,9 @@ def candidates(windows: Int[Array, "n w"], f0: JoinedFeatures) -> Int[Array, "m 
 def correspondences(
     table: Int[Array, "m slots"], *, capacity: int
 ) -> tuple[Int[Array, "capacity 2"], Int[Array, ""]]:
-    """(cell 0, cell 1) of every candidate in index order, and how many there are.
+    """(cell 0, cell 1) of every candidate in index order, and the number of candidates.
 
-    More candidates than `capacity` are cut off at the end; the count tells.
+    Candidates beyond `capacity` are cut off at the end, but they are counted.
     """
     slots = table.shape[1]
     index, count = compact(table.reshape(-1) >= 0, size=capacity)
@@ -140,13 +140,16 @@ def similarities(
     *,
     chunk: int = 512,
 ) -> Float[Array, " k"]:
-    """Products of the fine descriptors of the first `found` correspondences; zeros after them."""
+    """Products of the fine descriptors of the first `found` correspondences.
+
+    Entries after them are unspecified.
+    """
     k = cells.shape[0]
     chunk = min(chunk, k)
 
     def body(state):
         i, scores = state
-        # The last chunk is moved back to fit; what it repeats is written twice, alike.
+        # The last chunk is moved back to fit. The products that it repeats are written twice.
         start = jnp.minimum(i * chunk, k - chunk)
         some = lax.dynamic_slice(cells, (start, 0), (chunk, 2))
         a, b = rows_of(f0.fine, some[:, 0]), rows_of(f1.fine, some[:, 1])
@@ -164,10 +167,10 @@ def one_to_one(
     *,
     num_cells: int,
 ) -> Bool[Array, " k"]:
-    """Which kept correspondences survive so that no cell of either image appears twice.
+    """Which correspondences of `keep` survive, so that no cell of either image appears twice.
 
-    First every cell of image 0 keeps its best, then every cell of image 1 its best of those; the
-    higher score wins, the earlier entry among equals.
+    First every cell of image 0 keeps its best correspondence. Then every cell of image 1 keeps the
+    best of those. The higher score wins, and among equal scores the earlier entry.
     """
     k = cells.shape[0]
     for side in (0, 1):

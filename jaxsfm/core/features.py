@@ -1,4 +1,4 @@
-"""One image -> DenseFeatures: descriptors of two layers and a keypoint for every fine cell."""
+"""The features of one image: descriptors of two layers, and a keypoint for every fine cell."""
 
 import functools
 from collections.abc import Sequence
@@ -18,15 +18,15 @@ from jaxsfm.core.types import DenseFeatures, Levels
 from jaxsfm.core.vgg import Preprocessing, preprocess
 
 LEAST_DIFFERENCE = 1e-3
-"""Between a unit descriptor and its image's mean, for the descriptor to count."""
+"""Smallest distance between a unit descriptor and the mean of its image for it to count."""
 
 
 class Extraction(NamedTuple):
-    """What fixes the program of `extract`, beside the image's shape; hashable."""
+    """The static, hashable settings of `extract`."""
 
     preprocessing: Preprocessing
     num_coarse: int
-    """Capacity of the first octave; there are four times as many fine cells."""
+    """Capacity for coarse cells of the first octave; that for fine cells is four times as large."""
     backbone: str = "vgg16"
     """One of `jaxsfm.core.backbones.BACKBONES`."""
     relocalized: bool = True
@@ -38,7 +38,7 @@ class Extraction(NamedTuple):
 def _flatten(
     feature_map: Float[Array, "h w c"], grid: Int[Array, " 2"], *, capacity: int, centred: bool
 ) -> Float[Array, "capacity c"]:
-    """Unit descriptors of the valid cells in row order, zero rows after them."""
+    """Unit descriptors of the valid cells in row order, followed by zero rows."""
     row, col = cell_rows_cols(capacity, jnp.maximum(grid[1], 1))
     h, w, c = feature_map.shape
     inside = (row < grid[0]) & (grid[1] > 0)
@@ -48,7 +48,7 @@ def _flatten(
         seen = jnp.any(flat != 0, axis=1)
         mean = jnp.sum(flat, axis=0) / jnp.maximum(jnp.sum(seen), 1).astype(flat.dtype)
         rest = flat - mean
-        # What differs from the mean by rounding alone (a blank wall) shows nothing.
+        # A cell that differs from the mean by no more than rounding (a blank wall) shows nothing.
         seen &= squared_norm(rest) > LEAST_DIFFERENCE**2
         flat = jnp.where(seen[:, None], unit(rest), 0.0)
     return flat
@@ -63,14 +63,16 @@ def dense_features(
     relocalized: bool,
     centred: bool = False,
 ) -> DenseFeatures:
-    """Descriptors and keypoints of an image from its maps, each with batch axis 1.
+    """The features of an image from its maps.
 
     Args:
-      octaves: of the image, of the image at half its size, ...
+      octaves: maps of the image, of the image at half its size, and so on; all have a batch axis
+        of 1.
       size: valid (rows, columns) of the image.
       num_coarse, num_fine: capacities of the first octave, at least the number of valid cells.
-      relocalized: keypoints by relocalization; False puts them at the cells' centres.
-      centred: subtract an octave's mean descriptor from all of them, before normalising again.
+      relocalized: keypoints are relocalized; otherwise they are the centres of the cells.
+      centred: the mean descriptor of an octave is subtracted from its descriptors, which are then
+        scaled to unit length again.
     """
     fine_grid, coarse_grid = size // FINE_STRIDE, size // COARSE_STRIDE
     row, col = cell_rows_cols(num_fine, fine_grid[1])
@@ -97,9 +99,11 @@ def dense_features(
 
 
 def stored(features: DenseFeatures) -> DenseFeatures:
-    """The same with descriptors of half the size, as they are kept: float16, which moves a unit
-    vector by 2.4e-4 at most, a thousandth of what separates neighbouring cells
-    (docs/decisions/features.md)."""
+    """The features as they are stored, with descriptors as float16.
+
+    This moves a unit vector by at most 2.4e-4, a thousandth of the distance between neighbouring
+    cells (docs/decisions/features.md).
+    """
 
     def half(octaves: tuple[Array, ...]) -> tuple[Array, ...]:
         return tuple(octave.astype(jnp.float16) for octave in octaves)
@@ -116,19 +120,21 @@ def extract(
     settings: Extraction,
     scores: dict | None = None,
 ) -> DenseFeatures:
-    """DenseFeatures of one RGB image, padded at the bottom and on the right beyond `size`.
-
-    Both padded sides must be multiples of 2^(octaves - 1).
+    """The features of one RGB image.
 
     Args:
-      params: of the backbone.
-      scores: of `jaxsfm.core.scores.Scores`, for keypoints; None: the norm rule.
+      params: parameters of the backbone.
+      image: RGB, padded at the bottom and on the right beyond `size`. Both sides are multiples of
+        2^(octaves - 1).
+      size: valid (rows, columns).
+      scores: parameters of `jaxsfm.core.scores.Scores`, which move the keypoints; `None` scores by
+        descriptor norms.
     """
     x = preprocess(image, settings.preprocessing)
     network = BACKBONES[settings.backbone].module(bfloat16=settings.bfloat16)
     levels: list[Levels] = []
     for k in range(settings.octaves):
-        # Keypoints are the first octave's.
+        # Keypoints come from the first octave.
         heads = heads_of(scores if k == 0 else None)
         maps = network.apply(params, x[None], (size >> k)[None], heads, method="levels")
         assert isinstance(maps, Levels)

@@ -1,8 +1,8 @@
 """Homographies: four-point solution, least squares, transfer test.
 
-h maps image 0 to image 1: (x1, y1, 1) ~ h (x0, y0, 1). Everything is float32 on coordinates that
-were centred and scaled (`normalisation`); at raw pixel coordinates the normal equations would
-lose all of float32's digits.
+h maps image 0 to image 1: (x1, y1, 1) ~ h (x0, y0, 1). All computations are in float32, on
+coordinates that were centred and scaled (`normalisation`). In raw pixel coordinates the normal
+equations would lose all digits of float32.
 """
 
 import jax.numpy as jnp
@@ -11,18 +11,19 @@ from jaxtyping import Array, Bool, Float
 from jaxsfm.core.numerics import HIGHEST
 
 MIN_AREA = 1e-4
-"""Twice the triangle area, in normalised units squared, below which three points are collinear."""
+"""Three points are collinear if twice the area of their triangle, in normalised units squared, is
+below this."""
 
 
 def homogeneous(xy: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    """Append 1."""
+    """Homogeneous coordinates (x, y, 1) of points."""
     return jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
 
 
 def normalisation(xy: Float[Array, "k 2"], weight: Float[Array, " k"]) -> Float[Array, "3 3"]:
-    """Similarity that moves weighted points to mean 0 and root mean square radius sqrt(2).
+    """The similarity that moves weighted points to mean 0 and root mean square radius sqrt(2).
 
-    One scale for both axes, so that a radius in pixels stays a radius.
+    Both axes have one scale, so that a circle stays a circle.
     Source: Hartley 1997, section 5.
     """
     x, y = xy[:, 0], xy[:, 1]  # columns: sums over (k, 2) are read with a stride of two
@@ -36,7 +37,8 @@ def normalisation(xy: Float[Array, "k 2"], weight: Float[Array, " k"]) -> Float[
 
 
 def apply_affine(t: Float[Array, "3 3"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-    """Map points by a similarity or affinity; precise on every backend (no matrix product)."""
+    """Points mapped by a similarity or an affinity. There is no matrix product, so the result is
+    precise on every backend."""
     return jnp.stack(
         [
             t[0, 0] * xy[..., 0] + t[0, 1] * xy[..., 1] + t[0, 2],
@@ -47,15 +49,17 @@ def apply_affine(t: Float[Array, "3 3"], xy: Float[Array, "*n 2"]) -> Float[Arra
 
 
 def adjugate(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """adj(m) m = det(m) I: the inverse up to scale, defined for singular m too."""
+    """adj(m) with adj(m) m = det(m) I: the inverse up to scale, which exists for singular m too."""
     a, b, c = m[..., :, 0], m[..., :, 1], m[..., :, 2]
     return jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-2)
 
 
 def _basis(xy: Float[Array, "*b 4 2"]) -> tuple[Array, Array, Array]:
-    """Columns of the first three points, their adjugate, and the fourth point's coordinates.
+    """The first three points as columns, the adjugate of that matrix, and the coordinates of the
+    fourth point in it.
 
-    The coordinates are twice the signed areas of the triangles with the fourth point.
+    The coordinates are twice the signed areas of the triangles that the fourth point forms with two
+    of the others.
     """
     points = homogeneous(xy)
     columns = jnp.swapaxes(points[..., :3, :], -1, -2)
@@ -68,16 +72,18 @@ def from_four_points(
 ) -> tuple[Float[Array, "*b 3 3"], Bool[Array, "*b"]]:
     """The homography through four correspondences, and whether they determine one.
 
-    Closed form by projective bases (no linear solver: batches of 8 x 8 systems run one by one on
-    CPUs). With a_k, b_k the first three points as columns of A, B and l, m the coordinates of the
-    fourth point in them, h = B diag(m / l) adj(A). Not valid: three collinear points, or a triangle
-    that one image sees from the other side (no camera can).
+    This is a closed form by projective bases, because linear solvers take batches of 8 x 8 systems
+    one by one on CPUs. Let A, B have the first three points of the images as columns, and let l, m
+    be the coordinates of the fourth points in them. Then h = B diag(m / l) adj(A).
+
+    Four correspondences are not valid if three points are collinear, or if a triangle is mirrored
+    between the images, which no camera can do.
 
     Source: Hartley and Zisserman, 2nd ed., section 2.3 and table 22.1 (chirality).
     """
     _, adj0, area0 = _basis(xy0)
     columns1, adj1, area1 = _basis(xy1)
-    # Signs of all four triangles: three with the fourth point, and the first three themselves.
+    # The signed areas of all four triangles: three with the fourth point, and the first three.
     whole0 = area0.sum(-1, keepdims=True)
     whole1 = area1.sum(-1, keepdims=True)
     all0 = jnp.concatenate([area0, whole0], axis=-1)
@@ -90,7 +96,7 @@ def from_four_points(
 
 
 def orient(h: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """Scale to Frobenius norm 1 and positive determinant: then w > 0 in front of both cameras."""
+    """h with Frobenius norm 1 and positive determinant, so that w > 0 in front of both cameras."""
     det = jnp.sum(h[..., 0] * jnp.cross(h[..., 1], h[..., 2]), axis=-1)
     norm = jnp.sqrt(jnp.maximum(jnp.sum(h * h, axis=(-1, -2)), 1e-30))
     return h * (jnp.where(det < 0, -1.0, 1.0) / norm)[..., None, None]
@@ -99,16 +105,19 @@ def orient(h: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
 def least_squares(
     xy0: Float[Array, "k 2"], xy1: Float[Array, "k 2"], weight: Float[Array, " k"]
 ) -> Float[Array, "3 3"]:
-    """Weighted direct linear transform: the smallest eigenvector of the 9 x 9 normal matrix.
+    """Weighted direct linear transform: the last eigenvector of the 9 x 9 normal matrix.
 
-    Points of zero weight do not count. Normalises internally.
+    It belongs to the smallest eigenvalue. Points of weight zero do not count. Coordinates are
+    normalised inside.
+
     Source: Hartley and Zisserman, 2nd ed., algorithm 4.2.
     """
     t0, t1 = normalisation(xy0, weight), normalisation(xy1, weight)
     p, q = apply_affine(t0, xy0), apply_affine(t1, xy1)
     x, y, u, v = p[:, 0], p[:, 1], q[:, 0], q[:, 1]
     one = jnp.ones_like(x)
-    # The rows (p, 0, -u p) and (0, p, -v p) meet in sums of p p' times 1, u, v and u^2 + v^2.
+    # The normal matrix of the rows (p, 0, -u p) and (0, p, -v p) has blocks that are sums of p p'
+    # times 1, -u, -v and u^2 + v^2.
     squares = jnp.stack([x * x, x * y, y * y, x, y, one])
     factors = weight * jnp.stack([one, -u, -v, u * u + v * v])
     sums = jnp.einsum("fk,sk->fs", factors, squares, precision=HIGHEST)
@@ -126,7 +135,8 @@ def compose(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Float[Array, "3 3
 
 
 def _image_of(h: Float[Array, "*b 3 3"], xy0: Float[Array, "k 2"]) -> list[Array]:
-    """h (x, y, 1), its three coordinates (*b, k) apart; elementwise, precise on every backend."""
+    """The three coordinates (*b, k) of h (x, y, 1). They are computed elementwise, which is precise
+    on every backend."""
     m, x, y = h[..., None], xy0[:, 0], xy0[:, 1]
     return [m[..., i, 0, :] * x + m[..., i, 1, :] * y + m[..., i, 2, :] for i in range(3)]
 
@@ -137,9 +147,9 @@ def transfer_inliers(
     xy1: Float[Array, "k 2"],
     threshold: Float[Array, ""],
 ) -> Bool[Array, "*b k"]:
-    """|xy1 - h xy0| < threshold, with the point in front of the camera (w > 0).
+    """Whether |xy1 - h xy0| < threshold and the point lies in front of the camera (w > 0).
 
-    One-way: the distance is measured in image 1. Without division: both sides times w.
+    The distance is measured in image 1. Both sides are multiplied by w, which avoids a division.
     """
     u, v, w = _image_of(h, xy0)
     du, dv = u - w * xy1[:, 0], v - w * xy1[:, 1]
@@ -150,7 +160,7 @@ def transfer_inliers(
 def transfer_error(
     h: Float[Array, "*b 3 3"], xy0: Float[Array, "k 2"], xy1: Float[Array, "k 2"]
 ) -> Float[Array, "*b k"]:
-    """|xy1 - h xy0|^2; infinite behind the camera."""
+    """The squared error |xy1 - h xy0|^2 in image 1; infinite for points behind the camera."""
     u, v, w = _image_of(h, xy0)
     safe = jnp.where(w > 0, w, 1.0)
     square = (u / safe - xy1[:, 0]) ** 2 + (v / safe - xy1[:, 1]) ** 2
@@ -166,7 +176,7 @@ def inliers(
     *,
     two_way: bool,
 ) -> Bool[Array, "*b k"]:
-    """Inliers in image 1, and also in image 0 by the inverse map where `two_way`."""
+    """Inliers in image 1; with `two_way` they must be inliers in image 0 as well."""
     forward = transfer_inliers(h, xy0, xy1, threshold1)
     if not two_way:
         return forward

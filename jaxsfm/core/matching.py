@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours of unit descriptors, tiled: no full n x m matrix has to exist."""
+"""Mutual nearest neighbours of unit descriptors, in tiles, so that no n x m matrix has to exist."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from jaxsfm.core.numerics import HIGHEST, argmax_first
 
 
 def similarity(a: Float[Array, "n c"], b: Float[Array, "m c"]) -> Float[Array, "n m"]:
-    """Inner products; -inf where either descriptor is zero (padding, or nothing to see).
+    """Inner products; -inf where either descriptor is zero (padding, or a cell that shows nothing).
 
     For unit vectors |a - b|^2 = 2 - 2 a.b, so the largest product is the nearest neighbour.
     """
@@ -25,7 +25,7 @@ def mutual(
     row_score: Float[Array, " n"],
     col_best: Int[Array, " m"],
 ) -> Int[Array, " n"]:
-    """The column of each row where both choose each other, else -1."""
+    """For each row the column that it chose, if that column chose the row; otherwise -1."""
     rows = jnp.arange(row_best.shape[0], dtype=jnp.int32)
     agreed = (jnp.take(col_best, row_best, mode="clip") == rows) & jnp.isfinite(row_score)
     return jnp.where(agreed, row_best, -1)
@@ -36,11 +36,11 @@ def scan_mutual(
 ) -> Int[Array, " n"]:
     """Mutual best partners of n rows and m columns; `tile` rows of scores exist at a time.
 
-    Exact; ties go to the lowest index on both sides.
+    The result is exact, and ties go to the lowest index on both sides.
 
     Args:
-      scores: first row (int32) -> the scores of `tile` rows from there; -inf for what cannot match
-        and for rows past the last.
+      scores: a function of the first row (int32) that returns the scores of `tile` rows; -inf for
+        pairs that cannot match and for rows after the last one.
     """
 
     def step(best, start):
@@ -68,8 +68,9 @@ def mutual_nn(
 ) -> Int[Array, " n"]:
     """For every row of `a` the row of `b` that is its mutual nearest neighbour, or -1.
 
-    Exact; ties go to the lowest index on both sides. No ratio test: neighbouring cells look alike
-    (paper, section 3.1). `tile` rows of the similarity matrix exist at a time.
+    The result is exact, and ties go to the lowest index on both sides. There is no ratio test,
+    because neighbouring cells look alike (paper, section 3.1). `tile` rows of the similarity matrix
+    exist at a time.
     """
     n = a.shape[0]
     tile = min(tile, n)

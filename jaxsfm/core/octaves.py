@@ -1,9 +1,9 @@
-"""Octaves: an image described at its size, at half its size, at a quarter.
+"""Octaves: an image is described at its size, at half of it, at a quarter, and so on.
 
-Photon noise defeats the network at full size before it does at half or a quarter, and what is far
-apart in a view comes close together there. Every cell of the first octave gets the descriptors of
-all octaves at its place, so products are weighted means over the octaves and cells, keypoints and
-tracks stay those of the first.
+At full size, photon noise makes the network fail earlier than at half or a quarter of the size. At
+smaller sizes a cell also sees a larger part of the scene. Every cell of the first octave gets the
+descriptors of all octaves at its place, so the product of two cells is a weighted mean over the
+octaves. Cells, keypoints and tracks stay those of the first octave.
 """
 
 import math
@@ -17,12 +17,13 @@ from jaxsfm.core.numerics import inverse_norm
 from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart
 
 OCTAVE_WEIGHT = 0.5
-"""Of an octave's products, relative to the octave before: 1, 1/2, 1/4, ... Equal weights find a
-quarter more at night, but lose 0.1 mAA on photos of 800 px (docs/decisions/features.md)."""
+"""Weight of the products of an octave relative to the octave before: 1, 1/2, 1/4, ... Equal weights
+find a quarter more matches at night, but lose 0.1 mAA on photos of 800 px
+(docs/decisions/features.md)."""
 
 
 def halve(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
-    """Means of 2 x 2 pixels; pixel (u, v) lies at (2 u + 0.5, 2 v + 0.5) of the whole image.
+    """Means of 2 x 2 pixels. Pixel (u, v) lies at (2 u + 0.5, 2 v + 0.5) of the given image.
 
     Both sides must be even.
     """
@@ -31,15 +32,20 @@ def halve(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
 
 
 def octave_capacity(capacity: int, octave: int) -> int:
-    """Room for an octave's cells, where `capacity` is the first one's."""
+    """Capacity for the cells of an octave, where the first octave has `capacity`."""
     return -(-capacity // 4**octave)
 
 
 def _between(
     cell: Int[Array, " n"], count: Int[Array, ""], octave: int
 ) -> tuple[Int[Array, " n"], Int[Array, " n"], Float[Array, " n"]]:
-    """The two of an octave's `count` cells along an axis around a cell's centre, and the share of
-    the second."""
+    """Along one axis, the two cells of an octave around the centre of a cell of the first octave,
+    and the weight of the second one.
+
+    Args:
+      cell: index of the cell in the first octave.
+      count: number of cells of the octave along the axis.
+    """
     last = jnp.maximum(count - 1, 0)
     place = (cell.astype(jnp.float32) + 0.5) / 2**octave - 0.5
     place = jnp.clip(place, 0.0, last.astype(jnp.float32))
@@ -50,7 +56,7 @@ def _between(
 def blend(
     rows: Float[Array, "k c"], cells: Int[Array, "n 4"], weights: Float[Array, "n 4"]
 ) -> Float[Array, "n c"]:
-    """Weighted sums of four rows each."""
+    """For each of n cells the weighted sum of four rows."""
 
     def nth(i):
         return weights[:, i : i + 1] * jnp.take(rows, cells[:, i], axis=0, mode="clip")
@@ -61,17 +67,19 @@ def blend(
 def _join(
     octaves: Sequence[Array], grid: Int[Array, " 2"]
 ) -> tuple[Float[Array, "n kc"], tuple[OctavePart, ...]]:
-    """The octaves' unit descriptors at the first one's cells, each times the root of its weight,
-    side by side, unit together; and what the channels after the first octave's are made of.
+    """Joined unit descriptors at the cells of the first octave, and how the channels after those of
+    the first octave are made.
 
-    Between the centres of coarser cells: bilinear; beyond the outermost: theirs.
+    The unit descriptor of each octave is multiplied by the root of its weight. All of them are
+    concatenated, and the result is scaled to unit length. Between the centres of an octave's cells,
+    descriptors are interpolated bilinearly; beyond the outermost centres they are constant.
     """
     octaves = [flat.astype(jnp.float32) for flat in octaves]
     first = octaves[0]
     if len(octaves) == 1:
         return first, ()
     row, col = cell_rows_cols(first.shape[0], grid[1])
-    # A cell that shows nothing at full size has no keypoint worth matching either.
+    # A cell that shows nothing at full size has no keypoint that is worth matching.
     shown = (row < grid[0]) & jnp.any(first != 0, axis=1)
     columns, parts = [first], []
     for k, flat in enumerate(octaves[1:], start=1):
@@ -92,8 +100,8 @@ def _join(
 
 
 def join_octaves(features: DenseFeatures) -> JoinedFeatures:
-    """What an image brings to a pair: products of these descriptors are weighted means over the
-    octaves."""
+    """The features of an image with its octaves joined: the product of two joined descriptors is a
+    weighted mean of the products in the octaves."""
     coarse, parts = _join(features.coarse, features.coarse_grid)
     return JoinedFeatures(
         coarse=coarse,

@@ -1,7 +1,7 @@
-"""One pair = one program: coarse matches, fine correspondences, planes, one-to-one.
+"""The program for one pair: coarse matches, fine correspondences, planes, one-to-one matches.
 
-Images come with their octaves joined (`jaxsfm.core.octaves.join_octaves`), which is done once per
-image and not once per pair. `match_pairs` is the batch.
+The octaves of the images are joined before (`jaxsfm.core.octaves.join_octaves`), once per image and
+not once per pair. `match_pairs` computes a batch of pairs.
 """
 
 import functools
@@ -27,9 +27,9 @@ from jaxsfm.core.types import (
 
 
 def pair_key(root: PRNGKey, identity0: int | Array, identity1: int | Array) -> PRNGKey:
-    """The key of a pair from the identities (uint32) of its images, whichever comes first.
+    """The key of a pair, from the identities (uint32) of its images in either order.
 
-    It does not depend on the pair's place in a batch, on the other pairs or on the machine.
+    It does not depend on the place of the pair in a batch, on other pairs or on the machine.
     """
     a, b = jnp.uint32(identity0), jnp.uint32(identity1)
     return jax.random.fold_in(jax.random.fold_in(root, jnp.minimum(a, b)), jnp.maximum(a, b))
@@ -46,12 +46,12 @@ def match_pair(
 ) -> PairMatches:
     """Verified matches of one pair (paper, section 3).
 
-    One compilation per feature capacity and `PairShape`; thresholds and grid sizes are traced.
-    A pair that fails says why in `status`.
+    There is one compilation for each feature capacity and `PairShape`; thresholds and grid sizes
+    are traced. If the pair fails, `status` gives the reason.
 
     Args:
       key: from `pair_key`.
-      features0, features1: of the two working images.
+      features0, features1: features of the two working images.
       thresholds: pixels of the working images.
     """
     num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
@@ -107,10 +107,10 @@ def match_pairs(
     """`match_pair` over a leading axis of keys and features.
 
     Args:
-      batch_size: pairs computed side by side (vmapped), the others in turn. With 1 the results
-        equal `match_pair` bit for bit; with more, products are vmapped and may round differently in
-        the last place. One is best on a CPU, where a vmapped `while_loop` runs every pair as long
-        as the slowest.
+      batch_size: number of pairs that are computed together (vmapped); batches follow each other.
+        With 1 the results equal those of `match_pair` bit for bit. With more, products are vmapped
+        and may round differently in the last place. On a CPU 1 is best, because a vmapped
+        `while_loop` runs every pair as long as the slowest one.
     """
 
     def one(item):

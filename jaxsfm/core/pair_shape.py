@@ -1,4 +1,4 @@
-"""The static half of the pair program's settings. Imports neither jax nor numpy."""
+"""The static settings of the pair program. This module imports neither jax nor numpy."""
 
 import dataclasses
 from typing import Literal
@@ -8,34 +8,34 @@ OneToOne = Literal["first", "similarity"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairShape:
-    """Static part of the pair program; changing any field recompiles it."""
+    """The static settings of the pair program. Another value of any field is another program."""
 
     max_planes: int = 5
-    """Homographies peeled from one pair (paper, section 4)."""
+    """Largest number of homographies of a pair (paper, section 4)."""
     max_hypotheses: int = 10_000
-    """Upper bound of minimal samples per plane."""
+    """Largest number of minimal samples for a plane."""
     hypotheses_per_step: int = 64
-    """Samples solved and scored together before the stopping rule is looked at."""
+    """Number of samples that are solved and scored between two looks at the stopping rule."""
     two_way: bool = False
-    """Inlier test in both images instead of image 1 only."""
+    """Inliers are tested in both images, instead of in image 1 only."""
     local_refits: int = 1
-    """Least-squares refits on the inliers of each new best hypothesis."""
+    """Largest number of least-squares refits of each new best hypothesis to its inliers."""
     plane_rounds: int = 0
-    """Rounds in which the peeled planes compete for their correspondences (one-way errors)."""
+    """Number of rounds in which the planes compete for their correspondences (one-way errors)."""
     one_to_one: OneToOne = "first"
-    """Which of a cell's several matches survives: the first in index order, or the most similar."""
+    """Which match of a cell survives: the first in index order, or the most similar one."""
     consensus: int = 0
-    """Radius, coarse cells, of the neighbourhood that votes on coarse matches; 0: none."""
+    """Radius, coarse cells, of the neighbourhood that votes on coarse matches; 0 for no votes."""
     coarse_columns: int = 128
-    """Widest coarse grid the votes reach across: 2048 px; widened for wider images."""
+    """Largest number of coarse columns for which votes work, 2048 px; widened for wider images."""
     coarse_tile: int = 1024
-    """Rows of the coarse similarity matrix held at once."""
+    """Number of rows of the coarse similarity matrix that are held at once."""
     fine_chunk: int = 16
-    """Coarse matches whose windows are compared at once."""
+    """Number of coarse matches whose windows are compared at once."""
     score_chunk: int = 2048
-    """Correspondences scored at once: small enough to stay in cache."""
+    """Number of correspondences that are scored at once; they stay in the cache."""
     correspondences_per_cell: float = 2.0
-    """Capacity of the correspondence list, per fine cell."""
+    """Capacity of the list of correspondences, per fine cell."""
 
     def __post_init__(self) -> None:
         for name in (

@@ -1,11 +1,12 @@
 """Homography RANSAC: vmapped hypotheses, chunked scoring, adaptive stop, planes peeled in turn.
 
-The loop structure is the authors' (at most 10 000 samples, confidence 0.999, one least-squares
-refit at each new best, up to five planes of at least 26 inliers on what the earlier ones left);
-the minimal solution is the true one, where their code takes the wrong singular vector.
+The structure is that of the authors' code: at most 10 000 samples, a confidence of 0.999, one
+least-squares refit at each new best hypothesis, and up to five planes of at least 26 inliers, each
+on the correspondences that the earlier ones left. The minimal solution differs: their code takes
+the wrong singular vector, and here it is the true solution.
 
-Correspondences are compacted first, so the work follows their number and not the list's capacity.
-Random numbers come from (key, plane, step): the result does not depend on the capacity.
+Correspondences are compacted first, so the amount of work follows their number and not the capacity
+of their list. Random numbers depend on (key, plane, step) and not on the capacity either.
 """
 
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from jaxsfm.core.types import Correspondences, Planes, PRNGKey, Thresholds
 
 
 class _Problem(NamedTuple):
-    """Normalised correspondences of one plane search: the first `num_live` rows count."""
+    """Normalised correspondences, of which the first `num_live` rows count."""
 
     xy0: Float[Array, "k 2"]
     xy1: Float[Array, "k 2"]
@@ -33,9 +34,9 @@ class _Problem(NamedTuple):
 
 
 def sample_indices(key: PRNGKey, num: int, count: Int[Array, ""]) -> Int[Array, "num 4"]:
-    """`num` draws of four different indices below `count` (>= 4), uniform, in any order.
+    """`num` uniform samples of four different indices below `count` (at least 4), in any order.
 
-    The i-th index is drawn below count - i and moved past the ones already drawn.
+    The i-th index is drawn below count - i and then moved past the indices drawn before.
     """
     drawn: list[Array] = []
     for i in range(4):
@@ -51,14 +52,15 @@ def sample_indices(key: PRNGKey, num: int, count: Int[Array, ""]) -> Int[Array, 
 def hypotheses_needed(
     num_inliers: Int[Array, ""], count: Int[Array, ""], confidence: Float[Array, ""] | float
 ) -> Float[Array, ""]:
-    """Samples after which an all-inlier one has been drawn with `confidence`.
+    """The number of samples after which one of inliers alone was drawn with probability
+    `confidence`.
 
-    The probability of an all-inlier sample is the hypergeometric prod (i - k) / (n - k), k = 0..3.
+    A sample of inliers alone has the hypergeometric probability prod (i - k) / (n - k), k = 0..3.
     """
     k = jnp.arange(4, dtype=jnp.float32)
     i, n = num_inliers.astype(jnp.float32), count.astype(jnp.float32)
     p = jnp.prod(jnp.maximum(i - k, 0.0) / jnp.maximum(n - k, 1.0))
-    # log1p keeps p far below float32's epsilon; p = 1 needs one sample.
+    # log1p is accurate for p far below the epsilon of float32. With p = 1 one sample is enough.
     miss = jnp.log1p(-jnp.minimum(p, 1.0 - 1e-6))
     return jnp.where(p > 0, jnp.log(1.0 - confidence) / jnp.where(p > 0, miss, -1.0), jnp.inf)
 
@@ -74,10 +76,10 @@ def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
 def count_inliers(
     h: Float[Array, "s 3 3"], problem: _Problem, *, shape: PairShape
 ) -> Int[Array, " s"]:
-    """Inliers of every hypothesis, a chunk of correspondences at a time.
+    """The number of inliers of every hypothesis, computed a chunk of correspondences at a time.
 
-    Coordinates are cut into columns first: slices of (k, 2) are read with a stride of two, four
-    times as slowly.
+    Coordinates are separated into columns first. Slices of (k, 2) would be read with a stride of
+    two, which is four times as slow.
     """
     k = problem.xy0.shape[0]
     chunk = min(shape.score_chunk, k)
@@ -89,7 +91,7 @@ def count_inliers(
         x0, y0, x1, y1 = (lax.dynamic_slice_in_dim(c, start, chunk) for c in columns)
         xy0, xy1 = jnp.stack([x0, y0], axis=1), jnp.stack([x1, y1], axis=1)
         index = start + jnp.arange(chunk)
-        # The last chunk is moved back to fit: count only what no earlier chunk has counted.
+        # The last chunk is moved back to fit. Count only rows that no earlier chunk has counted.
         live = (index >= i * chunk) & (index < problem.num_live)
         hit = hg.inliers(h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way)
         return i + 1, counts + jnp.sum(hit & live, axis=1, dtype=jnp.int32)
@@ -99,7 +101,7 @@ def count_inliers(
 
 
 def _refit(h: Array, num: Array, problem: _Problem, shape: PairShape) -> tuple[Array, Array]:
-    """Least squares on the inliers, kept while it gains; at most `local_refits` times."""
+    """Least squares on the inliers, at most `local_refits` times, as long as inliers are gained."""
 
     def body(state):
         i, h, num, _ = state
@@ -119,7 +121,7 @@ def _refit(h: Array, num: Array, problem: _Problem, shape: PairShape) -> tuple[A
 def _one_plane(
     key: PRNGKey, problem: _Problem, thresholds: Thresholds, active: Array, shape: PairShape
 ) -> tuple[Array, Array, Array]:
-    """Best homography (normalised), its inlier count, hypotheses used."""
+    """The best homography (normalised), its number of inliers, and the number of hypotheses."""
     step_size = shape.hypotheses_per_step
 
     def more(state):
@@ -158,13 +160,14 @@ def peel_planes(
     *,
     shape: PairShape,
 ) -> Planes:
-    """Up to `max_planes` homographies, each on the correspondences the earlier ones left.
+    """Up to `max_planes` homographies, each on the correspondences that the earlier ones left.
 
-    Stops at the first with fewer than `min_inliers` inliers (paper, section 3.3; authors' code).
-    With `plane_rounds` they then compete for the correspondences (`jaxsfm.core.planes`).
+    Peeling stops at the first homography with fewer than `min_inliers` inliers (paper, section 3.3;
+    authors' code). With `plane_rounds` above 0 the planes then compete for the correspondences
+    (`jaxsfm.core.planes`).
 
     Args:
-      key: the pair's key.
+      key: the key of the pair.
       xy0, xy1: pixels of the working images.
       valid: which rows are correspondences.
     """

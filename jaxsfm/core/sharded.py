@@ -1,7 +1,8 @@
 """Batches over all devices: every device runs the same program on its own items.
 
-Items are laid along the one axis of a mesh (`jax.sharding`); nothing is exchanged between devices,
-so an item's result is that of one device, and a loop ends on each device when its own items end.
+Items are laid along the one axis of a mesh (`jax.sharding`). Devices exchange nothing. So the
+result of an item is what one device alone computes, and a loop on a device ends when the items of
+that device are done.
 """
 
 import functools
@@ -28,7 +29,7 @@ _EACH, _SAME = PartitionSpec(AXIS), PartitionSpec()
 
 
 def device_mesh(devices: Sequence[object]) -> Mesh:
-    """The devices in a row."""
+    """A mesh with one axis over the devices."""
     return Mesh(np.asarray(devices), (AXIS,))
 
 
@@ -54,10 +55,12 @@ def extract_batch(
     mesh: Mesh,
     settings: Extraction,
 ) -> DenseFeatures:
-    """`jaxsfm.core.features.extract` of images that share a padded size, as they are `stored`.
+    """Features of images of one padded size, as `jaxsfm.core.features.stored` keeps them.
 
     Args:
-      images: a multiple of the number of devices; each computes its share side by side.
+      params, scores: as in `jaxsfm.core.features.extract`.
+      images: RGB; their number is a multiple of the number of devices.
+      sizes: valid (rows, columns) of each image.
     """
 
     def local(params, scores, images, sizes):
@@ -72,7 +75,7 @@ def extract_batch(
 
 @functools.partial(jax.jit, static_argnames=("mesh",))
 def join_everywhere(features: DenseFeatures, *, mesh: Mesh) -> JoinedFeatures:
-    """One image's joined features on every device: leading axis of devices, all alike."""
+    """The joined features of one image, copied to every device along a leading axis of devices."""
 
     def local(features):
         return jax.tree.map(lambda x: x[None], join_octaves(features))
@@ -81,8 +84,10 @@ def join_everywhere(features: DenseFeatures, *, mesh: Mesh) -> JoinedFeatures:
 
 
 def pick(joined: Sequence[JoinedFeatures], *, mesh: Mesh) -> JoinedFeatures:
-    """For each device the features of another image, from results of `join_everywhere`; nothing is
-    copied."""
+    """For each device the features of another image, along a leading axis of devices.
+
+    They are taken from results of `join_everywhere`, and nothing is copied.
+    """
     if mesh.size == 1:
         return joined[0]
     sharding = NamedSharding(mesh, _EACH)
@@ -108,15 +113,16 @@ def match_batch(
     mesh: Mesh,
     shape: PairShape,
 ) -> PairMatches:
-    """`jaxsfm.core.pair.match_pairs` with b pairs, side by side, on each of d devices.
+    """`jaxsfm.core.pair.match_pairs` with b vmapped pairs on each of d devices.
 
     Args:
-      root: key of the run; a pair's own is `pair_key`'s.
-      identities: of the two images of every pair.
-      sides: for each of the b the features of both images, leading axis d (from `pick`).
+      root: key of the run, from which `pair_key` makes the key of a pair.
+      identities: identities of the two images of every pair.
+      sides: for each of the b pairs the features of both images, with a leading axis d (from
+        `pick`).
 
     Returns:
-      Leading axes d, b.
+      Matches with leading axes d, b.
     """
 
     def local(root, identities, sides, thresholds):

@@ -1,8 +1,9 @@
-"""The containers that flow through the core: NamedTuples of arrays, no methods that compute.
+"""The containers of the core: NamedTuples of arrays, without methods.
 
-Axis letters: h w image rows and columns, c channels, n coarse (pool4) cells, m fine (pool3) cells,
-k correspondences (capacity), p planes, s samples. Padded rows are marked by a mask, an index of -1
-or, for descriptors, by being all zero; they never match.
+Axis letters are h, w for rows and columns of an image, c for channels, n for coarse (pool4) cells,
+m for fine (pool3) cells, k for correspondences (capacity), p for planes and s for samples. Rows of
+padding are marked by a mask, by an index of -1 or, for descriptors, by being zero; they never
+match.
 """
 
 import enum
@@ -16,7 +17,7 @@ class Pyramid(NamedTuple):
     """Feature maps, each half the size of the one before; the first has the image's size."""
 
     conv1_2: Float[Array, "b h w 64"]
-    """Before the rectifier, as the authors' code uses it (algorithm notes, section 1)."""
+    """Before the rectifier, as in the authors' code."""
     pool1: Float[Array, "b h2 w2 64"]
     pool2: Float[Array, "b h4 w4 128"]
     pool3: Float[Array, "b h8 w8 256"]
@@ -25,19 +26,19 @@ class Pyramid(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """What features are made of: descriptors, and how strong the finer maps are."""
+    """The maps of a backbone that features are made of."""
 
     scores: tuple[Float[Array, "b h w"], Float[Array, "b h2 w2"], Float[Array, "b h4 w4"]]
-    """What relocalization walks by: squared norms of the cells of conv1_2, pool1 and pool2, or
-    learned scores."""
+    """The scores that keypoints are relocalized by: squared norms of the cells of conv1_2, pool1
+    and pool2, or learned scores."""
     pool3: Float[Array, "b h8 w8 d"]
-    """Fine descriptors, not normalised; of another backbone than VGG its map of that stride."""
+    """Fine descriptors, not normalised. Other backbones than VGG give their map of this stride."""
     pool4: Float[Array, "b h16 w16 c"]
-    """Coarse ones."""
+    """Coarse descriptors, not normalised."""
 
 
 class DenseFeatures(NamedTuple):
-    """What one image brings to every pair: descriptors at its size, at half its size, ...
+    """The features of one image: descriptors at its size, at half its size, and so on; keypoints.
 
     Octave k has `grid >> k` cells; cell (row, col) is entry row * columns + col of its octave.
     """
@@ -55,18 +56,19 @@ class DenseFeatures(NamedTuple):
 
 
 class OctavePart(NamedTuple):
-    """A smaller octave's channels of joined descriptors: weighted sums over its own cells."""
+    """The channels of joined descriptors that come from a smaller octave. They are weighted sums
+    over the cells of that octave."""
 
     flat: Float[Array, "k c"]
     """The octave's descriptors."""
     cells: Int[Array, "n 4"]
-    """The four of them around every joined cell."""
+    """The four cells of the octave around every joined cell."""
     weights: Float[Array, "n 4"]
-    """Zero for cells without this octave."""
+    """Weights of the four cells; zero where the octave has no part."""
 
 
 class JoinedFeatures(NamedTuple):
-    """What one image brings to a pair, its octaves joined (`jaxsfm.core.octaves`).
+    """The features of one image with its octaves joined (`jaxsfm.core.octaves`).
 
     Cell (row, col) is entry row * columns + col.
     """
@@ -82,7 +84,7 @@ class JoinedFeatures(NamedTuple):
     fine_grid: Int[Array, " 2"]
     """(rows, columns) of the pool3 grid."""
     coarse_parts: tuple[OctavePart, ...] = ()
-    """What the last channels of `coarse` are made of, octave after octave."""
+    """How the last channels of `coarse` are made, octave after octave."""
 
 
 class DescriptorGrid(NamedTuple):
@@ -93,7 +95,7 @@ class DescriptorGrid(NamedTuple):
     size: Int[Array, " 2"]
     """(rows, columns)."""
     parts: tuple[OctavePart, ...] = ()
-    """What the last channels are made of, octave after octave; empty if that is not known."""
+    """How the last channels are made, octave after octave; may be empty."""
 
 
 class Correspondences(NamedTuple):
@@ -106,7 +108,7 @@ class Correspondences(NamedTuple):
 
 
 class Thresholds(NamedTuple):
-    """Traced scalars of the verification: changing them does not recompile."""
+    """Settings of the verification. They are traced, so other values do not recompile a program."""
 
     threshold_px: Float[Array, ""] | float
     min_inliers: Int[Array, ""] | int
@@ -114,7 +116,7 @@ class Thresholds(NamedTuple):
 
 
 class Status(enum.IntEnum):
-    """How a pair ended."""
+    """The outcome of matching a pair."""
 
     VERIFIED = 0
     TOO_FEW_MATCHES = 1
@@ -129,23 +131,23 @@ class Planes(NamedTuple):
     num_inliers: Int[Array, " p"]
     """Members of each plane; 0 where there is no plane."""
     num_hypotheses: Int[Array, " p"]
-    """Minimal samples that were scored."""
+    """Number of minimal samples that were scored."""
     plane: Int[Array, " k"]
-    """The plane of each correspondence, -1 for none."""
+    """The plane of each correspondence; -1 for none."""
 
 
 class PairMatches(NamedTuple):
     """The verified matches of one pair; row i is a match only where plane[i] >= 0."""
 
     cells: Int[Array, "k 2"]
-    """Fine cell in image 0 and in image 1; one-to-one among the matches."""
+    """The fine cells in image 0 and in image 1. No cell occurs twice among the matches."""
     plane: Int[Array, " k"]
     homographies: Float[Array, "p 3 3"]
     num_inliers: Int[Array, " p"]
     num_coarse: Int[Array, ""]
     num_tentative: Int[Array, ""]
     num_dropped: Int[Array, ""]
-    """Correspondences beyond the list's capacity, lost."""
+    """Number of correspondences that were lost because the list was full."""
     status: Int[Array, ""]
 
 

@@ -1,9 +1,9 @@
 """VGG-16 and VGG-19 up to the pooling of conv5, as flax modules with the canonical layer names.
 
-Images may be padded at the bottom and on the right: after every convolution the rows and columns
-past the valid size are set to zero again, so that the valid part equals what the unpadded image
-gives (zero padding is what the network's own borders use). Pooling floors, as MatConvNet and
-PyTorch do.
+Images may be padded at the bottom and on the right. After every convolution the rows and columns
+beyond the valid size are set to zero again. The borders of the network use zero padding, so the
+valid part of a map equals the map of the unpadded image. Pooling rounds sizes down, as in
+MatConvNet and PyTorch.
 
 Source: Simonyan and Zisserman 2015, configurations D and E.
 """
@@ -28,9 +28,9 @@ BLOCKS: Blocks = (
     (512, 512, 512),
     (512, 512, 512),
 )
-"""Of VGG-16: the channels of every convolution of every block."""
+"""The numbers of channels of the convolutions of VGG-16, block by block."""
 BLOCKS_19: Blocks = tuple((*block, block[-1]) if len(block) == 3 else block for block in BLOCKS)
-"""Of VGG-19: a convolution more in each of the last three."""
+"""The same of VGG-19, which has one more convolution in each of the last three blocks."""
 
 
 def layers_of(blocks: Blocks) -> dict[str, tuple[int, int]]:
@@ -44,14 +44,14 @@ def layers_of(blocks: Blocks) -> dict[str, tuple[int, int]]:
 
 
 LAYERS = layers_of(BLOCKS)
-"""Of VGG-16."""
+"""The layers of VGG-16."""
 
 LARGE_BLOCKS = 2
-"""Those whose maps CPUs compute strip by strip; the third gains nothing."""
+"""Number of first blocks that CPUs compute strip by strip. The third block gains nothing by it."""
 
 
 class Preprocessing(NamedTuple):
-    """What a family of weights expects: (image / scale - mean) / std, channels RGB."""
+    """The input that a family of weights expects: (image / scale - mean) / std, channels RGB."""
 
     scale: float
     mean: tuple[float, float, float]
@@ -61,20 +61,20 @@ class Preprocessing(NamedTuple):
 def preprocess(
     image: UInt8[Array, "*b h w 3"] | Float[Array, "*b h w 3"], p: Preprocessing
 ) -> Float[Array, "*b h w 3"]:
-    """RGB, 0 .. 255, to the network's input."""
+    """The input of the network for an RGB image, 0 .. 255."""
     x = image.astype(jnp.float32) / p.scale
     return (x - jnp.asarray(p.mean, jnp.float32)) / jnp.asarray(p.std, jnp.float32)
 
 
 class Parameters(nn.Module):
-    """Holds a layer's parameters under the canonical names."""
+    """The parameters of a layer under their canonical names."""
 
     inputs: int
     features: int
 
     @nn.compact
     def __call__(self) -> Layer:
-        """The layer."""
+        """The kernel and the bias."""
         shape = (3, 3, self.inputs, self.features)
         kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
         bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
@@ -82,17 +82,18 @@ class Parameters(nn.Module):
 
 
 class VGG(nn.Module):
-    """`apply(params, images, size)` -> Pyramid, all maps up to pool5; pure.
+    """A flax module: `apply(params, images, size)` gives a `Pyramid`, all maps up to pool5.
 
-    With `method="levels"` -> Levels: what features are made of, without the largest maps.
+    With `method="levels"` it gives `Levels`, the maps that features are made of. The largest maps
+    then do not exist as a whole.
     """
 
     blocks: ClassVar[Blocks]
     bfloat16: bool = False
-    """Convolutions of bfloat16 (`jaxsfm.core.blocks.conv`)."""
+    """Convolutions round to bfloat16 (`jaxsfm.core.blocks.conv`)."""
 
     def setup(self) -> None:
-        """All layers, with the canonical names."""
+        """Make all layers, with their canonical names."""
         for name, shape in layers_of(self.blocks).items():
             setattr(self, name, Parameters(*shape))
 
@@ -124,10 +125,10 @@ class VGG(nn.Module):
         size: Int[Array, "b 2"],
         heads: Sequence[Head | None] = (None, None, None),
     ) -> Levels:
-        """The same network up to pool4; arguments as above.
+        """The maps that features are made of, up to pool4. Arguments are those of `__call__`.
 
         Args:
-          heads: of the scores of conv1_2, pool1 and pool2; None: squared norms.
+          heads: learned heads for the scores of conv1_2, pool1 and pool2; `None` gives norms.
         """
         x = clear_padding(images, size)
         finest: list[Array] = []
@@ -151,8 +152,8 @@ class VGG(nn.Module):
     def conv5(
         self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]
     ) -> Float[Array, "b h16 w16 512"]:
-        """The last convolution before its rectifier, zero past the valid cells; arguments as
-        above."""
+        """The last convolution before its rectifier, zero beyond the valid cells. Arguments are
+        those of `__call__`."""
         x = clear_padding(images, size)
         for block in range(1, 5):
             layers, large = self._layers(block), block <= LARGE_BLOCKS
@@ -163,7 +164,8 @@ class VGG(nn.Module):
     def walked(
         self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]
     ) -> tuple[Float[Array, "b h w 64"], Float[Array, "b h2 w2 64"], Float[Array, "b h4 w4 128"]]:
-        """The maps that keypoints walk through, conv1_2, pool1 and pool2; arguments as above."""
+        """The maps that keypoints walk through: conv1_2, pool1 and pool2. Arguments are those of
+        `__call__`."""
         x = clear_padding(images, size)
         conv1_2 = convolve(x, size, self._layers(1), bfloat16=self.bfloat16)
         pool1 = pool(conv1_2, size)
@@ -185,7 +187,7 @@ class VGG19(VGG):
 
 
 def init_shapes() -> dict:
-    """The parameter tree's shapes: {'params': {layer: {'kernel': HWIO, 'bias': O}}}."""
+    """The shapes of the parameters: {'params': {layer: {'kernel': HWIO, 'bias': O}}}."""
     return jax.eval_shape(
         VGG16().init,
         jax.random.key(0),

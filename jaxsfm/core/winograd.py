@@ -1,11 +1,12 @@
 """3 x 3 convolution with 2.25 times fewer multiplications: Winograd's F(2 x 2, 3 x 3).
 
-Tiles of 4 x 4 inputs, two apart, become tiles of 2 x 2 outputs: Y = A^T [(G g G^T) * (B^T d B)] A,
-and the elementwise product, summed over the channels, is sixteen matrix products. The transforms
-only add, subtract and halve, so the result differs from the plain sum by rounding alone.
+Tiles d of 4 x 4 inputs, two cells apart, become tiles of 2 x 2 outputs,
+Y = A^T [(G g G^T) * (B^T d B)] A. The elementwise product, summed over the channels, is sixteen
+matrix products. The transforms only add, subtract and halve, so the result differs from the plain
+sum by rounding alone.
 
-For CPUs: XLA has no such path there, and its matrix products are as fast as its convolutions.
-Accelerators' libraries choose among their own.
+This is meant for CPUs, where XLA does not use the algorithm and its matrix products are as fast as
+its convolutions. The libraries of accelerators choose among their own algorithms.
 
 Source: Lavin and Gray 2016, "Fast algorithms for convolutional neural networks", section 4.1.
 """
@@ -19,8 +20,8 @@ from jaxtyping import Array, Float
 from jaxsfm.core.numerics import HIGHEST
 
 TILES = 1024
-"""Tiles transformed together: few enough for the cache, enough for fast products; 256 and 6144 are
-a tenth slower."""
+"""Number of tiles that are transformed together. They fit into the cache and still give fast
+products; 256 and 6144 are a tenth slower."""
 
 
 def _inputs(d: Sequence[Array]) -> list[Array]:
@@ -42,10 +43,10 @@ def _kernels(g: Sequence[Array]) -> list[Array]:
 def conv3x3(
     x: Float[Array, "h w c"], kernel: Float[Array, "3 3 c o"], *, tiles: int = TILES
 ) -> Float[Array, "h w o"]:
-    """Correlation with zero padding of one: what `lax.conv` with padding SAME gives.
+    """Correlation with zero padding of one cell, as `lax.conv` with padding SAME.
 
     Args:
-      tiles: about so many tiles are held at once, whole rows of them.
+      tiles: about this many tiles are held at once, in whole rows.
     """
     h, w, c = x.shape
     down, across = -(-h // 2), -(-w // 2)
@@ -60,13 +61,13 @@ def conv3x3(
         block = block.reshape(rows + 1, 2, across + 1, 2, c)
 
         def corner(i: int, j: int) -> Array:
-            """Entry (i, j) of every tile."""
+            """Entry (i, j) of all tiles of the strip."""
             part = block[i // 2 : rows + i // 2, i % 2, j // 2 : across + j // 2, j % 2]
             return part.reshape(rows * across, c)
 
         half = [_inputs([corner(i, j) for i in range(4)]) for j in range(4)]
         d = [_inputs([half[j][e] for j in range(4)]) for e in range(4)]
-        # One product each: stacked into one batched product they take up to twice as long.
+        # These are sixteen products. One batched product takes up to twice as long.
         m = [[jnp.matmul(d[e][f], g[f][e], precision=HIGHEST) for e in range(4)] for f in range(4)]
         half = [_outputs(m[f]) for f in range(4)]
         y = [_outputs([half[f][p] for f in range(4)]) for p in range(2)]

@@ -133,6 +133,47 @@ def test_normalised_points_have_mean_zero_and_radius_root_two():
     assert np.isfinite(hg.normalisation(same, jnp.ones(5))).all()
 
 
+def test_an_affinity_is_its_matrix():
+    rng = rng_of(2)
+    t, xy = rng.normal(size=(3, 3)).astype(np.float32), rng.normal(size=(4, 5, 2))
+    t[2] = [0, 0, 1]
+    ours = hg.apply_affine(jnp.asarray(t), jnp.asarray(xy, jnp.float32))
+    np.testing.assert_allclose(ours, xy @ t[:2, :2].T + t[:2, 2], **UNIT)
+
+
+def test_in_a_batch_every_sample_is_valid_or_not_by_itself():
+    mirrored, line = SQUARE * np.asarray([-1, 1], np.float32), SQUARE.copy()
+    line[2] = (line[0] + line[1]) / 2
+    # As many samples as points, so that no axis can be taken for another.
+    batch = np.stack([SQUARE, mirrored, line, SQUARE[::-1]]) / 500 - 1
+    first = np.stack([SQUARE] * 3 + [SQUARE[::-1]]) / 500 - 1
+    valid = hg.from_four_points(*(jnp.asarray(x, jnp.float32) for x in (first, batch)))[1]
+    np.testing.assert_array_equal(valid, [True, False, False, True])
+
+
+def test_the_error_of_a_transfer_is_its_squared_distance_and_infinite_behind_the_camera():
+    rng = rng_of(3)
+    h = np.stack([random_homography(rng, strength=1.0) for _ in range(2)])
+    xy0 = rng.uniform(0, 1000, (30, 2))
+    xy1 = xy0 + rng.normal(0, 20, xy0.shape)
+    points = jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32)
+    ours = hg.transfer_error(jnp.asarray(h, jnp.float32), *points)
+    expected = [((oracles.transfer(m, xy0) - xy1) ** 2).sum(1) for m in h]
+    np.testing.assert_allclose(ours, expected, rtol=1e-3, atol=HOMOGRAPHY_PX)
+    behind = jnp.asarray([[1.0, 0, 0], [0, 1, 0], [-2, 0, 1]])
+    away = hg.transfer_error(behind, jnp.asarray([[1.0, 0.0], [0.5, 0.0]]), jnp.zeros((2, 2)))
+    assert np.isinf(away).all()
+
+
+def test_an_oriented_homography_has_norm_one_and_a_positive_determinant():
+    h = np.stack([random_homography(rng_of(4), strength=1.0)] * 2)
+    h[1] *= -3
+    ours = np.asarray(hg.orient(jnp.asarray(h, jnp.float32)), np.float64)
+    np.testing.assert_allclose(np.linalg.norm(ours, axis=(1, 2)), 1, **UNIT)
+    np.testing.assert_allclose(ours[0], ours[1], atol=1e-6)
+    assert (np.linalg.det(ours) > 0).all()
+
+
 def test_vmap_equals_loop():
     rng = rng_of(1)
     xy1 = np.stack([oracles.transfer(random_homography(rng, strength=1), SQUARE) for _ in range(5)])

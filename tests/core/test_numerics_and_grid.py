@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import rng_of, seeds
@@ -74,3 +75,20 @@ def test_compaction_lists_the_set_entries_in_order(seed, size):
     expected = np.flatnonzero(mask)
     assert count == len(expected)
     np.testing.assert_array_equal(index[: min(size, len(expected))], expected[:size])
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("batch_size", [1, 3, 8])
+def test_a_batch_is_its_items_and_one_batch_is_no_loop(count, batch_size):
+    items = jnp.arange(3.0 * count).reshape(count, 3), jnp.arange(count)
+
+    def one(item):
+        return {"sum": item[0].sum() * item[1].astype(jnp.float32), "row": item[0]}
+
+    def run(items):
+        return numerics.one_by_one(one, items, batch_size=batch_size)
+
+    made = run(items)
+    np.testing.assert_array_equal(made["row"], items[0])
+    np.testing.assert_array_equal(made["sum"], np.asarray(items[0]).sum(1) * np.arange(count))
+    assert ("scan" in str(jax.make_jaxpr(run)(items))) == (count > batch_size)
