@@ -33,7 +33,7 @@ def _found(*names: str) -> str | None:
 
 @contextlib.contextmanager
 def started() -> Iterator[webdriver.Chrome]:
-    """Skips the test where there is no browser, or no driver that fits it."""
+    """Start the browser; without one, or without a driver that fits it, the test is skipped."""
     binary = _found("chromium", "chromium-browser", "google-chrome")
     driver = _found("chromedriver")
     if binary is None or driver is None:
@@ -52,7 +52,7 @@ def started() -> Iterator[webdriver.Chrome]:
 
 
 def faults(chrome: webdriver.Chrome) -> list[str]:
-    """What the console holds of errors, since the last call."""
+    """The errors in the console since the last call."""
     return [row["message"] for row in chrome.get_log("browser") if row["level"] == "SEVERE"]
 
 
@@ -78,7 +78,7 @@ def wait_for(condition, seconds: float = 60.0):
 
 
 def element(chrome: webdriver.Chrome, selector: str) -> WebElement:
-    """The first element."""
+    """The first element that a selector finds."""
     return chrome.find_element("css selector", selector)
 
 
@@ -100,5 +100,5 @@ def picture(chrome: webdriver.Chrome, selector: str) -> np.ndarray:
 
 
 def colours(rgb: np.ndarray) -> int:
-    """How many clearly different colours a picture has."""
+    """The number of clearly different colours in a picture."""
     return len(np.unique(rgb.reshape(-1, 3) // 16, axis=0))

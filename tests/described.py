@@ -1,4 +1,4 @@
-"""Dense features of one image in float32, before they are stored."""
+"""Compute dense features of one image in float32, as they are before they are stored."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""A small model with exact observations, any cameras and names, and a run's folder of it."""
+"""A small model with exact observations and any cameras and names, and a run's folder with it."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ CAMERAS = {
     "RADIAL_FISHEYE": [600.0, 512, 384, 0.02, -0.01],
     "OPENCV_FISHEYE": [600.0, 620, 500, 390, 0.02, -0.01, 0.003, -0.002],
 }
-"""Models, and parameters in COLMAP's pixels."""
+"""COLMAP's camera models, each with parameters in COLMAP's pixels."""
 
 
 def camera(model: str, camera_id: int = 1, params: list[float] | None = None) -> pycolmap.Camera:
@@ -79,7 +79,7 @@ def image_files(names: list[str], folder: Path) -> list[ImageFile]:
 def results_of(
     model: pycolmap.Reconstruction, keep=lambda point_id: True
 ) -> dict[Pair, PairResult]:
-    """Every pair's common points as matches; a cell is the point's id."""
+    """The common points of every pair as matches; a cell is the point's id."""
     seen = {
         image.name: {
             p.point3D_id: p.xy - 0.5
@@ -106,7 +106,7 @@ def results_of(
 
 
 def write_run(folder: Path, model: pycolmap.Reconstruction, *, with_model: bool = True) -> Path:
-    """A finished run's folder: database (the first pair verified but for its last match), model."""
+    """Write a finished run's folder; in its database the first pair lacks its last match."""
     folder.mkdir(parents=True, exist_ok=True)
     names = sorted(image.name for image in model.images.values())
     results = results_of(model)

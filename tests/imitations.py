@@ -1,4 +1,4 @@
-"""Weights in every framework's own file format, written by hand, without the frameworks."""
+"""Write weights in the file format of each framework without the framework."""
 
 import collections
 import contextlib
@@ -19,19 +19,19 @@ import scipy.io
 from jaxsfm.core.vgg import LAYERS
 
 Layers = dict[str, tuple[np.ndarray, np.ndarray]]
-"""Layer -> kernel (HWIO, RGB, correlation), bias."""
+"""The kernel (HWIO, RGB, for correlation) and the bias of each layer."""
 
 SMALL = {
     name: (3 if inputs == 3 else inputs // 16, outputs // 16)
     for name, (inputs, outputs) in LAYERS.items()
 }
-"""VGG-16 with a sixteenth of its channels."""
+"""The layers of VGG-16 with a sixteenth of the channels."""
 MEAN = (123.68, 116.779, 103.939)
 TORCH_INDEX = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 
 
 def random_layers(shapes=SMALL, *, seed: int = 0) -> Layers:
-    """He scaling, so that maps neither vanish nor explode."""
+    """Random layers, scaled after He et al. so that maps neither vanish nor explode."""
     rng = np.random.default_rng(seed)
     return {
         name: (
@@ -46,7 +46,7 @@ def random_layers(shapes=SMALL, *, seed: int = 0) -> Layers:
 
 
 def torchvision_names(layers: Layers) -> dict[str, np.ndarray]:
-    """A state dict's entries: OIHW."""
+    """The entries of a PyTorch state dict, whose kernels are OIHW."""
     state = {}
     for index, (kernel, bias) in zip(TORCH_INDEX, layers.values(), strict=True):
         state[f"features.{index}.weight"] = np.ascontiguousarray(kernel.transpose(3, 2, 0, 1))
@@ -61,7 +61,7 @@ class _Storage:
 
 
 class _Tensor:
-    """Pickles as torch's tensors do; `old`: as parameters of 2017."""
+    """An array that is pickled like a PyTorch tensor, or like a parameter of 2017 if `old`."""
 
     def __init__(self, torch, key: str, array: np.ndarray, old: bool) -> None:
         self.torch, self.storage, self.old = torch, _Storage(key, array), old
@@ -119,7 +119,7 @@ class _Pickler(pickle.Pickler):
 
 
 def torch_zip(path: Path, state: dict[str, np.ndarray], *, prefix: str = "archive") -> Path:
-    """As torch.save since 1.6."""
+    """Write a file as torch.save does since version 1.6."""
     buffer = io.BytesIO()
     with fake_torch() as torch:
         tree = collections.OrderedDict(
@@ -137,7 +137,7 @@ def torch_zip(path: Path, state: dict[str, np.ndarray], *, prefix: str = "archiv
 
 
 def torch_legacy(path: Path, state: dict[str, np.ndarray]) -> Path:
-    """As torch.save of 2017, whose state dicts hold parameters."""
+    """Write a file as torch.save did in 2017, when state dicts held parameters."""
     system = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"int": 4}}
     with fake_torch() as torch, path.open("wb") as file:
         tree = collections.OrderedDict(

@@ -1,4 +1,4 @@
-"""Copies of a finished run, changed."""
+"""Change copies of a finished run."""
 
 import json
 import shutil
@@ -7,11 +7,11 @@ from pathlib import Path
 import pycolmap
 
 HOSTILE = "<img src=x onerror=document.title='owned'><b>&amp;.png"
-"""A file name that would do harm, or look wrong, if it were not escaped."""
+"""A file name that would do harm or look wrong if it were not escaped."""
 
 
 def change_report(out: Path, change) -> Path:
-    """Rewrite report.json by a function that changes it in place."""
+    """Rewrite report.json after a function has changed its content."""
     path = out / "report.json"
     report = json.loads(path.read_text())
     change(report)
@@ -20,7 +20,7 @@ def change_report(out: Path, change) -> Path:
 
 
 def renamed(out: Path, images: Path, to: Path, old: str, new: str) -> tuple[Path, Path]:
-    """The run and its photos with one image under another name, in all places."""
+    """Copy a run and its photos, and give one image another name everywhere."""
     run, photos = to / "run", to / "images"
     shutil.copytree(out, run)
     shutil.copytree(images, photos)

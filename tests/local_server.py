@@ -1,4 +1,4 @@
-"""A server of this machine that breaks off, changes its mind or goes away."""
+"""A web server on this machine that can break off an answer, change a file or stop."""
 
 import hashlib
 import http.server
@@ -7,7 +7,7 @@ CONTENT = bytes(range(256)) * 2000
 
 
 class Server(http.server.ThreadingHTTPServer):
-    """Serves `files`; breaks off after `break_after` bytes of an answer."""
+    """A server of `files`, which breaks off after `break_after` bytes of an answer."""
 
     files: dict[str, bytes]
     break_after: int | None = None

@@ -1,4 +1,4 @@
-"""Verification and mapping of a database, as the pipeline strings them together."""
+"""Verify and map a database as a run does."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ from jaxsfm.colmap.verification import VerificationOptions, verify
 
 
 def verified(path: Path, options: MapOptions):
-    """The pairs of a database after COLMAP's verification."""
+    """Verify a database; returns its verified pairs."""
     verify(
         path,
         VerificationOptions(seed=options.seed, threads=options.threads, scale=options.scale),
@@ -22,5 +22,5 @@ def verified(path: Path, options: MapOptions):
 def map_database(
     path: Path, options: MapOptions, *, on_image: Callable[[], None] = lambda: None
 ) -> list[pycolmap.Reconstruction]:
-    """Its models, the largest first."""
+    """Verify and map a database; returns its models, the largest first."""
     return build_models(path, verified(path, options), options, on_image=on_image)[0]

@@ -1,4 +1,4 @@
-"""Damage done to files by seed, and the cases of a fuzz test that can each be repeated alone."""
+"""Random damage to files; each case of a fuzz test has its own seed and can be repeated alone."""
 
 import copy
 import json
@@ -12,7 +12,7 @@ import numpy as np
 from jaxsfm.errors import UserError
 
 SEED = int(os.environ.get("JAXSFM_FUZZ_SEED", "0"))
-"""Of all cases; one that failed says which it was."""
+"""The seed of all cases. A case that fails names it."""
 NUMBERS = (0, 1, -1, 2, 255, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 WORDS = (
     "nan inf -inf 1e400 -0 1e-320 9999999999999999999 0x10 1_000 ٣ é \0 \t # : , .. / a\\n".split(
@@ -23,12 +23,12 @@ WRONG: tuple[Any, ...] = (None, True, -1, 1e308, 2**70, "", "text\n", [], {}, [[
 
 
 def rng_of(kind: str, case: int) -> np.random.Generator:
-    """A generator for one case, whatever the others are."""
+    """A random generator that depends on the case alone."""
     return np.random.default_rng([SEED, zlib.crc32(kind.encode()), case])
 
 
 def outcome(read: Callable[[], Any], *names: object) -> tuple[str, Any]:
-    """('refused', the sentence) for one that names the input, or ('read', the result).
+    """Read an input; returns ('read', the result) or ('refused', the error's sentence).
 
     Args:
       names: the file or option, one of which the sentence must name.
@@ -44,7 +44,7 @@ def outcome(read: Callable[[], Any], *names: object) -> tuple[str, Any]:
 
 
 def mutated(data: bytes, rng: np.random.Generator) -> bytes:
-    """Cut off, or with some bytes changed, mostly near the beginning."""
+    """Data that is cut off or has some bytes changed, mostly near the beginning."""
     if rng.random() < 0.2:
         return data[: rng.integers(len(data))]
     changed = bytearray(data)
@@ -55,7 +55,7 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Damage of any kind: noise, truncation, flips, moved and doubled chunks, absurd numbers."""
+    """Data with any kind of damage: noise, cuts, flipped bits, moved parts, absurd numbers."""
     kind = rng.integers(8)
     at = int(rng.integers(len(data)))
     if kind == 0:
@@ -83,7 +83,7 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def damaged_text(text: str, rng: np.random.Generator) -> bytes:
-    """A text with words changed, moved, doubled or left out; now and then any bytes."""
+    """A text with words changed, moved, doubled or removed; sometimes with any other damage."""
     if rng.random() < 0.15:
         return damaged(text.encode(), rng)
     parts = text.replace("\n", " \n ").split(" ")
@@ -103,7 +103,7 @@ def damaged_text(text: str, rng: np.random.Generator) -> bytes:
 
 
 def damaged_json(value: Any, rng: np.random.Generator) -> bytes:
-    """A document with a value of another type, or without a key; now and then any bytes."""
+    """A JSON text with a value of another type or without a key; sometimes with other damage."""
     text = json.dumps(value)
     if rng.random() < 0.15:
         return damaged(text.encode(), rng)

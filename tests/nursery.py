@@ -1,7 +1,7 @@
-"""A process that has imported everything and computed nothing: its children start at once.
+"""A process that has imported everything, so that its children start at once.
 
-Reads a command line (JSON) per line, answers the child's number, and its exit status (minus the
-signal) when it has ended. Run as a script with the folder of compiled programs.
+It reads one command line a line (JSON), and prints the child's process number, and its exit status
+(minus the signal) when it has ended. Run it as a script with the folder of compiled programs.
 """
 
 import json

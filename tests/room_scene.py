@@ -22,7 +22,7 @@ SIZE = (480, 360)
 class Room(NamedTuple):
     views: list[View]
     images: dict[str, np.ndarray]
-    """Intensities by name."""
+    """The grey photo of each view, by name."""
     poses: dict[str, CameraPose]
     points: np.ndarray
     plane: np.ndarray
@@ -113,7 +113,7 @@ def exact_tracks(scene: Room, *, use=None) -> Tracks:
 
 
 def noisy_model(scene: Room, sigma: float, *, use=None) -> pycolmap.Reconstruction:
-    """Every observation (but none of the truth) moved by noise, then bundle adjusted."""
+    """A model whose observations have noise, after bundle adjustment."""
     tracks = exact_tracks(scene, use=use)
     rng = np.random.default_rng(1)
     tracks = tracks._replace(xy=tracks.xy + rng.normal(0, sigma, tracks.xy.shape))
@@ -129,7 +129,7 @@ def exact_model(scene: Room, *, use=None) -> Model:
 
 
 def arrays(model: pycolmap.Reconstruction, scene: Room) -> Model:
-    """A COLMAP model of the room, as arrays."""
+    """A model of the room as arrays."""
     return Model.from_colmap(model, sizes(scene))
 
 
@@ -157,6 +157,6 @@ def sizes(scene: Room):
 
 
 def other_scene(seed: int) -> np.ndarray:
-    """Textured, but nothing of the room."""
+    """A textured photo that shows nothing of the room."""
     noise = np.random.default_rng(seed).normal(0, 60, (SIZE[1] // 4, SIZE[0] // 4))
     return 120 + np.kron(noise, np.ones((4, 4))).astype(np.float32)

@@ -40,9 +40,9 @@ def once(
 
 
 def _state(folder: Path) -> dict[str, tuple[int, int]]:
-    """The size and the time of the last change of each file."""
+    """The size and the time of the last change of each file but locks, which readers touch."""
     return {
         str(path.relative_to(folder)): (path.stat().st_size, path.stat().st_mtime_ns)
         for path in folder.rglob("*")
-        if path.is_file()
+        if path.is_file() and path.name != ".lock"
     }

@@ -1,4 +1,4 @@
-"""The one table of tolerances; a test that needs another says why beside it."""
+"""All tolerances. A test that needs another one says why."""
 
 FEATURES = {"rtol": 1e-4, "atol": 1e-4}
 """float32 sums of up to 4608 products in two different orders, relative to the map's largest."""

@@ -1,4 +1,4 @@
-"""Public data sets that the benchmarks read: where they are, what they weigh, under which terms."""
+"""Public data sets of the benchmarks: their addresses, sizes and terms, and how to fetch them."""
 
 import dataclasses
 import json
@@ -16,7 +16,7 @@ _STRECHA = (
     "https://raw.githubusercontent.com/openMVG/SfM_quality_evaluation/"
     "e2772f8163e7a945f87557949c7d3afd520b7351/Benchmarking_Camera_Calibration_2008/"
 )
-"""One commit of openMVG's repository: what it names cannot change."""
+"""A fixed commit of openMVG's repository, whose content cannot change."""
 _STRECHA_SETS = {
     "Herz-Jesus-P8": 8,
     "Herz-Jesus-P25": 25,
@@ -40,16 +40,16 @@ class RemoteFile:
 
     url: str
     name: str
-    """In the data set's folder."""
+    """The file's path in the data set's folder."""
     known_hash: str | None = None
-    """None: published by nobody."""
+    """The published hash; None if there is none."""
     archive: bool = False
-    """Unpacked into the data set's folder; the archive goes then."""
+    """Whether the file is unpacked into the data set's folder and then removed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DataSet:
-    """What a benchmark reads."""
+    """A data set that a benchmark reads."""
 
     title: str
     page: str
@@ -57,10 +57,11 @@ class DataSet:
     size: str
     files: tuple[RemoteFile, ...]
     root: str
-    """What `--root` wants, below the data set's folder."""
+    """The folder to give to `--root`, relative to the data set's folder."""
     expects: tuple[str, ...]
-    """Below the data set's folder: by these it is known where somebody else put it there."""
+    """Paths in the data set's folder that exist if the data set is complete."""
     bench: str
+    """The benchmarks that read it."""
 
 
 def _strecha_files() -> tuple[RemoteFile, ...]:
@@ -142,24 +143,28 @@ DATA_SETS: dict[str, DataSet] = {
     ),
 }
 _FETCHED = "fetched.json"
-"""In a data set's folder: the hashes of the files that came; those of archives, unpacked too."""
+"""A file in the data set's folder with the hashes of all files that were fetched."""
 
 
 def data_folder() -> Path:
-    """Where data sets lie: $JAXSFM_DATA, or the user's data folder."""
+    """The folder of all data sets: $JAXSFM_DATA, or the user's data folder."""
     own = os.environ.get("JAXSFM_DATA")
     return Path(own) if own else platformdirs.user_data_path("jaxsfm") / "data"
 
 
 def find(name: str) -> DataSet:
-    """The data set of that name; UserError names the ones there are."""
+    """The data set called `name`.
+
+    Raises:
+      UserError: there is none; the sentence lists the known names.
+    """
     if name not in DATA_SETS:
         raise UserError(f"no data set '{name}'; there are {', '.join(DATA_SETS)}")
     return DATA_SETS[name]
 
 
 def is_complete(name: str, folder: Path | None = None) -> bool:
-    """Whether all of it is there: all that was to be fetched has been, or somebody put it there."""
+    """Whether a data set is there and whole: fetched to the end, or put there by the user."""
     home, data_set = (folder or data_folder()) / name, find(name)
     fetched = _read_fetched(home / _FETCHED)
     if fetched is not None and not all(file.name in fetched for file in data_set.files):
@@ -168,10 +173,10 @@ def is_complete(name: str, folder: Path | None = None) -> bool:
 
 
 def path_of(name: str, folder: Path | None = None) -> Path:
-    """What to give to `--root`.
+    """The folder to give to `--root`.
 
     Raises:
-      UserError: it is not there, or not all of it.
+      UserError: the data set is not there, or not whole.
     """
     home = (folder or data_folder()) / name
     if not is_complete(name, folder):
@@ -180,11 +185,13 @@ def path_of(name: str, folder: Path | None = None) -> Path:
 
 
 def fetch(name: str, folder: Path | None = None, *, progress: bool = False) -> Path:
-    """Download what is missing; returns what to give to `--root`. Interrupted, it goes on from
-    there; what is there already is not asked for.
+    """Download the missing files of a data set; returns the folder to give to `--root`.
+
+    An interrupted download continues where it stopped.
 
     Raises:
-      UserError: something cannot be had, written or unpacked, or has another hash than published.
+      UserError: a file cannot be downloaded, written or unpacked, or its hash is not the published
+        one.
     """
     if is_complete(name, folder):
         return path_of(name, folder)
@@ -206,7 +213,7 @@ def fetch(name: str, folder: Path | None = None, *, progress: bool = False) -> P
             try:
                 unpack(path, home)
             except UserError:
-                path.unlink()  # the same command asks for it again
+                path.unlink()  # so that the same command downloads it again
                 raise
         write_atomic(home / _FETCHED, _text(fetched))
         if file.archive:

@@ -1,4 +1,4 @@
-"""The demo: a rendered scene with exact cameras through the whole pipeline, and the verdict."""
+"""The demo: reconstruct a rendered scene and compare the result with its exact cameras."""
 
 import tempfile
 from pathlib import Path
@@ -11,17 +11,20 @@ from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 
 MAX_POSITION = 0.002
-"""Stated mean position error, units (metres) of the room; measured 0.0001."""
+"""The largest mean position error that passes, in metres of the room; measured: 0.0001."""
 MAX_ROTATION_DEG = 0.03
-"""Stated mean rotation error; measured 0.004 deg."""
+"""The largest mean rotation error that passes; measured: 0.004 degrees."""
 
 
 def run_demo(out: Path | None, *, seed: int) -> tuple[list[str], bool]:
-    """Render, write, reconstruct, compare; the lines to print and whether it passed.
+    """Run the demo; returns the lines to print and whether it passed.
 
     Args:
-      out: folder for the scene and the results; None makes one under the temporary folder.
-      seed: of the scene's noise and of the reconstruction.
+      out: folder for the scene and the results; None makes one in the temporary folder.
+      seed: seed of the scene's noise and of the reconstruction.
+
+    Raises:
+      UserError: `out` cannot be written.
     """
     if out is None:
         out = Path(tempfile.mkdtemp(prefix="jaxsfm-demo-"))

@@ -1,15 +1,15 @@
-"""A synthetic night: what a camera would make of a day photo's scene under a few lamps.
+"""A synthetic night: a day photo as a camera would see it under a few lamps.
 
-It is a model, not a night: every result made with it says `synthetic`. What it has, in order:
+It is a model and no real night, so every result made with it is called `synthetic`. Its steps are:
 
-1. Light: the day fades (severity 0 to 1) into a dim bluish ambience and a few lamps of different
-   colours, each with its reach, and their glare.
-2. Blur of 0.3 px per unit of severity (longer exposure).
+1. Light: from severity 0 to 1 the day fades into a dim bluish ambience with a few lamps. Each lamp
+   has its colour, its reach and a glare.
+2. Blur of 0.3 px per unit of severity, because the exposure is longer.
 3. Exposure: the brightest hundredth saturates; a pixel at saturation holds 20 000 electrons at
    severity 0 and a tenth of that per unit. Photon noise is Poisson, read noise 2 electrons.
-4. Gain ends at 100 electrons for full scale: from severity 2.3 on the image gets darker; at 5 a
-   pixel holds less than one, and there is nothing but read noise to see.
-5. Encoding (gamma 2.2, 8 bits), then a camera's denoising and JPEG, if wanted.
+4. Gain: the gain ends at 100 electrons for full scale, so from severity 2.3 on the image gets
+   darker. At severity 5 a pixel holds less than one electron, and only read noise is left.
+5. Encoding with gamma 2.2 and 8 bits, then optionally a camera's denoising and JPEG.
 """
 
 import cv2
@@ -48,16 +48,17 @@ def _lamp_light(shape: tuple[int, int], rng: np.random.Generator) -> tuple[np.nd
 def synthetic_night(
     rgb: np.ndarray, *, severity: float, seed: int, denoise: bool = True, jpeg: bool = True
 ) -> np.ndarray:
-    """The photo at a synthetic night, uint8 (h, w, 3) RGB.
+    """A photo at a synthetic night, uint8 (h, w, 3) RGB.
 
     Args:
       rgb: uint8 (h, w, 3), a day photo.
-      severity: 0: the photo itself; 1: a clean night; 2: noisy; 3: dark and very noisy; 5: noise.
-      seed: of the lamps' places and the noise.
-      denoise, jpeg: what cameras do afterwards.
+      severity: 0 is the photo itself, 1 a clean night, 2 noisy, 3 dark, 5 nothing but noise.
+      seed: seed of the lamps' places and of the noise.
+      denoise: whether the camera removes noise.
+      jpeg: whether the camera stores JPEG.
 
     Raises:
-      ValueError: `severity` is negative, `rgb` is not such an image.
+      ValueError: `severity` is negative, or `rgb` is not such an image.
     """
     if severity < 0:
         raise ValueError(f"severity must be at least 0; got {severity}")

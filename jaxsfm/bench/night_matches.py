@@ -1,4 +1,4 @@
-"""Which of a night photo's matches are right, where cameras and poses are known."""
+"""Count the right matches of a night photo whose camera and pose are known."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -11,12 +11,12 @@ from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.two_views import rays_of
 
 CORRECT_PX = 4.0
-"""From the true epipolar line. A wrong match lies that close by chance in 1 of 100 cases where the
-images are 1000 px high."""
+"""The largest distance of a right match from the true epipolar line. In images of 1000 px height a
+wrong match lies that close by chance in 1 of 100 cases."""
 
 
 class NightMatches(NamedTuple):
-    """Matches of a night photo with its day photos, as they go to the mapper."""
+    """The number of a night photo's verified matches, and how many of them are right."""
 
     number: int
     correct: int
@@ -25,11 +25,12 @@ class NightMatches(NamedTuple):
 def epipolar_distance(
     rays0: np.ndarray, rays1: np.ndarray, pose0: CameraPose, pose1: CameraPose
 ) -> np.ndarray:
-    """Distance of each ray's point in image 1 from the epipolar line of its partner, in units of
-    image 1's focal length; nan where a ray lies in the image plane.
+    """The distance of each point in image 1 from the epipolar line of its partner in image 0.
+
+    The unit is the focal length of image 1. The distance is nan for a ray in the image plane.
 
     Args:
-      rays0, rays1: (n, 3), in the cameras' frames.
+      rays0, rays1: (n, 3), rays in the frames of the two cameras.
 
     Source: Hartley and Zisserman, 2nd edition, section 9.6 (x1' E x0 = 0, E = [t]x R).
     """
@@ -42,10 +43,10 @@ def epipolar_distance(
 
 
 def night_matches(database: Path, scene: Scene, subset: Subset) -> NightMatches | None:
-    """Verified matches of the subset's night photo in a COLMAP database, summed over its day
-    photos; None unless camera and poses are known.
+    """Count the verified matches of a subset's night photo in a COLMAP database.
 
-    Day photos without a reference pose do not count.
+    Matches with all day photos that have a reference pose are counted. The result is None if the
+    camera or the night photo's pose is unknown.
     """
     if scene.camera is None or subset.night not in scene.truth:
         return None

@@ -7,18 +7,18 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, NotRequired, TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 
 from jaxsfm.bench.figures import collect
-from jaxsfm.bench.inputs import check_root, choose_sets, read_rows
 from jaxsfm.bench.methods import RUN_ABLATED, method_config
 from jaxsfm.bench.options import StrechaOptions
+from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.models import write_models
-from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.poses import model_poses, read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.colmap.verification import VerificationOptions
@@ -38,17 +38,6 @@ PUBLISHED = (
     "published (Widya et al. 2018, mean over six full-size sets): "
     "DoG + RootSIFT 0.17 m, 0.90 deg; dense + relocalization 0.59 m, 2.27 deg"
 )
-
-
-class StrechaSet(NamedTuple):
-    """A set of photos with ground truth."""
-
-    folder: Path
-    camera: str
-    """The sets' camera as `MODEL:params`, in COLMAP's pixels."""
-    focal: float
-    """Its focal length, pixels."""
-    truth: Poses
 
 
 class StrechaRow(TypedDict):
@@ -92,40 +81,6 @@ class StrechaFigures(TypedDict):
     rows: list[StrechaRow]
     ratios: dict[str, MethodRatios]
     published: str
-
-
-def strecha_intrinsics(folder: Path) -> tuple[str, float]:
-    """A set's camera as `MODEL:params`, and its focal length in pixels.
-
-    The sets' K counts pixels from the image's corner, as COLMAP does: K was halved together with
-    the images, which is exact only for that convention, and rotations agree better with it
-    (docs/results.md).
-
-    Raises:
-      UserError: images/K.txt is missing or not a camera matrix.
-    """
-    path = folder / "images" / "K.txt"
-    k = read_rows(path, 3, "a camera matrix (3 x 3)")
-    if k.shape != (3, 3) or k[0, 0] <= 0 or k[1, 1] <= 0:
-        raise UserError(f"--root: {path} is not a camera matrix")
-    fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
-    return f"PINHOLE:{fx!r},{fy!r},{cx!r},{cy!r}", 0.5 * (fx + fy)
-
-
-def find_sets(root: Path, names: Sequence[str] | None) -> list[Path]:
-    """The folders of the sets in `root` (those with images/K.txt) that are called `names`.
-
-    Args:
-      names: None stands for all sets, sorted by name.
-
-    Raises:
-      UserError: there is no set, or none with one of the names.
-    """
-    check_root(root)
-    found = {path.parent.parent.name: path.parent.parent for path in root.glob("*/images/K.txt")}
-    if not found:
-        raise UserError(f"--root {root}: no Strecha sets (SET/images/K.txt) in it")
-    return choose_sets(found, names, root)
 
 
 def _run_rootsift(each: StrechaSet, work: Path, options: StrechaOptions) -> StrechaRow:
@@ -236,10 +191,7 @@ def bench_strecha(options: StrechaOptions) -> StrechaFigures:
     """
     methods = options.chosen_methods(METHODS)
     # All inputs are read before the first reconstruction, which takes minutes.
-    sets = [
-        StrechaSet(folder, *strecha_intrinsics(folder), read_poses(folder, option="--root"))
-        for folder in find_sets(options.root, options.chosen_sets())
-    ]
+    sets = read_sets(options.root, options.chosen_sets())
 
     def rows() -> Iterator[StrechaRow]:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:

@@ -1,7 +1,7 @@
-"""A small scene with exact cameras: textured planes seen from an arc, one view at night.
+"""A small rendered scene with exact cameras: textured planes seen from an arc, one view at night.
 
-Textures are photographs that scikit-image carries. Used by `jaxsfm demo` and by the tests; results
-on it are synthetic and must be called so.
+The textures are photographs from the scikit-image package. `jaxsfm demo` and the tests use the
+scene. Results on it must be called synthetic.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ SUPERSAMPLING = 2
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TexturedPlane:
-    """A rectangle: corner + s * right + t * down, s and t in [0, 1]."""
+    """A rectangle of the points corner + s * right + t * down, with s and t in [0, 1]."""
 
     corner: np.ndarray
     right: np.ndarray
     down: np.ndarray
     texture: np.ndarray
-    """uint8 (h, w, 3), RGB; its first row lies at the corner."""
+    """uint8 (h, w, 3), RGB; the first row lies at the corner."""
 
 
 def photo_textures() -> list[np.ndarray]:
@@ -41,14 +41,14 @@ def photo_textures() -> list[np.ndarray]:
 
 
 def mosaic(photos: list[np.ndarray], rows: int, cols: int, *, tile: int = 400) -> np.ndarray:
-    """rows x cols photographs as one texture."""
+    """One texture of rows x cols photographs, uint8 RGB."""
     tiles = [cv2.resize(p, (tile, tile), interpolation=cv2.INTER_AREA) for p in photos]
     grid = [[tiles[(r * cols + c) % len(tiles)] for c in range(cols)] for r in range(rows)]
     return np.concatenate([np.concatenate(row, axis=1) for row in grid])
 
 
 def room() -> list[TexturedPlane]:
-    """Two walls, a floor and a slanted board; x right, y down, z forward; units of a metre."""
+    """Two walls, a floor and a slanted board, in metres; x right, y down, z forward."""
     a = photo_textures()
     v = lambda *xyz: np.asarray(xyz, float)  # noqa: E731
     return [
@@ -87,7 +87,7 @@ def arc(num_views: int) -> list[CameraPose]:
     target = np.asarray([-0.1, 0.1, 5.2])
     poses = []
     for i, angle in enumerate(np.radians(np.linspace(-20, 20, num_views))):
-        # Centres near one line would leave the roll about it to noise.
+        # If the centres lay near one line, the rotation about this line would be uncertain.
         height = -1.0 + 0.6 * (i % 3)
         distance = 4.6 - 0.5 * (i % 2)
         centre = target + distance * np.asarray([np.sin(angle), 0, -np.cos(angle)])
@@ -97,13 +97,13 @@ def arc(num_views: int) -> list[CameraPose]:
 
 
 def camera_matrix(size: tuple[int, int]) -> np.ndarray:
-    """K of the demo's camera; centre of the top-left pixel (0, 0)."""
+    """K of the demo's camera, float64 (3, 3); the centre of the top-left pixel is (0, 0)."""
     width, height = size
     return np.asarray([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
 
 
 def render(planes: list[TexturedPlane], pose: CameraPose, size: tuple[int, int]) -> np.ndarray:
-    """Exact perspective image, uint8 RGB, box-filtered from twice the resolution."""
+    """An exact perspective image, uint8 RGB, averaged from an image of twice the resolution."""
     width, height = size
     k = camera_matrix(size)
     s = SUPERSAMPLING
@@ -132,7 +132,7 @@ def render(planes: list[TexturedPlane], pose: CameraPose, size: tuple[int, int])
 
 
 def night(image: np.ndarray, *, seed: int) -> np.ndarray:
-    """A synthetic night: dim bluish ambient light, two warm lamps with falloff, photon noise."""
+    """A simple synthetic night: dim bluish light, two warm lamps and photon noise."""
     rng = np.random.default_rng(seed)
     height, width = image.shape[:2]
     linear = (image / 255.0) ** 2.2
@@ -149,9 +149,9 @@ def night(image: np.ndarray, *, seed: int) -> np.ndarray:
 def write_scene(
     folder: Path, *, num_views: int = 7, size: tuple[int, int] = (640, 480), seed: int = 0
 ) -> Poses:
-    """Write images/, K.txt and reference/ (Strecha format); returns the exact poses by name.
+    """Write images/, K.txt and reference/ (Strecha's format); returns the exact poses by name.
 
-    The view before the last is turned to night.
+    The last view but one is at night.
     """
     images, reference = folder / "images", folder / "reference"
     images.mkdir(parents=True, exist_ok=True)

@@ -28,51 +28,51 @@ def _run(
     return 0
 
 
-def strecha(options: StrechaOptions) -> int:
+def strecha(bench: StrechaOptions) -> int:
     """Reconstruct the Strecha sets with several methods, next to COLMAP's RootSIFT.
 
     For example
         $ jaxsfm bench strecha --root SETS --methods rootsift,default --json figures.json
     """
-    from jaxsfm.bench import strecha as bench
+    from jaxsfm.bench.strecha import bench_strecha, table_lines
 
-    return _run(bench.bench_strecha, bench.table_lines, options)
+    return _run(bench_strecha, table_lines, bench)
 
 
-def wxbs(options: WxbsOptions) -> int:
+def wxbs(bench: WxbsOptions) -> int:
     """Match pairs under changes of viewpoint, illumination and season (WxBS).
 
     For example
         $ jaxsfm bench wxbs --root PAIRS --methods rootsift,default
     """
-    from jaxsfm.bench import wxbs as bench
+    from jaxsfm.bench.wxbs import bench_wxbs, table_lines
 
-    return _run(bench.bench_wxbs, bench.table_lines, options)
+    return _run(bench_wxbs, table_lines, bench)
 
 
-def homography(options: HomographyOptions) -> int:
+def homography(bench: HomographyOptions) -> int:
     """Match sequences with known homographies (Oxford affine, HPatches).
 
     For example
         $ jaxsfm bench homography --root SEQUENCES --methods rootsift,default
     """
-    from jaxsfm.bench import homography as bench
+    from jaxsfm.bench.homography import bench_homography, table_lines
 
-    return _run(bench.bench_homography, bench.table_lines, options)
+    return _run(bench_homography, table_lines, bench)
 
 
-def planes(options: PlanesOptions) -> int:
+def planes(bench: PlanesOptions) -> int:
     """Fit several homographies to given points (AdelaideRMF).
 
     For example
         $ jaxsfm bench planes --root POINTS
     """
-    from jaxsfm.bench import planes as bench
+    from jaxsfm.bench.planes import bench_planes, table_lines
 
-    return _run(bench.bench_planes, bench.table_lines, options)
+    return _run(bench_planes, table_lines, bench)
 
 
-def daynight(options: DayNightOptions) -> int:
+def daynight(bench: DayNightOptions) -> int:
     """Reconstruct day photos with one night photo: the paper's night protocol.
 
     The night camera is compared with the reference after a similarity from the day cameras.
@@ -80,17 +80,17 @@ def daynight(options: DayNightOptions) -> int:
     For example
         $ jaxsfm bench daynight --root SETS --severity 3.25 --methods rootsift,default
     """
-    from jaxsfm.bench import daynight as bench
+    from jaxsfm.bench.daynight import bench_daynight, table_lines
 
-    return _run(bench.bench_daynight, bench.table_lines, options)
+    return _run(bench_daynight, table_lines, bench)
 
 
-def warps(options: WarpsOptions) -> int:
+def warps(bench: WarpsOptions) -> int:
     """Compare relocalization rules on views of photos under known homographies (synthetic).
 
     For example
         $ jaxsfm bench warps --root PHOTOS --seeds 3
     """
-    from jaxsfm.bench import warps as bench
+    from jaxsfm.bench.warps import bench_warps, table_lines
 
-    return _run(bench.bench_warps, bench.table_lines, options)
+    return _run(bench_warps, table_lines, bench)

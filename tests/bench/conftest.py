@@ -1,4 +1,4 @@
-"""Sets that several benchmarks' tests share."""
+"""A data set that the tests of several benchmarks share."""
 
 import shutil
 
@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def strecha(scene, tmp_path_factory):
-    """One set: SET/images with K.txt, SET/gt_dense_cameras."""
+    """The folder of one Strecha set: room/images with K.txt, and room/gt_dense_cameras."""
     folder = tmp_path_factory.mktemp("sets")
     shutil.copytree(scene / "images", folder / "room" / "images")
     shutil.copy(scene / "K.txt", folder / "room" / "images" / "K.txt")

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.daynight import SubsetModel, judge, summary
+from jaxsfm.bench.daynight import judge, summary
 from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
 from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Subset
+from jaxsfm.bench.subset_models import SubsetModel, dense_models, rootsift_models
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose, read_poses
 from jaxsfm.errors import UserError
@@ -113,8 +114,6 @@ def test_damaged_scenes_are_named_before_the_first_run(simple, tmp_path, capsys,
 @pytest.mark.slow
 def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monkeypatch):
     """Two nights: neither reconstruction may hold the other's night photo."""
-    from jaxsfm.bench import daynight
-
     room = tmp_path / "room"
     shutil.copytree(simple / "room", room)
     night = next((room / "night").iterdir())
@@ -123,8 +122,8 @@ def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monke
     assert len(made.subsets) == 2
     options = DayNightOptions(root=tmp_path, threads=1)
     for runs in (
-        daynight._rootsift_models(made, tmp_path, options),
-        daynight._dense_models(made, tmp_path, "paper", options),
+        rootsift_models(made, tmp_path, options),
+        dense_models(made, tmp_path, "paper", options),
     ):
         for (poses, matches), subset in zip(runs, made.subsets, strict=True):
             assert subset.night in poses and set(poses) <= {*subset.day, subset.night}

@@ -6,7 +6,8 @@ import shutil
 import pytest
 
 from jaxsfm.bench.methods import method_config
-from jaxsfm.bench.strecha import find_sets, ratios
+from jaxsfm.bench.strecha import ratios
+from jaxsfm.bench.strecha_sets import find_sets
 from jaxsfm.cli.main import main
 from jaxsfm.config import preset
 

@@ -1,4 +1,4 @@
-"""What the tests of the COLMAP adapter share."""
+"""A scene that the tests of the COLMAP adapter share."""
 
 from typing import NamedTuple
 
@@ -16,13 +16,13 @@ NAMES = ["a b.png", "b\tc.png", "new\nline.png", "sub/日本.png", "z.png"]
 
 
 class Scene(NamedTuple):
-    """Five views of 150 points, exact; odd image names; the files do not exist."""
+    """Five exact views of 150 points. The images have odd names, and their files do not exist."""
 
     truth: pycolmap.Reconstruction
     names: list[str]
     images: list[ImageFile]
     results: dict[Pair, PairResult]
-    """Every pair with the points both see; a cell is the point's number."""
+    """The points that both images of each pair see; a cell is the point's number."""
     known: Intrinsics
 
 

@@ -27,7 +27,7 @@ PAGES = (
     *sorted((ROOT / "docs").rglob("*.md")),
 )
 LONG = (
-    "jaxsfm.runs.reconstruct.run_folder",
+    "jaxsfm.runs.reconstruct.reconstruct_folder",
     "jaxsfm.bench.demo.run_demo",
     "jaxsfm.matching.retrieval.shortlist",
     "jaxsfm.runs.localize.localize",

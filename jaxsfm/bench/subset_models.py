@@ -1,0 +1,115 @@
+"""Reconstruct the subsets of a day and night scene by a method."""
+
+import functools
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxsfm.bench.methods import method_config
+from jaxsfm.bench.night_matches import NightMatches, night_matches
+from jaxsfm.bench.options import DayNightOptions
+from jaxsfm.bench.scenes import Scene
+from jaxsfm.colmap.database import drop_pairs
+from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.poses import Poses, model_poses
+from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.io.features import ImageFeatures, image_capacity
+from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.io.weights import chosen_weights
+from jaxsfm.matching.extraction import image_features
+from jaxsfm.matching.pair_matching import matched
+from jaxsfm.sfm.reconstruction import reconstruct
+
+FEATURES = 64
+"""Photos whose features are held (at least all photos of a subset): 50 MB each at 1536 x 1024."""
+
+
+class SubsetModel(NamedTuple):
+    """A method's reconstruction of one subset."""
+
+    poses: Poses
+    """The poses of the largest model."""
+    matches: NightMatches | None
+
+
+def _map_options(scene: Scene, options: DayNightOptions) -> MapOptions:
+    return MapOptions(
+        refine_intrinsics=scene.camera is None, seed=options.seed, threads=options.threads
+    )
+
+
+def rootsift_models(scene: Scene, scratch: Path, options: DayNightOptions) -> list[SubsetModel]:
+    """A model of each subset from COLMAP's own features.
+
+    Features and matches of all photos are computed once; each subset takes its part of them.
+    """
+    database = scratch / "all.db"
+    images = [scene.images[name] for name in sorted(scene.images)]
+    blanks = any(" " in name for name in scene.images)  # COLMAP's pair lists cannot hold them
+    pairs = {p for subset in scene.subsets for p in exhaustive_pairs([*subset.day, subset.night])}
+    write_rootsift_database(
+        database,
+        scene.folder,
+        images,
+        scene.camera,
+        VerificationOptions(seed=options.seed, threads=options.threads),
+        pairs=None if blanks else sorted(pairs),
+    )
+    every = read_two_views(database)
+    models = []
+    for subset in scene.subsets:
+        part = scratch / "part.db"
+        shutil.copyfile(database, part)
+        names = {*subset.day, subset.night}
+        kept = {pair: view for pair, view in every.items() if names.issuperset(pair)}
+        drop_pairs(part, every.keys() - kept.keys())
+        found, _ = build_models(part, kept, _map_options(scene, options))
+        poses = model_poses(found[0]) if found else {}
+        models.append(SubsetModel(poses, night_matches(part, scene, subset)))
+    return models
+
+
+def dense_models(
+    scene: Scene, scratch: Path, method: str, options: DayNightOptions
+) -> list[SubsetModel]:
+    """A model of each subset by one of our methods.
+
+    A photo's features and a pair's matches are computed once for all subsets.
+    """
+    config = method_config(method)
+    weights = chosen_weights(options.network, config.backbone)
+    largest = max(len(subset.day) + 1 for subset in scene.subsets)
+
+    @functools.lru_cache(maxsize=max(FEATURES, largest))
+    def features(name: str) -> ImageFeatures:
+        return image_features(weights, scene.images[name], config=config)
+
+    capacities = {
+        name: image_capacity(image, config=config) for name, image in scene.images.items()
+    }
+    last_use = {
+        pair: k
+        for k, subset in enumerate(scene.subsets)
+        for pair in exhaustive_pairs([*subset.day, subset.night])
+    }
+    results: dict[Pair, PairResult] = {}
+    models = []
+    for k, subset in enumerate(scene.subsets):
+        pairs = exhaustive_pairs([*subset.day, subset.night])
+        missing = [pair for pair in pairs if pair not in results]
+        for result in matched(features, capacities, missing, config=config, seed=options.seed):
+            results[result.pair] = result
+        made = reconstruct(
+            [scene.images[name] for name in sorted({*subset.day, subset.night})],
+            {pair: results[pair] for pair in pairs},
+            scratch / "part.db",
+            config=config,
+            intrinsics=scene.camera,
+            options=_map_options(scene, options),
+        )
+        poses = model_poses(made.models[0]) if made.models else {}
+        models.append(SubsetModel(poses, night_matches(scratch / "part.db", scene, subset)))
+        results = {pair: result for pair, result in results.items() if last_use[pair] > k}
+    return models
