@@ -1,14 +1,13 @@
-"""The command `pairs`: which pairs of photos `--pairs` means, written to a file."""
+"""`jaxsfm pairs`: the pairs of photos that `--pairs` selects, written to a file."""
 
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from jaxsfm.cli.run_commands import check_writable
 from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.options import Retrieval, WeightsChoice
 
 
 def pairs(
@@ -16,22 +15,22 @@ def pairs(
     *,
     out: Path,
     pairs: str = "retrieval:20",
-    retrieval: Literal["gem", "vlad", "netvlad"] = "vlad",
-    network: WeightsChoice = USUAL_WEIGHTS,
+    retrieval: Retrieval = "vlad",
     backbone: BackboneName = "vgg16",
+    network: WeightsChoice,
 ) -> int:
-    """The pairs that a run would try, as a file that --pairs takes.
+    """Write the pairs that reconstruct would try to a file, which its --pairs takes.
 
     For example
         $ jaxsfm pairs PHOTOS --out pairs.txt --pairs retrieval:20
 
     Args:
       images: Folder with the photos; sub-folders are included.
-      out: File.txt to write: two names a line.
-      pairs: See reconstruct.
-      retrieval: See reconstruct.
-      network: The network's parameters.
-      backbone: See reconstruct.
+      out: File.txt to write, with two image names on each line.
+      pairs: Which pairs; see jaxsfm reconstruct --help.
+      retrieval: How photos are described for retrieval:K; netvlad needs weights of its own, given
+        with --weights.
+      backbone: The network that describes the photos.
     """
     check_writable(out, "--out", (".txt",))
     from tqdm import tqdm

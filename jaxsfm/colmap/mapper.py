@@ -8,7 +8,6 @@ import dataclasses
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
 
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
@@ -16,8 +15,8 @@ import pycolmap
 from jaxsfm.colmap.native import native
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.io.pairs import Pair, component_of
+from jaxsfm.options import Mapper
 
-Mapper = Literal["incremental", "global"]
 MISSING = 0.1
 """Share of the connected images up to which an absence is no reason to start again: one of ten
 lacks matches, not another start, and further starts are two more runs of the mapper."""

@@ -23,6 +23,7 @@ from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.features import total_memory
+from jaxsfm.options import ExecutionChoice
 
 HOST_SHARE, DEVICE_SHARE = 1 / 8, 1 / 2
 """Of a machine's memory, or of an accelerator's, that joined features may take."""
@@ -36,18 +37,14 @@ MAX_IMAGES, MAX_PAIRS = 16, 64
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Execution:
-    """None: chosen from the machine."""
+class Execution(ExecutionChoice):
+    """How many devices are used, how large batches are, and how much memory features may take.
 
-    devices: int | None = None
-    """How many of the visible ones; None: all."""
-    images_at_once: int | None = None
-    """Extracted side by side on each device; None: one on a CPU, which one image keeps busy."""
-    pairs_at_once: int | None = None
-    """Matched side by side on each device; None: one on a CPU."""
-    memory_gb: float | None = None
-    """For the joined features of the images at hand, on each device; None: half of an accelerator,
-    an eighth of a host, at most 1.6 GB. Less makes images come back more often."""
+    The fields are those of `jaxsfm.options.ExecutionChoice`, checked.
+
+    Raises:
+      ValueError: a number that is not positive, or not finite.
+    """
 
     def __post_init__(self) -> None:
         for name in ("devices", "images_at_once", "pairs_at_once"):

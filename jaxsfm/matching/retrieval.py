@@ -12,13 +12,13 @@ import numpy as np
 from jaxsfm.core.pooling import nearest
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
-from jaxsfm.io.pair_selection import Retrieval
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.store import Store
 from jaxsfm.io.weight_files import has_extras, is_converted
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.global_descriptors import Work, by_gem, by_netvlad, by_vlad
+from jaxsfm.options import Retrieval
 
 
 class Described(NamedTuple):

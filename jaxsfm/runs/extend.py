@@ -34,14 +34,14 @@ from jaxsfm.runs.extend_report import New, extended_report
 from jaxsfm.runs.finished_model import (
     ChosenCamera,
     KnownModel,
+    by_similarity,
     choose_camera,
     known_model,
     run_files,
     run_weights,
     view_of,
 )
-from jaxsfm.runs.localize import LocalizeOptions
-from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.runs.run_options import LocalizeOptions, RunOptions
 from jaxsfm.sfm.register.grow import Grown, Newcomer, grow
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
         progress=options.progress,
     )
     folder = open_locked_folder(run, identity)
-    shortlist = options.chosen_shortlist(kept, weights, new)
+    shortlist = by_similarity(kept, weights, options.shortlist, new, options.execution)
     shortlists, unread = {}, {}
     for name, image in new.items():
         try:

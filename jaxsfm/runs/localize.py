@@ -30,10 +30,8 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights
-from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.extraction import extracted, image_features
 from jaxsfm.matching.pair_matching import matched
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.report.finished_run import KeptRun, read_run
 from jaxsfm.runs.finished_model import (
     ChosenCamera,
@@ -47,36 +45,8 @@ from jaxsfm.runs.finished_model import (
     view_of,
 )
 from jaxsfm.runs.localize_report import UNUSABLE, error_against, located_figures
+from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.sfm.register.locate_view import Located, locate
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LocalizeOptions:
-    """What to do, beyond what the run fixes."""
-
-    images: Path | None = None
-    """Folder of the run's photos; None: where the run found them."""
-    intrinsics: str | None = None
-    """K.txt or MODEL:p1,p2,.. of the photos; None: the run's camera, if exactly one of this size is
-    that of several photos, else one per photo, whose focal length is estimated."""
-    reference: Path | None = None
-    """Reference poses of the photos and of the run's."""
-    network: WeightsChoice = USUAL_WEIGHTS
-    shortlist: Shortlist | int = 20
-    """Photos that a new one is matched with; a number: the most similar ones."""
-
-    execution: Execution = dataclasses.field(default_factory=Execution)
-    keep_features: bool = False
-    """Of the run's photos, in its folder, for the next time (25 MB for 1536 x 1024)."""
-    progress: bool = False
-
-    def chosen_shortlist(
-        self, run: KeptRun, weights: Weights, new: Mapping[str, ImageFile]
-    ) -> Shortlist:
-        """As a function; `new` as in `by_similarity`."""
-        if isinstance(self.shortlist, int):
-            return by_similarity(run, weights, self.shortlist, new, self.execution)
-        return self.shortlist
 
 
 def locate_photo(
@@ -148,12 +118,20 @@ def _features(
         yield load
 
 
-def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> dict[str, Any]:
+def localize(
+    photos: Sequence[Path],
+    run: Path,
+    *,
+    options: LocalizeOptions,
+    shortlist: Shortlist | None = None,
+) -> dict[str, Any]:
     """Localize photos in a finished run; returns plain JSON, a row for each photo.
 
     Args:
       photos: files, or folders of them.
       run: a run's OUT.
+      shortlist: chooses the photos of the run that a photo is matched with; default: the
+        `options.shortlist` most similar ones.
 
     Raises:
       UserError: no finished run with a model, its photos or weights are not at hand, or no usable
@@ -170,7 +148,9 @@ def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> 
     weights = run_weights(kept, options.network)
     names = [view.name for view in model.views]
     shortlists, unknown = {}, {image.name: image for image in usable.values()}
-    shortlist = options.chosen_shortlist(kept, weights, unknown)
+    shortlist = shortlist or by_similarity(
+        kept, weights, options.shortlist, unknown, options.execution
+    )
     for path, image in usable.items():
         own = kept.photos.called(image.sha256)
         try:

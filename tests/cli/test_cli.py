@@ -1,5 +1,6 @@
 """Every option has an effect; bad input gets one sentence and no traceback."""
 
+import dataclasses
 import importlib.metadata
 import json
 import re
@@ -11,6 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from jaxsfm import options
+from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.main import BENCHMARKS, COMMANDS, main
 
 SIZE = (320, 240)
@@ -555,8 +558,26 @@ def test_the_version_and_a_completion_script_are_printed(capsys):
 def test_no_description_of_an_option_is_broken_where_the_source_wraps():
     for command in (*COMMANDS.values(), *BENCHMARKS.values()):
         arguments = (command.__doc__ or "").partition("Args:")[2]
-        assert not re.search(r"\n {8}", arguments), command.__name__
-    assert "Longer side of the working images, pixels.\n" in (COMMANDS["reconstruct"].__doc__ or "")
+        assert not re.search(r"\n {4}", arguments), command.__name__
+    choices = filter(dataclasses.is_dataclass, vars(options).values())
+    for choice in (MatchingChoice, ModelChoice, *choices):
+        attributes = (choice.__doc__ or "").partition("Attributes:")[2]
+        assert attributes and not re.search(r"\n {4}", attributes), choice.__name__
+    assert "Folder with the photos; sub-folders are included.\n" in COMMANDS["reconstruct"].__doc__
+    assert "Longer side of the working images, pixels.\n" in MatchingChoice.__doc__
+
+
+def test_every_option_has_a_description(capsys, monkeypatch):
+    """Of the commands that read their options from classes."""
+    monkeypatch.setenv("COLUMNS", "400")
+    for command in ("reconstruct", "match", "pairs", "localize", "extend"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        lines = capsys.readouterr().out.splitlines()
+        shown = [line for line in lines if re.match(r"\W+--?[a-z]", line)]
+        assert len(shown) > 6
+        for line in shown:
+            assert re.search(r"\s{2,}\w.* (\((default|required)|exit)", line), line
 
 
 # -- matches that somebody else made ------------------------------------------------------------

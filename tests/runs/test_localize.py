@@ -22,7 +22,8 @@ from jaxsfm.matching.execution import Execution
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.runs import localize as localize_module
 from jaxsfm.runs.finished_model import by_similarity, choose_camera, known_model
-from jaxsfm.runs.localize import LocalizeOptions, localize
+from jaxsfm.runs.localize import localize
+from jaxsfm.runs.run_options import LocalizeOptions
 
 SIZE, WIDE = (320, 240), (368, 248)
 """Of one padded size: nothing is compiled twice."""
@@ -142,8 +143,12 @@ def test_kept_features_spare_the_next_call_and_change_no_pose(
 
 
 def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
-    options = LocalizeOptions(shortlist=lambda image, names: [n for n in names if n == "view2.png"])
-    result = localize([photos / "photos" / "new.png"], plain[0], options=options)
+    result = localize(
+        [photos / "photos" / "new.png"],
+        plain[0],
+        options=LocalizeOptions(),
+        shortlist=lambda image, names: [n for n in names if n == "view2.png"],
+    )
     assert result["photos"][0]["shortlist"] == ["view2.png"]
     assert result["photos"][0]["status"] in ("localized", "doubtful")
 
