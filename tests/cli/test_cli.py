@@ -569,15 +569,15 @@ def test_no_description_of_an_option_is_broken_where_the_source_wraps():
 
 def test_every_option_has_a_description(capsys, monkeypatch):
     """Of the commands that read their options from classes."""
-    monkeypatch.setenv("COLUMNS", "400")
+    monkeypatch.setenv("COLUMNS", "100")
     for command in ("reconstruct", "match", "pairs", "localize", "extend"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
-        lines = capsys.readouterr().out.splitlines()
-        shown = [line for line in lines if re.match(r"\W+--?[a-z]", line)]
-        assert len(shown) > 6
-        for line in shown:
-            assert re.search(r"\s{2,}\w.* (\((default|required)|exit)", line), line
+        _, *options = re.split(r"\n\W+(?=--[a-z])", capsys.readouterr().out)
+        assert len(options) >= 6
+        for text in options:
+            words = re.sub(r"\W*\n\W*", " ", text.partition("╰")[0])
+            assert re.search(r" [A-Za-z].* .* .* \((default|required)", words), text
 
 
 # -- matches that somebody else made ------------------------------------------------------------
