@@ -63,6 +63,8 @@ COMMANDS = {
     "data": data,
     "bench": bench,
 }
+for _command in COMMANDS.values():
+    unwrapped(_command)
 
 
 def version_lines() -> list[str]:
@@ -94,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with interrupt.noted():
             return tyro.extras.subcommand_cli_from_dict(
-                {name: unwrapped(command) for name, command in COMMANDS.items()},
+                COMMANDS,
                 prog="jaxsfm",
                 description=DESCRIPTION,
                 args=with_action(sys.argv[1:] if argv is None else argv),
