@@ -576,8 +576,8 @@ def test_every_option_has_a_description(capsys, monkeypatch):
         _, *options = re.split(r"\n\W+(?=--[a-z])", capsys.readouterr().out)
         assert len(options) >= 6
         for text in options:
-            words = re.sub(r"\W*\n\W*", " ", text.partition("╰")[0])
-            assert re.search(r" [A-Za-z].* .* .* \((default|required)", words), text
+            words = " ".join(re.sub("[│╰─╯]", " ", text).split())
+            assert re.search(r" [A-Za-z].* .* .* \((default:|required)", words), text
 
 
 # -- matches that somebody else made ------------------------------------------------------------
