@@ -39,7 +39,7 @@ def pairs(
     from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.pipeline import open_images
-    from jaxsfm.matching.retrieval import described_alone, nearest_pairs
+    from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
 
     selection = parse_pair_selection(pairs)
     usable, skipped = open_images(images, progress=True)
@@ -50,7 +50,7 @@ def pairs(
     if selection.retrieval:
         weights = chosen_weights(network, backbone)
         with tqdm(total=len(usable), desc="retrieval", unit="image") as bar:
-            alone = described_alone(weights, usable, kind=retrieval, on_image=bar.update)
+            alone = describe_photos(weights, usable, kind=retrieval, on_image=bar.update)
         found.update(nearest_pairs(alone.vectors, selection.retrieval))
         skipped |= {image.name: str(error) for image, error in alone.lost}
         found = {pair for pair in found if not skipped.keys() & set(pair)}

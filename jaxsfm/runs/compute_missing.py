@@ -34,7 +34,7 @@ def extract_missing(
     if not todo:
         return skipped
     engine = chosen_engine(options.engine)
-    stream = engine.extracted(weights, todo, config=config, execution=options.execution)
+    stream = engine.extract_images(weights, todo, config=config, execution=options.execution)
     for image, found in _bar(stream, len(todo), "extraction", "image", options):
         if isinstance(found, ImageError):
             folder.record_failure(image, found)
@@ -62,7 +62,7 @@ def match_missing(
         return found
 
     capacities = {name: image_capacity(image, config=config) for name, image in images.items()}
-    stream = chosen_engine(options.engine).matched(
+    stream = chosen_engine(options.engine).match_pairs(
         load, capacities, pairs, config=config, seed=options.seed, execution=options.execution
     )
     for result in _bar(stream, len(pairs), "matching", "pair", options):

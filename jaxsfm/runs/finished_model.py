@@ -24,7 +24,7 @@ from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.global_descriptors import GEM
-from jaxsfm.matching.retrieval import described
+from jaxsfm.matching.retrieval import describe_photos
 from jaxsfm.options import WeightsChoice
 from jaxsfm.report.finished_run import KeptRun
 
@@ -153,7 +153,7 @@ def by_similarity(
         raise UserError(f"--shortlist must be at least 1; got {k}")
 
     def describe(images: Sequence[ImageFile], store: Store) -> dict[str, np.ndarray]:
-        found = described(weights, images, kind="gem", store=store, execution=execution)
+        found = describe_photos(weights, images, kind="gem", store=store, execution=execution)
         for _, error in found.lost:
             raise error
         return found.vectors

@@ -30,8 +30,8 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights
-from jaxsfm.matching.extraction import extracted, image_features
-from jaxsfm.matching.pair_matching import matched
+from jaxsfm.matching.extraction import extract_images, image_features
+from jaxsfm.matching.pair_matching import match_pairs
 from jaxsfm.report.finished_run import KeptRun, read_run
 from jaxsfm.runs.finished_model import (
     ChosenCamera,
@@ -102,7 +102,7 @@ def _features(
         apart = Store(Path(scratch), run.report["identity"])
         fresh = run.matches if options.keep_features else apart
         todo = [image for image in files.values() if not run.matches.has_features(image)]
-        stream = extracted(weights, todo, config=run.config, execution=options.execution)
+        stream = extract_images(weights, todo, config=run.config, execution=options.execution)
         quiet = not options.progress or not todo
         bar = tqdm(stream, total=len(todo), desc="extraction", unit="image", disable=quiet)
         for _, found in bar:
@@ -205,7 +205,7 @@ def _matches(
     capacities = {name: feature_capacity(sizes[name]) for name in shortlist} | {
         image.name: own.capacity
     }
-    results = matched(
+    results = match_pairs(
         either,
         capacities,
         [(image.name, name) for name in shortlist],

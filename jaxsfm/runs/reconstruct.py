@@ -26,7 +26,7 @@ from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.io.work_folder import WorkFolder, open_folder
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.matching.retrieval import check_retrieval, described, nearest_pairs
+from jaxsfm.matching.retrieval import check_retrieval, describe_photos, nearest_pairs
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.runs.compute_missing import extract_missing, match_missing
 from jaxsfm.runs.reconstruct_report import Done, run_report
@@ -209,7 +209,7 @@ def _retrieve(
     """Each image with its k most similar ones; why some cannot be described."""
     total, quiet = len(images), not options.progress
     with tqdm(total=total, desc="retrieval", unit="image", disable=quiet) as bar:
-        found = described(
+        found = describe_photos(
             weights,
             images,
             kind=options.retrieval,

@@ -455,7 +455,7 @@ def test_running_out_of_memory_is_one_sentence(scene, tmp_path, monkeypatch, cap
     def exhausted(*args, **kwargs):
         raise RuntimeError("RESOURCE_EXHAUSTED: out of memory allocating 1 TB")
 
-    monkeypatch.setattr("jaxsfm.matching.engines.LocalEngine.matched", exhausted)
+    monkeypatch.setattr("jaxsfm.matching.engines.LocalEngine.match_pairs", exhausted)
     args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
     assert main(args) == 1
     error = capsys.readouterr().err
@@ -520,7 +520,7 @@ def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatc
     (folder / "bad.png").write_bytes(data[: len(data) // 2])
     run(scene, tmp_path / "out", images=folder)
     monkeypatch.setattr(
-        "jaxsfm.matching.engines.LocalEngine.extracted", None
+        "jaxsfm.matching.engines.LocalEngine.extract_images", None
     )  # calling it would fail
     report = run(scene, tmp_path / "out", images=folder)
     assert list(report["images"]["skipped"]) == ["bad.png"]
@@ -573,7 +573,7 @@ def test_every_option_has_a_description(capsys, monkeypatch):
     for command in ("reconstruct", "match", "pairs", "localize", "extend"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
-        _, *options = re.split(r"\n\W+(?=--[a-z])", capsys.readouterr().out)
+        _, *options = re.split(r"\n\W{1,3}(?=--[a-z])", capsys.readouterr().out)
         assert len(options) >= 6
         for text in options:
             words = " ".join(re.sub("[│╰─╯]", " ", text).split())

@@ -18,8 +18,8 @@ from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.config import Config, preset
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.weights import load_weights
-from jaxsfm.matching.extraction import extracted
-from jaxsfm.matching.pair_matching import matched
+from jaxsfm.matching.extraction import extract_images
+from jaxsfm.matching.pair_matching import match_pairs
 
 SMALL = 384
 """Longer side for a thousand pairs in a minute; the programs are those of any other size."""
@@ -51,7 +51,7 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
     def per_pair(some: list[str]) -> float:
         pairs = list(itertools.combinations(some, 2))
         start = time.perf_counter()
-        for _ in matched(features.__getitem__, capacities, pairs, config=config):
+        for _ in match_pairs(features.__getitem__, capacities, pairs, config=config):
             pass
         return (time.perf_counter() - start) / len(pairs)
 
@@ -77,7 +77,7 @@ def measure_pixels(data: Path) -> Iterator[Metric]:
     def work(longer: int) -> Callable[[], list]:
         # Enlarged where the photo is smaller: only its size matters here.
         sized = dataclasses.replace(config, max_size=longer, enlarge=2.0)
-        return lambda: [found for _, found in extracted(weights, photos[:1], config=sized)][0].dense
+        return lambda: next(extract_images(weights, photos[:1], config=sized))[1].dense
 
     sizes = (384, 768, 1536, 2304)
     turns = seconds(*(work(longer) for longer in sizes), repeat=3)
@@ -93,13 +93,13 @@ from jaxsfm.io.compiled_programs import keep_compiled
 keep_compiled()
 from pathlib import Path
 import jaxsfm
-from jaxsfm.matching.extraction import extracted
+from jaxsfm.matching.extraction import extract_images
 images, _ = jaxsfm.open_images(Path(sys.argv[1]))
 weights = jaxsfm.load_weights()
 times = []
 for _ in range(3):
     start = time.time()
-    list(extracted(weights, images[:1], config=jaxsfm.preset("default")))
+    list(extract_images(weights, images[:1], config=jaxsfm.preset("default")))
     times.append((start, time.time()))
 print(json.dumps(times))
 """
