@@ -7,7 +7,7 @@ from jaxsfm.bench.synthetic import write_scene
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.report.summary import summary_lines
-from jaxsfm.runs.reconstruct import run_folder
+from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 
 MAX_POSITION = 0.002
@@ -35,15 +35,15 @@ def run_demo(out: Path | None, *, seed: int) -> tuple[list[str], bool]:
         seed=seed,
         progress=True,
     )
-    report = run_folder(
+    report = reconstruct_folder(
         out / "scene" / "images", out / "run", config=preset("default"), options=options
     )
-    result = report.get("evaluation")
+    result = report.evaluation
     passed = (
         result is not None
-        and result["registered"] == len(truth)
-        and result["position"]["mean"] <= MAX_POSITION
-        and result["rotation_deg"]["mean"] <= MAX_ROTATION_DEG
+        and result.registered == len(truth)
+        and result.position.mean <= MAX_POSITION
+        and result.rotation_deg.mean <= MAX_ROTATION_DEG
     )
     verdict = (
         f"demo {'passed' if passed else 'FAILED'}: synthetic scene; required {len(truth)} of "

@@ -31,8 +31,10 @@ from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.versions import package_versions
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
-from jaxsfm.report.summary import model_figures
-from jaxsfm.runs.reconstruct import run_folder
+from jaxsfm.report.run_results import ModelRow
+from jaxsfm.report.typed_json import to_json
+from jaxsfm.runs.reconstruct import reconstruct_folder
+from jaxsfm.runs.report import model_row
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.evaluation import evaluate
 
@@ -71,10 +73,12 @@ def find_sets(root: Path, names: Sequence[str] | None) -> list[Path]:
     return choose_sets(found, names, root)
 
 
-def _row(set_name: str, method: str, figures: dict[str, Any] | None) -> dict[str, Any]:
+def _row(set_name: str, method: str, model: ModelRow | None) -> dict[str, Any]:
     row: dict[str, Any] = {"set": set_name, "method": method, "registered": 0}
-    if figures is not None:
-        row |= {k: v for k, v in figures.items() if k != "images"}
+    if model is not None:
+        plain = to_json(dataclasses.replace(model, images=[]))
+        assert isinstance(plain, dict)
+        row |= {key: value for key, value in plain.items() if key != "images"}
     return row
 
 
@@ -110,7 +114,7 @@ def run_rootsift(
     options = MapOptions(refine_intrinsics=intrinsics is None, seed=seed, threads=threads)
     models, _ = build_models(database, read_two_views(database), options)
     write_models(models, out / "sparse")
-    row = _row(folder.name, "rootsift", model_figures(models[0]) if models else None)
+    row = _row(folder.name, "rootsift", model_row(models[0]) if models else None)
     return row | {"seconds": time.monotonic() - start}
 
 
@@ -133,9 +137,11 @@ def run_method(
         threads=threads,
         progress=progress,
     )
-    report = run_folder(folder / "images", out, config=method_config(method), options=options)
-    row = _row(folder.name, method, report["models"][0] if report["models"] else None)
-    return row | {"stages": report["seconds"], "seconds": sum(report["seconds"].values())}
+    report = reconstruct_folder(
+        folder / "images", out, config=method_config(method), options=options
+    )
+    row = _row(folder.name, method, report.models[0] if report.models else None)
+    return row | {"stages": report.seconds, "seconds": sum(report.seconds.values())}
 
 
 def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:

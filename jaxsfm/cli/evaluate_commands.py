@@ -31,20 +31,23 @@ def evaluate(
     check_writable(json, "--json", (".json",))
     from jaxsfm.colmap.poses import find_model, model_poses, read_model, read_poses
     from jaxsfm.io.atomic import write_atomic
+    from jaxsfm.report.run_results import EvaluationReport
     from jaxsfm.report.summary import evaluation_lines
+    from jaxsfm.report.typed_json import from_json, to_json
     from jaxsfm.sfm import evaluation
 
     truth = read_poses(reference)
     names = evaluation.read_names(align_on) if align_on else None
     poses = model_poses(read_model(find_model(out)))
-    result = evaluation.evaluate(poses, truth, align_on=names).as_dict()
-    for name, error in result["images"].items():
-        print(f"{name!s:40s} {error['position']:10.4f} {error['rotation_deg']:9.4f} deg")
-    for name in result["missing"]:
+    errors = evaluation.evaluate(poses, truth, align_on=names)
+    result = from_json(EvaluationReport, errors.as_dict())
+    for name, error in result.images.items():
+        print(f"{name!s:40s} {error.position:10.4f} {error.rotation_deg:9.4f} deg")
+    for name in result.missing:
         print(f"{name!s:40s} not in the model")
     print("\n".join(evaluation_lines(result)))
     if json is not None:
-        write_atomic(json, dumps(result, indent=1).encode())
+        write_atomic(json, dumps(to_json(result), indent=1).encode())
     return 0
 
 

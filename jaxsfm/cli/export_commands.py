@@ -93,13 +93,14 @@ def _new_folder(path: Path) -> Iterator[Path]:
 
 def _recorded_photos(run: Path) -> Path | None:
     """The photos' folder of a run, if it says and they are still there."""
-    from jaxsfm.report.schema import PHOTOS, read_report
+    from jaxsfm.report.run_inputs import PhotoFolder
+    from jaxsfm.report.run_report import read_part
 
     try:
-        folder = Path(read_report(run, PHOTOS)["images"]["folder"])
-    except UserError:  # a model of COLMAP's, or an older run
+        folder = read_part(run, PhotoFolder, "images").folder
+    except UserError:  # the folder is not a run's
         return None
-    return folder if folder.is_dir() else None
+    return Path(folder) if folder is not None and Path(folder).is_dir() else None
 
 
 def _model(run: Path) -> "pycolmap.Reconstruction":
@@ -162,14 +163,15 @@ def _export_folder(
 def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -> None:
     from jaxsfm.colmap.formats.hloc import write_hloc
     from jaxsfm.io.images import working_size
-    from jaxsfm.report.schema import SIZES, read_report
+    from jaxsfm.report.run_inputs import RecordedConfig
+    from jaxsfm.report.run_report import read_part
 
     tables = _tables(run)
     if tables is None:
         raise UserError(f"{run}: no database.db here, whose matches hloc would get")
     try:
-        config = read_report(run, SIZES)["options"]["config"]
-        limits = config["max_size"], float(config["enlarge"])
+        config = read_part(run, RecordedConfig, "options", "config")
+        limits = config.max_size, config.enlarge
     except UserError:  # not a run of ours: the photos' own pixels
         limits = 2**31, 1.0
     scales = {s: max(s) / max(working_size(s, *limits)) for s in set(tables.sizes.values())}

@@ -35,18 +35,18 @@ def localize(
     """
     check_writable(out, "--out", (".json",))
     from jaxsfm.io.atomic import write_atomic
-    from jaxsfm.runs.localize import localize
-    from jaxsfm.runs.localize_report import LOCALIZED, localize_lines
+    from jaxsfm.runs.localize import localize_photos
+    from jaxsfm.runs.localize_report import localize_lines
     from jaxsfm.runs.run_options import LocalizeOptions
 
     options = LocalizeOptions(
         **vars(new_photos), reference=reference, network=network, engine=engine, progress=True
     )
-    result = localize(photos, model, options=options)
+    result = localize_photos(photos, model, options=options)
     if out is not None:
-        write_atomic(out, dumps(result, indent=1).encode())
+        write_atomic(out, dumps(result.to_json(), indent=1).encode())
     print("\n".join(localize_lines(result)))
-    if not any(row["status"] == LOCALIZED for row in result["photos"]):
+    if not any(row.status == "localized" for row in result.photos):
         print("jaxsfm: no photo could be localized: see above", file=sys.stderr)
         return 1
     return 0
@@ -75,22 +75,23 @@ def extend(
       network: The files of the network's parameters. They must be those of the run.
     """
     from jaxsfm.io.images import shown_name
-    from jaxsfm.runs.extend import extend
+    from jaxsfm.runs.extend import extend_run
     from jaxsfm.runs.run_options import LocalizeOptions
 
     options = LocalizeOptions(**vars(new_photos), network=network, engine=engine, progress=True)
-    report = extend(run, options=options)
+    report = extend_run(run, options=options)
     if report is None:
         print(f"no new photos for {run}")
         return 0
-    last, model = report["extended"][-1], report["models"][0]
-    for name in last["skipped"]:
-        print(f"skipped    {report['images']['skipped'][name]}")
-    for row in report["lost"]:
-        if row["image"] in last["added"]:
-            print(f"lost       {shown_name(row['image'])}: {row['detail']}")
+    assert report.extended is not None
+    last, model = report.extended[-1], report.models[0]
+    for name in last.skipped:
+        print(f"skipped    {report.images.skipped[name]}")
+    for photo in report.lost:
+        if photo.image in last.added:
+            print(f"lost       {shown_name(photo.image)}: {photo.detail}")
     print(
-        f"placed     {len(last['placed'])} of {len(last['added'])} new photos in "
-        f"{last['rounds']} rounds: {model['registered']} images, {model['points']} points"
+        f"placed     {len(last.placed)} of {len(last.added)} new photos in "
+        f"{last.rounds} rounds: {model.registered} images, {model.points} points"
     )
-    return 0 if last["placed"] else 1
+    return 0 if last.placed else 1

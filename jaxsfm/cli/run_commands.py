@@ -63,7 +63,7 @@ def reconstruct(
     chosen = config.config(network.relocalizer)
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
-    from jaxsfm.runs.reconstruct import run_folder
+    from jaxsfm.runs.reconstruct import reconstruct_folder
     from jaxsfm.runs.run_options import RunOptions
 
     try:
@@ -73,9 +73,9 @@ def reconstruct(
     options = RunOptions(
         **vars(run), network=network, execution=checked, engine=engine, progress=True
     )
-    report = run_folder(images, out, config=chosen, options=options)
+    report = reconstruct_folder(images, out, config=chosen, options=options)
     print("\n".join(summary_lines(report)))
-    if not report["models"]:
+    if not report.models:
         where = out / "failed" if (out / "sparse").exists() else out
         print(
             "jaxsfm: no model could be built: see the lost images above and "

@@ -1,11 +1,11 @@
-"""A finished run, read again from what its folder keeps: for looking at it, never for going on."""
+"""A finished run, read from its folder again: to be shown, extended or used for localization."""
 
 import dataclasses
 import functools
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,43 +17,48 @@ from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, inspect_image,
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
-from jaxsfm.report.schema import read_report
+from jaxsfm.report.run_inputs import RecordedConfig
+from jaxsfm.report.run_report import RunReport, read_report
+from jaxsfm.report.run_results import EvaluationReport
+from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.sfm.evaluation import Similarity, common_alignment, evaluate
 
 logger = logging.getLogger(__name__)
 
 
-class Model(NamedTuple):
-    """The best model, in original pixels (`View.scale` is 1)."""
+class FinishedModel(NamedTuple):
+    """The best model of a run, in original pixels (`View.scale` is 1)."""
 
     views: list[View]
     tracks: Tracks
     colours: np.ndarray
-    """uint8 (n, 3), RGB of the points."""
+    """uint8 (n, 3): RGB of each point."""
     errors: np.ndarray
-    """float64 (m,): reprojection error of every observation, original pixels."""
+    """float64 (m,): the reprojection error of each observation, original pixels."""
 
 
-class Reference(NamedTuple):
-    """Reference poses and how the model is moved onto them."""
+class ReferencePoses(NamedTuple):
+    """Reference poses, and how the model is moved onto them."""
 
     poses: Poses
     similarity: Similarity
-    """Model to reference."""
+    """From the model to the reference."""
 
 
-class Photos:
-    """The run's photos, as long as they are where they were and what they were."""
+class RecordedPhotos:
+    """The photos of a run, for as long as they are unchanged and where the run found them."""
 
-    def __init__(self, folder: Path | None, hashes: Mapping[str, str], report: Mapping) -> None:
-        config = report["options"]["config"]
+    def __init__(
+        self, folder: Path | None, hashes: Mapping[str, str], config: RecordedConfig
+    ) -> None:
+        """Photos in `folder` with the SHA-256 `hashes` by name."""
         self.folder = folder
         self._hashes = hashes
-        self._sizes = {"max_size": config["max_size"], "enlarge": config["enlarge"]}
+        self._config = config
         self.read = functools.lru_cache(maxsize=16)(self._read)
 
     def file(self, name: str) -> ImageFile | None:
-        """A photo's file; None if it is gone or changed."""
+        """The file of a photo; None if it is gone or has changed."""
         if self.folder is None:
             return None
         try:
@@ -63,61 +68,66 @@ class Photos:
         return image if image.sha256 == self._hashes.get(name) else None
 
     def recorded(self, name: str) -> ImageFile:
-        """A photo as the run found it; nobody looks whether it is still there. Its size is not
-        known."""
+        """The file of a photo as the run found it, unseen: it may be gone. Its size is (0, 0)."""
         path = (self.folder or Path()) / name
         return ImageFile(name=name, path=path, size=(0, 0), sha256=self._hashes[name])
 
-    def called(self, sha256: str) -> str | None:
-        """What the run calls a photo of that content."""
+    def name_of(self, sha256: str) -> str | None:
+        """The name of the photo with that content; None if the run has no such photo."""
         return next((name for name, each in self._hashes.items() if each == sha256), None)
 
     def _read(self, name: str) -> WorkingImage | None:
-        """A photo at working size; None if it is gone, changed or cannot be decoded."""
-        image = self.file(name)
+        """The working image of a photo; None if it is gone, changed or cannot be decoded."""
+        image, config = self.file(name), self._config
         try:
-            return image and read_image(image, **self._sizes)
+            return image and read_image(image, max_size=config.max_size, enlarge=config.enlarge)
         except ImageError:
             return None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class KeptRun:
-    """What is left of a run."""
+class FinishedRun:
+    """What the folder of a run holds."""
 
     folder: Path
-    """Where its results lie."""
-    report: dict[str, Any]
-    """The content of report.json; `evaluation` is against `reference`."""
-    photos: Photos
-    model: Model | None
-    reference: Reference | None
+    """The folder of its results."""
+    report: RunReport
+    """The content of report.json; its `evaluation` is against `reference`."""
+    photos: RecordedPhotos
+    model: FinishedModel | None
+    reference: ReferencePoses | None
     matches: Store
 
     @property
     def config(self) -> Config:
-        """The run's.
+        """The config of the run.
 
         Raises:
-          UserError: this version of jaxsfm does not know it.
+          UserError: the config has fields that this version of jaxsfm does not know.
         """
-        plain = dict(self.report["options"]["config"])
         try:
-            shape, refinement = PairShape(**plain.pop("pair")), plain.pop("refinement")
-            passes = refinement and Refinement(**refinement)
-            return Config(**plain, pair=shape, refinement=passes)
+            return _config(self.report.options.config)
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(
-                f"{self.folder}: was made by jaxsfm {self.report.get('version')}, whose options "
+                f"{self.folder}: was made by jaxsfm {self.report.version}, whose options "
                 "this version does not know; run reconstruct again"
             ) from error
 
     def load_matches(self, pair: Pair) -> PairResult | None:
-        """Of one pair, original pixels; None if there are none or the file is gone."""
+        """The matches of a pair, original pixels; None if there are none or the file is gone."""
         return self.matches.load_matches(pair)
 
 
-def _model(folder: Path) -> tuple[Model, Poses] | None:
+def _config(recorded: RecordedConfig) -> Config:
+    """TypeError, KeyError or ValueError for what is no config of this version."""
+    plain = to_json(recorded)
+    assert isinstance(plain, dict)
+    shape, refinement = plain.pop("pair"), plain.pop("refinement")
+    passes = Refinement(**refinement) if refinement else None
+    return Config(**plain, pair=PairShape(**shape), refinement=passes)
+
+
+def _model(folder: Path) -> tuple[FinishedModel, Poses] | None:
     if not (folder / "sparse" / "0").is_dir():
         return None
     model = read_model(folder / "sparse" / "0")
@@ -125,55 +135,73 @@ def _model(folder: Path) -> tuple[Model, Poses] | None:
     sizes = {name: ((c.width, c.height), (1.0, 1.0)) for name, c in cameras.items()}
     views, tracks = read_model_arrays(model, sizes)
     errors = errors_px(views, tracks)
-    return Model(views, tracks, point_colours(model), errors), model_poses(model)
+    return FinishedModel(views, tracks, point_colours(model), errors), model_poses(model)
 
 
-def _reference(report: dict[str, Any], poses: Poses, given: Path | None) -> Reference | None:
-    """Reference poses, and in `report` the errors against them.
+def _with_reference(
+    report: RunReport, poses: Poses, given: Path | None
+) -> tuple[RunReport, ReferencePoses | None]:
+    """The reference poses, and the report with the errors against them.
 
-    Those that the run was given may be gone by now; those that are given now must be readable.
+    Args:
+      given: reference poses that the user named. They must be readable. Those that the run was
+        given may be gone, which is only a warning.
     """
-    recorded = report["options"].get("reference")
-    if given is None and recorded is None:
-        return None
+    recorded = report.options.reference
+    path = given or (None if recorded is None else Path(recorded))
+    if path is None:
+        return report, None
     try:
-        reference = read_poses(given or Path(recorded))
+        reference = read_poses(path)
         _, _, similarity = common_alignment(poses, reference)
-        report["evaluation"] = evaluate(poses, reference).as_dict()
+        evaluation = evaluation_report(poses, reference)
     except UserError as error:
         if given is not None:
             raise
         logger.warning("the reference poses of the run are not shown: %s", error)
-        return None
-    return Reference(reference, similarity)
+        return report, None
+    report = dataclasses.replace(report, evaluation=evaluation)
+    return report, ReferencePoses(reference, similarity)
 
 
-def read_run(folder: Path, *, images: Path | None = None, reference: Path | None = None) -> KeptRun:
-    """Read a run's results.
-
-    Args:
-      folder: a run's OUT, or OUT/failed.
-      images: folder of the photos; default: where the run found them.
-      reference: reference poses to compare with; default: the run's.
+def evaluation_report(poses: Poses, reference: Poses) -> EvaluationReport:
+    """The errors of a model's poses against reference poses.
 
     Raises:
-      UserError: no finished run, or what was named cannot be used.
+      UserError: the two have too few photos in common.
+    """
+    return from_json(EvaluationReport, evaluate(poses, reference).as_dict())
+
+
+def read_run(
+    folder: Path, *, images: Path | None = None, reference: Path | None = None
+) -> FinishedRun:
+    """Read the results of a run.
+
+    Args:
+      folder: the OUT of a run, or OUT/failed.
+      images: the folder of the photos; default: where the run found them.
+      reference: reference poses to compare with; default: those of the run.
+
+    Raises:
+      UserError: there is no finished run, or an argument cannot be used.
     """
     report = read_report(folder)
     if images is not None and not images.is_dir():
         raise UserError(f"--images {images}: no such folder")
     home = folder if (folder / RECORD).exists() else folder.parent
-    recorded = report["images"].get("folder")
+    recorded = report.images.folder
     where = images or (Path(recorded) if recorded else None)
-    found = _model(folder) if report["models"] else None
+    found = _model(folder) if report.models else None
     model, poses = found if found else (None, {})
     if reference is not None and not poses:
         raise UserError(f"--reference {reference}: {folder} has no model to compare with it")
-    return KeptRun(
+    report, known = _with_reference(report, poses, reference) if poses else (report, None)
+    return FinishedRun(
         folder=folder,
         report=report,
-        photos=Photos(where, report["identity"]["images"], report),
+        photos=RecordedPhotos(where, report.identity.images, report.options.config),
         model=model,
-        reference=_reference(report, poses, reference) if poses else None,
-        matches=Store(home, report["identity"]),
+        reference=known,
+        matches=Store(home, report.identity.to_json()),
     )

@@ -1,61 +1,85 @@
-"""Why images were lost, or no model came out: where, with which numbers, and what may help."""
+"""Why a photo was lost, or why there is no model.
+
+A photo is lost if it has no pose in the best model. For each lost photo the report names the stage
+that lost it, the numbers that decided, and what may help:
+
+* `jaxsfm.report.pair_outcomes` says how far each pair of photos came, and what it lacked;
+* `jaxsfm.report.photo_groups` says which photos trusted pairs join;
+* this module says at which stage a photo was lost;
+* `jaxsfm.report.advice` says which option, or which further photos, could help.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from typing import NamedTuple
 
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, describe
-from jaxsfm.report.advice import LEAST_ANGLE_DEG, Circumstances, Help, towards_others, without_pose
-from jaxsfm.report.pair_outcomes import Component, PairOutcomes, components
+from jaxsfm.report.advice import LEAST_ANGLE_DEG, Circumstances, towards_others, without_pose
+from jaxsfm.report.pair_outcomes import PairOutcomes
+from jaxsfm.report.photo_groups import PhotoGroup, photo_groups, view_graph_report
+from jaxsfm.report.run_results import Advice, LostPhoto, Stage, ViewGraph
+from jaxsfm.sfm.refine.passes import RefinementFigures
 
 
-def explained(
+class Explanation(NamedTuple):
+    """The fields of the report that explain what is missing."""
+
+    view_graph: ViewGraph
+    lost: list[LostPhoto]
+    no_model: str | None
+
+
+def explain(
     models: Sequence[Collection[str]],
     pairs: PairOutcomes,
     made: Circumstances,
-    refinement: Sequence[Mapping[str, Any] | None] = (),
-) -> dict[str, Any]:
-    """The report's `view_graph`, `lost` and `no_model`, plain JSON.
+    refinement: Sequence[RefinementFigures | None] = (),
+) -> Explanation:
+    """The groups of photos, the lost photos, and why there is no model.
 
     Args:
-      models: each one's images, the best first.
-      refinement: the report's, of each model.
+      models: the photos of each model, the best model first.
+      refinement: what the refinement of each model did; None for a model that was not refined.
     """
-    groups = components(made.sizes, pairs)
-    return {
-        "view_graph": {"components": _component_rows(groups, models, pairs)},
-        "lost": lost_images(groups, models, pairs, made, _taken_out(refinement)),
-        "no_model": None if models else no_model(pairs),
-    }
+    groups = photo_groups(made.sizes, pairs)
+    return Explanation(
+        view_graph=view_graph_report(groups, models[0] if models else (), pairs),
+        lost=lost_photos(groups, models, pairs, made, _taken_out(refinement)),
+        no_model=None if models else no_model(pairs),
+    )
 
 
-def lost_images(
-    groups: Sequence[Component],
+def lost_photos(
+    groups: Sequence[PhotoGroup],
     models: Sequence[Collection[str]],
     pairs: PairOutcomes,
     made: Circumstances,
     taken_out: Mapping[str, str],
-) -> list[dict[str, Any]]:
-    """For every image without a pose in the best model, the stage that lost it and the numbers.
+) -> list[LostPhoto]:
+    """Every photo without a pose in the best model, with the stage that lost it.
 
-    Stages, in the pipeline's order: `pairs` (never paired), `too few matches` (no pair had enough
-    tentative matches), `no plane` (no homography had enough inliers), `not connected` (no chain of
-    trusted pairs to the model), `no pose` (connected, but COLMAP found no pose), `not confirmed`
-    (COLMAP found one, and refinement took it out of the model again), `other model` (it is in a
-    smaller one, though trusted pairs lead to the best).
+    The stages, in the order of the pipeline:
+
+    * `pairs`: no pair with the photo was tried;
+    * `too few matches`: no pair had enough tentative matches;
+    * `no plane`: no homography had enough inliers;
+    * `not connected`: no chain of trusted pairs leads to the model;
+    * `no pose`: trusted pairs lead to the model, but COLMAP found no pose;
+    * `not confirmed`: COLMAP found a pose, but refinement took the photo out of the model again;
+    * `other model`: trusted pairs lead to the best model, but the photo is in a smaller one.
 
     Args:
-      taken_out: why refinement took images out of a model.
+      taken_out: why refinement took a photo out of a model, by name.
     """
     best_model = set(models[0]) if models else set()
     own: dict[str, list[Pair]] = {name: [] for name in made.sizes}
-    for pair in pairs.results:
+    for pair in pairs.rows:
         for name in own.keys() & set(pair):
             own[name].append(pair)
-    rows = []
+    lost = []
     for index, group in enumerate(groups):
         connected = bool(group.images & best_model) or not best_model
-        advice: list[Help] | None = None  # of a group that is not connected: the same for all of it
+        shared: list[Advice] | None = None  # all photos of an unconnected group get the same
         for name in sorted(group.images - best_model):
             stage, detail = _stage(name, own[name], connected, pairs)
             smaller = next((k for k, images in enumerate(models) if k and name in images), None)
@@ -65,102 +89,97 @@ def lost_images(
             elif name in taken_out:
                 stage, detail = "not confirmed", f"{detail}; {taken_out[name]}"
             if stage == "no pose":
-                found = without_pose(name, own[name], pairs, made, model=bool(models))
+                advice = without_pose(name, own[name], pairs, made, model=bool(models))
             elif stage == "not confirmed":
-                found = towards_others([name], own[name], pairs, made)
+                advice = towards_others([name], own[name], pairs, made)
             elif stage == "other model":
                 island = set(models[smaller or 0]) - best_model
-                found = towards_others(island, _leaving(island, pairs), pairs, made)
+                advice = towards_others(island, _leaving(island, pairs), pairs, made)
             else:
-                advice = advice or towards_others(group.images, group.crossing, pairs, made)
-                found = advice
+                shared = shared or towards_others(group.images, group.crossing, pairs, made)
+                advice = shared
             best = pairs.best(own[name])
-            rows.append(
-                {
-                    "image": name,
-                    "stage": stage,
-                    "detail": detail,
-                    "component": index,
-                    "model": smaller,
-                    "best_pair": best and pairs.row(best),
-                    "help": [each._asdict() for each in found],
-                }
+            lost.append(
+                LostPhoto(
+                    image=name,
+                    stage=stage,
+                    detail=detail,
+                    component=index,
+                    model=smaller,
+                    best_pair=None if best is None else pairs.closest(best),
+                    help=advice,
+                )
             )
-    return sorted(rows, key=lambda row: row["image"])
+    return sorted(lost, key=lambda photo: photo.image)
 
 
-def _taken_out(refinement: Sequence[Mapping[str, Any] | None]) -> dict[str, str]:
-    """Why refinement took images out of a model."""
+def _taken_out(refinement: Sequence[RefinementFigures | None]) -> dict[str, str]:
+    """Why refinement took photos out of a model, by name."""
     return {
-        at["name"]: (
-            f"the mapper gave it a pose, but alignment finds {at['agreed']} of the "
-            f"{at['candidates']} points that it should show, and {at['held']} points hold it"
+        at.name: (
+            f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
+            f"{at.candidates} points that it should show, and only {at.held} points hold it in "
+            "the model"
         )
         for each in refinement
-        for at in (each["placed"] if each else ())
-        if at.get("held") is not None
+        for at in (each.placed if each else ())
+        if at.held is not None
     }
 
 
 def _leaving(images: Collection[str], pairs: PairOutcomes) -> list[Pair]:
-    """Pairs tried between some images and all others."""
-    return [pair for pair in pairs.results if (pair[0] in images) != (pair[1] in images)]
+    """The pairs that were tried between some photos and all others."""
+    return [pair for pair in pairs.rows if (pair[0] in images) != (pair[1] in images)]
 
 
-def _stage(name: str, own: Sequence[Pair], connected: bool, pairs: PairOutcomes) -> tuple[str, str]:
-    """Where an image was lost, and the numbers in words."""
-    results = [pairs.results[pair] for pair in own]
-    tentative = max((r.num_tentative for r in results), default=0)
+def _stage(
+    name: str, own: Sequence[Pair], connected: bool, pairs: PairOutcomes
+) -> tuple[Stage, str]:
+    """The stage that lost a photo, and the numbers in words.
+
+    Args:
+      own: the pairs that were tried with the photo.
+      connected: whether trusted pairs join the photo's group to the model.
+    """
+    rows = [pairs.rows[pair] for pair in own]
+    tentative = max((row.tentative for row in rows), default=0)
     if not own:
         return "pairs", "it is in no pair that was tried"
-    if all(r.status == Status.TOO_FEW_MATCHES for r in results):
+    if all(row.status == Status.TOO_FEW_MATCHES for row in rows):
         return "too few matches", f"at most {tentative} tentative matches in a pair"
-    if not any(r.status == Status.VERIFIED for r in results):
-        return "no plane", f"{tentative} tentative matches, no homography among them"
-    used = [pairs.verified[pair] for pair in own if pairs.trusted(pair)]
+    if not any(row.status == Status.VERIFIED for row in rows):
+        return "no plane", (
+            f"{tentative} tentative matches, but no homography agrees with enough of them"
+        )
+    used = [row.colmap_inliers for row in rows if row.trusted]
     if used and connected:
         return "no pose", f"{len(used)} verified pairs with up to {max(used)} inliers"
-    dropped = sum(pair in pairs.verified for pair in own) - len(used)
-    return "not connected", (
-        f"{max(r.num_inliers for r in results)} inliers in its best pair, {len(used)} pairs "
-        "verified by COLMAP, none leads to the model"
-        + f"; the view graph dropped {dropped} (--view-graph no keeps them)"
-        * bool(dropped)
+    dropped = sum(row.colmap_inliers > 0 for row in rows) - len(used)
+    detail = (
+        f"{max(row.inliers for row in rows)} inliers in its best pair, {len(used)} pairs verified "
+        "by COLMAP, none of which leads to the model"
     )
-
-
-def _component_rows(
-    groups: Sequence[Component], models: Sequence[Collection[str]], pairs: PairOutcomes
-) -> list[dict[str, Any]]:
-    of = {name: k for k, group in enumerate(groups) for name in group.images}
-    rows = []
-    for group in groups:
-        best = pairs.best(group.crossing)
-        other = best and of[best[best[0] in group.images]]
-        rows.append(
-            {
-                "images": sorted(group.images),
-                "pairs": group.pairs,
-                "registered": len(group.images & set(models[0])) if models else 0,
-                "nearest": best and {"component": other, **pairs.row(best)},
-            }
-        )
-    return rows
+    if dropped:
+        detail += f"; the view graph dropped {dropped} more (--view-graph no keeps them)"
+    return "not connected", detail
 
 
 def no_model(pairs: PairOutcomes) -> str:
-    """The one reason that decided: the stage that no pair got past, with the numbers."""
-    best = pairs.best(pairs.results)
+    """The one reason why there is no model: the stage that no pair got past, with the numbers."""
+    best = pairs.best(pairs.rows)
     if best is None:
         return "no pair of photos was tried"
     lack = f"the best, {describe(best)}, has {pairs.missed(best)}"
-    if not any(result.num_inliers for result in pairs.results.values()):
-        return f"none of the {len(pairs.results)} pairs tried has matches on a plane: {lack}"
-    if not pairs.verified:
-        return f"COLMAP verified none of the {len(pairs.handed_on)} pairs handed to it: {lack}"
-    used = [pair for pair in pairs.verified if pairs.trusted(pair)]
+    rows = pairs.rows.values()
+    if not any(row.inliers for row in rows):
+        return f"none of the {len(rows)} pairs tried has matches on a plane: {lack}"
+    verified = [pair for pair in pairs.rows if pairs.verified(pair)]
+    if not verified:
+        handed_on = sum(row.handed_on for row in rows)
+        return f"COLMAP verified none of the {handed_on} pairs handed to it: {lack}"
+    used = [pair for pair in verified if pairs.trusted(pair)]
     if not used:
-        return f"the view graph trusts none of the {len(pairs.verified)} verified pairs: {lack}"
+        return f"the view graph trusts none of the {len(verified)} verified pairs: {lack}"
     start = f"the mapper found no pair to start from among {len(used)}"
     widest = pairs.widest_deg(used)
     if widest is not None and widest < LEAST_ANGLE_DEG:
@@ -170,4 +189,4 @@ def no_model(pairs: PairOutcomes) -> str:
         )
     best = pairs.best(used)
     assert best is not None
-    return f"{start}; the best, {describe(best)}, has {pairs.verified[best]} inliers"
+    return f"{start}; the best, {describe(best)}, has {pairs.rows[best].colmap_inliers} inliers"

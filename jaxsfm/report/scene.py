@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jaxsfm.colmap.poses import CameraPose
-from jaxsfm.report.finished_run import KeptRun, Model
+from jaxsfm.report.finished_run import FinishedModel, FinishedRun
 from jaxsfm.sfm.evaluation import Similarity
 
 FAR = 0.5
@@ -50,7 +50,7 @@ class Scene(NamedTuple):
         return np.asarray([0.0, 0.0, 0.4]) - 0.9 * ahead
 
 
-def _corners(model: Model) -> dict[str, np.ndarray]:
+def _corners(model: FinishedModel) -> dict[str, np.ndarray]:
     """Corners of every view's image at depth 1, camera frame."""
     found = {}
     for view in model.views:
@@ -87,7 +87,7 @@ def _depth(centres: np.ndarray, extent: float) -> float:
     return float(np.clip(0.5 * nearest, 0.01 * extent, 0.08 * extent))
 
 
-def shown_scene(run: KeptRun) -> Scene:
+def shown_scene(run: FinishedRun) -> Scene:
     """The run's best model.
 
     Raises:

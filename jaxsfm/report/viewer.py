@@ -11,7 +11,7 @@ import numpy as np
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.images import shown_name, working_size
-from jaxsfm.report.finished_run import KeptRun
+from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.scene import ShownCamera, shown_scene
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def _viser() -> ModuleType:
     return viser
 
 
-def _thumbnail(run: KeptRun, name: str) -> np.ndarray | None:
+def _thumbnail(run: FinishedRun, name: str) -> np.ndarray | None:
     image = run.photos.read(name)
     if image is None:
         return None
@@ -49,7 +49,7 @@ def fov_and_aspect(camera: ShownCamera) -> tuple[float, float]:
 class Viewer:
     """A scene on a server, with its controls."""
 
-    def __init__(self, server: "viser.ViserServer", run: KeptRun) -> None:
+    def __init__(self, server: "viser.ViserServer", run: FinishedRun) -> None:
         self.server, self.run, self.scene = server, run, shown_scene(run)
         self._set_view()
         gui, size = server.gui, self.scene.frustum_depth / 20
@@ -153,7 +153,7 @@ def _check_address(host: str) -> None:
         raise UserError(f"--host {host}: cannot be listened on ({error.strerror})") from error
 
 
-def serve(run: KeptRun, *, host: str, port: int) -> None:
+def serve(run: FinishedRun, *, host: str, port: int) -> None:
     """Show a run's model until Ctrl-C.
 
     Raises:

@@ -6,11 +6,10 @@ Matches are kept as a run's are, so a later reconstruct of the folder goes on fr
 """
 
 import dataclasses
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -19,40 +18,49 @@ from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.model_arrays import build_model
 from jaxsfm.colmap.models import colour_points, read_models, write_models
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
-from jaxsfm.io.work_folder import RECORD, WorkFolder, lock_folder, open_locked_folder
+from jaxsfm.io.work_folder import RECORD, WorkFolder, locked, locked_folder
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.report.finished_run import KeptRun, read_run
+from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.page.after_run import page_after_run
+from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.runs.compute_missing import extract_missing, match_missing
-from jaxsfm.runs.extend_report import New, extended_report
 from jaxsfm.runs.finished_model import (
     ChosenCamera,
     KnownModel,
-    by_similarity,
     choose_camera,
     known_model,
     run_files,
     run_weights,
     view_of,
 )
-from jaxsfm.runs.run_options import LocalizeOptions, RunOptions
+from jaxsfm.runs.localize import LocalizeOptions
+from jaxsfm.runs.report import NewPhotos, extended_report
+from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.register.grow import Grown, Newcomer, grow
 
 if TYPE_CHECKING:
     import pycolmap
 
 
-def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
+def extend(run: Path, *, options: LocalizeOptions) -> dict[str, object] | None:
+    """Extend a finished run; returns the content of its new report.json, or None.
+
+    See `extend_run`, which returns the report as an object.
+    """
+    report = extend_run(run, options=options)
+    return None if report is None else report.to_json()
+
+
+def extend_run(run: Path, *, options: LocalizeOptions) -> RunReport | None:
     """Extend a finished run; returns its new report, or None if there are no new photos, not even
     broken ones.
 
-    `report["extended"]` has a row for every extension: when, which photos were added, which placed,
+    `report.extended` has a row for every extension: when, which photos were added, which placed,
     which skipped.
 
     Args:
@@ -63,11 +71,11 @@ def extend(run: Path, *, options: LocalizeOptions) -> dict[str, Any] | None:
     """
     if not (run / RECORD).exists():
         raise UserError(f"{run}: no finished run here ({RECORD} is missing)")
-    with lock_folder(run):  # before anything is read: another one may be publishing
+    with locked(run):  # before anything is read: another one may be publishing
         return _extend(run, options)
 
 
-def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
+def _extend(run: Path, options: LocalizeOptions) -> RunReport | None:
     start = time.monotonic()
     kept = read_run(run, images=options.images, reference=options.reference)
     if kept.model is None:
@@ -75,14 +83,14 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
     if kept.photos.folder is None:
         raise UserError(f"{run}: where its photos lie is not known; say it with --images")
     config, weights = kept.config, run_weights(kept, options.network)
-    identity = kept.report["identity"]
-    if identity["version"] != versions()["jaxsfm"]:
+    identity = kept.report.identity
+    if identity.version != versions()["jaxsfm"]:
         raise UserError(
-            f"{run}: was made by jaxsfm {identity['version']}, this is {versions()['jaxsfm']}; "
+            f"{run}: was made by jaxsfm {identity.version}, this is {versions()['jaxsfm']}; "
             "run reconstruct again"
         )
     usable, broken = open_images(kept.photos.folder, progress=options.progress)
-    old, skipped = identity["images"], kept.report["images"]["skipped"]
+    old, skipped = identity.images, kept.report.images.skipped
     used = old.keys() - skipped.keys()
     # A photo that was skipped is new once it is another file, or if it was not for damage.
     fresh = [i for i in usable if i.name not in used and not kept.matches.why_unusable(i)]
@@ -90,22 +98,23 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
     newly_broken = {n: why for n, why in broken.items() if n not in used and n not in skipped}
     if not new and not newly_broken:
         return None
-    model = known_model(run / "sparse" / "0", config, seed=kept.report["options"]["seed"])
+    model = known_model(run / "sparse" / "0", config, seed=kept.report.options.seed)
     names = [view.name for view in model.views]
     there = {i.name: i for i in usable if i.name in used and old[i.name] == i.sha256}
     run_files(kept, [name for name in names if name not in there])  # says what is gone
     files = there | new
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     cameras = {name: choose_camera(i, model.views, intrinsics) for name, i in new.items()}
-    identity = identity | {"images": old | {name: image.sha256 for name, image in new.items()}}
+    hashes = old | {name: image.sha256 for name, image in new.items()}
+    identity = dataclasses.replace(identity, images=hashes)
     run_options = RunOptions(
         seed=model.seed,
         network=options.network,
         execution=options.execution,
         progress=options.progress,
     )
-    folder = open_locked_folder(run, identity)
-    shortlist = by_similarity(kept, weights, options.shortlist, new, options.execution)
+    folder = locked_folder(run, identity.to_json())
+    shortlist = options.chosen_shortlist(kept, weights, new)
     shortlists, unread = {}, {}
     for name, image in new.items():
         try:
@@ -113,7 +122,7 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
             shortlists[name] = shortlist(image, others)
         except ImageError as error:
             unread[name] = str(error)
-            folder.record_failure(image, error)
+            folder.note_failure(image, error)
     pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
     missing = [pair for pair in pairs if folder.load_matches(pair) is None]
     undecoded = unread | extract_missing(folder, weights, files, missing, config, run_options)
@@ -124,15 +133,13 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
     missing = [pair for pair in missing if not undecoded.keys() & set(pair)]
     for _ in match_missing(folder, weights, files, missing, config, run_options):
         pass
-    added = New(new, newly_broken | undecoded)
+    added = NewPhotos(new, newly_broken | undecoded)
     with folder.publish() as target:
         report = _extended(kept, folder, target, model, added, cameras, pairs, files, options)
-        report["identity"] = identity
-        seconds = report["seconds"]
-        took = seconds.get("extension", 0.0) + time.monotonic() - start
-        report["seconds"] = seconds | {"extension": took}
-        text = json.dumps(report, indent=1, default=str)
-        write_atomic(target / "report.json", text.encode())
+        took = report.seconds.get("extension", 0.0) + time.monotonic() - start
+        seconds = report.seconds | {"extension": took}
+        report = dataclasses.replace(report, identity=identity, seconds=seconds)
+        write_report(target, report)
     if not options.keep_features:
         folder.drop_features()
     page_after_run(run)
@@ -140,17 +147,17 @@ def _extend(run: Path, options: LocalizeOptions) -> dict[str, Any] | None:
 
 
 def _extended(
-    kept: KeptRun,
+    kept: FinishedRun,
     folder: WorkFolder,
     fresh: Path,
     model: KnownModel,
-    new: New,
+    new: NewPhotos,
     cameras: Mapping[str, ChosenCamera],
     pairs: list[Pair],
     files: Mapping[str, ImageFile],
     options: LocalizeOptions,
-) -> dict[str, Any]:
-    """Database and models in `fresh`; the report."""
+) -> RunReport:
+    """Write the database and the models into `fresh`; returns the report."""
     home, config = folder.path, model.config
     matches = SavedMatches(folder, pairs)
     chosen = {name: cameras[name] for name in new.images}
@@ -162,7 +169,7 @@ def _extended(
         database,
         matches,
         seed=model.seed,
-        threads=kept.report["options"]["threads"],
+        threads=kept.report.options.threads,
         scale=Photos(files.values(), config).median_scale(),
     )
     newcomers = {

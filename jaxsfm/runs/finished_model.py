@@ -26,7 +26,9 @@ from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.global_descriptors import GEM
 from jaxsfm.matching.retrieval import describe_photos
 from jaxsfm.options import WeightsChoice
-from jaxsfm.report.finished_run import KeptRun
+from jaxsfm.report.finished_run import FinishedRun
+from jaxsfm.report.run_inputs import UsedWeights
+from jaxsfm.report.typed_json import from_json
 
 Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
 """A photo and the names of the model's photos -> those that it is matched with."""
@@ -106,22 +108,24 @@ def view_of(image: ImageFile, chosen: ChosenCamera, config: Config) -> View:
     )
 
 
-def run_weights(run: KeptRun, choice: WeightsChoice) -> Weights:
+def run_weights(run: FinishedRun, choice: WeightsChoice) -> Weights:
     """Those of the run, or UserError."""
     config = run.config
     weights = chosen_weights(choice, config.backbone)
-    made_with, now = run.report["weights"], weights.described(config)
-    for key, option in (("sha256", "--weights"), ("relocalizer_sha256", "--relocalizer")):
-        if made_with.get(key) != now[key]:
+    made_with, now = run.report.weights, from_json(UsedWeights, weights.described(config))
+    for used, here, option in (
+        (made_with.sha256, now.sha256, "--weights"),
+        (made_with.relocalizer_sha256, now.relocalizer_sha256, "--relocalizer"),
+    ):
+        if used != here:
             raise UserError(
-                f"{run.folder}: was made with other weights (SHA-256 "
-                f"{str(made_with.get(key))[:12]}..., not {str(now[key])[:12]}...); give them with "
-                f"{option}"
+                f"{run.folder}: was made with other weights (SHA-256 {str(used)[:12]}..., not "
+                f"{str(here)[:12]}...); give them with {option}"
             )
     return weights
 
 
-def run_files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
+def run_files(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile]:
     """The run's photos, or UserError for one that is gone."""
     files = {}
     for name in names:
@@ -136,7 +140,7 @@ def run_files(run: KeptRun, names: Sequence[str]) -> dict[str, ImageFile]:
 
 
 def by_similarity(
-    run: KeptRun, weights: Weights, k: int, new: Mapping[str, ImageFile], execution: Execution
+    run: FinishedRun, weights: Weights, k: int, new: Mapping[str, ImageFile], execution: Execution
 ) -> Shortlist:
     """The `k` most similar photos by GeM, which describes each photo by itself; equally similar
     ones by name. The run's photos are described once and kept in its folder, if it can be written.
@@ -160,7 +164,7 @@ def by_similarity(
 
     def described_apart(image: ImageFile) -> np.ndarray:
         with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-            store = Store(Path(scratch), run.report["identity"])
+            store = Store(Path(scratch), run.report.identity.to_json())
             return describe([image], store)[image.name]
 
     @functools.cache

@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -19,7 +18,7 @@ from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.model_arrays import part_of
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
-from jaxsfm.io.features import ImageFeatures, feature_capacity
+from jaxsfm.io.features import ImageFeatures, room_of
 from jaxsfm.io.images import (
     ImageError,
     ImageFile,
@@ -30,9 +29,11 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights
-from jaxsfm.matching.extraction import extract_images, image_features
-from jaxsfm.matching.pair_matching import match_pairs
-from jaxsfm.report.finished_run import KeptRun, read_run
+from jaxsfm.matching.execution import Execution
+from jaxsfm.matching.extraction import extracted, image_features
+from jaxsfm.matching.pair_matching import matched
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.runs.finished_model import (
     ChosenCamera,
     KnownModel,
@@ -44,9 +45,43 @@ from jaxsfm.runs.finished_model import (
     run_weights,
     view_of,
 )
-from jaxsfm.runs.localize_report import UNUSABLE, error_against, located_figures
-from jaxsfm.runs.run_options import LocalizeOptions
+from jaxsfm.runs.localize_report import (
+    Localization,
+    LocalizedPhoto,
+    UnusablePhoto,
+    error_against,
+    localized_photo,
+)
 from jaxsfm.sfm.register.locate_view import Located, locate
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocalizeOptions:
+    """What to do, beyond what the run fixes."""
+
+    images: Path | None = None
+    """Folder of the run's photos; None: where the run found them."""
+    intrinsics: str | None = None
+    """K.txt or MODEL:p1,p2,.. of the photos; None: the run's camera, if exactly one of this size is
+    that of several photos, else one per photo, whose focal length is estimated."""
+    reference: Path | None = None
+    """Reference poses of the photos and of the run's."""
+    network: WeightsChoice = USUAL_WEIGHTS
+    shortlist: Shortlist | int = 20
+    """Photos that a new one is matched with; a number: the most similar ones."""
+
+    execution: Execution = dataclasses.field(default_factory=Execution)
+    keep_features: bool = False
+    """Of the run's photos, in its folder, for the next time (25 MB for 1536 x 1024)."""
+    progress: bool = False
+
+    def chosen_shortlist(
+        self, run: FinishedRun, weights: Weights, new: Mapping[str, ImageFile]
+    ) -> Shortlist:
+        """As a function; `new` as in `by_similarity`."""
+        if isinstance(self.shortlist, int):
+            return by_similarity(run, weights, self.shortlist, new, self.execution)
+        return self.shortlist
 
 
 def locate_photo(
@@ -95,14 +130,14 @@ def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, st
 
 @contextmanager
 def _features(
-    run: KeptRun, weights: Weights, files: Mapping[str, ImageFile], options: LocalizeOptions
+    run: FinishedRun, weights: Weights, files: Mapping[str, ImageFile], options: LocalizeOptions
 ) -> Iterator[Callable[[str], ImageFeatures]]:
     """Features of the run's photos by name: kept ones, else computed once, on disk (meanwhile)."""
     with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-        apart = Store(Path(scratch), run.report["identity"])
+        apart = Store(Path(scratch), run.report.identity.to_json())
         fresh = run.matches if options.keep_features else apart
         todo = [image for image in files.values() if not run.matches.has_features(image)]
-        stream = extract_images(weights, todo, config=run.config, execution=options.execution)
+        stream = extracted(weights, todo, config=run.config, execution=options.execution)
         quiet = not options.progress or not todo
         bar = tqdm(stream, total=len(todo), desc="extraction", unit="image", disable=quiet)
         for _, found in bar:
@@ -118,20 +153,20 @@ def _features(
         yield load
 
 
-def localize(
-    photos: Sequence[Path],
-    run: Path,
-    *,
-    options: LocalizeOptions,
-    shortlist: Shortlist | None = None,
-) -> dict[str, Any]:
-    """Localize photos in a finished run; returns plain JSON, a row for each photo.
+def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> dict[str, object]:
+    """Localize photos in a finished run; returns plain JSON, with a row for each photo.
+
+    See `localize_photos`, which returns the result as an object.
+    """
+    return localize_photos(photos, run, options=options).to_json()
+
+
+def localize_photos(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> Localization:
+    """Localize photos in a finished run.
 
     Args:
       photos: files, or folders of them.
       run: a run's OUT.
-      shortlist: chooses the photos of the run that a photo is matched with; default: the
-        `options.shortlist` most similar ones.
 
     Raises:
       UserError: no finished run with a model, its photos or weights are not at hand, or no usable
@@ -140,7 +175,7 @@ def localize(
     kept = read_run(run, images=options.images, reference=options.reference)
     if kept.model is None:
         raise UserError(f"{run}: this run has no model to localize photos in")
-    seed = kept.report["options"]["seed"]
+    seed = kept.report.options.seed
     model = known_model(kept.folder / "sparse" / "0", kept.config, seed=seed)
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, unusable = _queries(photos)
@@ -148,43 +183,49 @@ def localize(
     weights = run_weights(kept, options.network)
     names = [view.name for view in model.views]
     shortlists, unknown = {}, {image.name: image for image in usable.values()}
-    shortlist = shortlist or by_similarity(
-        kept, weights, options.shortlist, unknown, options.execution
-    )
+    shortlist = options.chosen_shortlist(kept, weights, unknown)
     for path, image in usable.items():
-        own = kept.photos.called(image.sha256)
+        own = kept.photos.name_of(image.sha256)
         try:
             shortlists[path] = shortlist(image, [name for name in names if name != own])
         except ImageError as error:
             unusable[path] = str(error)
     files = run_files(kept, sorted({name for some in shortlists.values() for name in some}))
-    rows = [{"photo": path, "status": UNUSABLE, "why": why} for path, why in unusable.items()]
+    rows: list[LocalizedPhoto | UnusablePhoto] = [
+        UnusablePhoto(photo=path, why=why) for path, why in unusable.items()
+    ]
     with _features(kept, weights, files, options) as load:
         todo = {path: usable[path] for path in shortlists}
         read = Photos([*files.values(), *todo.values()], model.config).gray
         each = tqdm(todo.items(), desc="localizing", unit="photo", disable=not options.progress)
         for path, image in each:
-            row: dict[str, Any] = {
-                "photo": path,
-                "in_run": kept.photos.called(image.sha256),
-                "shortlist": sorted(shortlists[path]),
-            }
             try:
                 matches = _matches(image, shortlists[path], load, weights, model, options)
                 found = locate_photo(image, cameras[path], model, shortlists[path], matches, read)
             except ImageError as error:
-                rows.append(row | {"status": UNUSABLE, "why": str(error)})
+                listed = sorted(shortlists[path])
+                rows.append(UnusablePhoto(photo=path, shortlist=listed, why=str(error)))
                 continue
-            row |= located_figures(found, cameras[path].source, matches)
+            error = None
             if found.view is not None and kept.reference is not None:
                 name, reference = Path(path).name, kept.reference.poses
-                row["error"] = error_against(name, found.view, model.views, reference)
-            rows.append(row)
-    return {
-        "version": importlib.metadata.version("jaxsfm"),
-        "model": str(run.absolute()),
-        "photos": sorted(rows, key=lambda row: row["photo"]),
-    }
+                error = error_against(name, found.view, model.views, reference)
+            rows.append(
+                localized_photo(
+                    path,
+                    found,
+                    matches,
+                    source=cameras[path].source,
+                    in_run=kept.photos.name_of(image.sha256),
+                    shortlist=shortlists[path],
+                    error=error,
+                )
+            )
+    return Localization(
+        version=importlib.metadata.version("jaxsfm"),
+        model=str(run.absolute()),
+        photos=sorted(rows, key=lambda row: row.photo),
+    )
 
 
 def _matches(
@@ -202,12 +243,10 @@ def _matches(
         return own if name == image.name else load(name)
 
     sizes = {view.name: view.size for view in model.views}
-    capacities = {name: feature_capacity(sizes[name]) for name in shortlist} | {
-        image.name: own.capacity
-    }
-    results = match_pairs(
+    rooms = {name: room_of(sizes[name]) for name in shortlist} | {image.name: own.room}
+    results = matched(
         either,
-        capacities,
+        rooms,
         [(image.name, name) for name in shortlist],
         config=model.config,
         seed=model.seed,

@@ -1,13 +1,11 @@
 """A whole run in its work folder: photos in, COLMAP model, database and report out."""
 
 import importlib.metadata
-import json
 import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -18,7 +16,6 @@ from jaxsfm.colmap.models import write_models
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair, PairCounts, PairResult, best_pairs
@@ -28,17 +25,31 @@ from jaxsfm.io.work_folder import WorkFolder, open_folder
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, nearest_pairs
 from jaxsfm.report.page.after_run import page_after_run
+from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
+from jaxsfm.report.run_report import RunReport, write_report
+from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs.compute_missing import extract_missing, match_missing
-from jaxsfm.runs.reconstruct_report import Done, run_report
+from jaxsfm.runs.report import StageResults, evaluated, run_report
 from jaxsfm.runs.run_options import RunOptions, check_options
-from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.reconstruction import Reconstructed, reconstruct
 from jaxsfm.sfm.stages import Kept
 
 logger = logging.getLogger("jaxsfm")
 
 
-def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) -> dict[str, Any]:
+def run_folder(
+    images: Path, out: Path, *, config: Config, options: RunOptions
+) -> dict[str, object]:
+    """Reconstruct a folder of photos; returns the content of `out`/report.json.
+
+    See `reconstruct_folder`, which returns the report as an object.
+    """
+    return reconstruct_folder(images, out, config=config, options=options).to_json()
+
+
+def reconstruct_folder(
+    images: Path, out: Path, *, config: Config, options: RunOptions
+) -> RunReport:
     """Reconstruct a folder of photos; returns the report, also written to `out`/report.json.
 
     Features, matches and finished stages are kept in `out` as they are made, each under what it
@@ -63,16 +74,16 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
     if plan.retrieval:
         check_retrieval(options.retrieval, weights)
     relocalizer = weights.chosen_relocalizer(config)
-    identity = {
-        "version": importlib.metadata.version("jaxsfm"),
-        "weights": weights.sha256,
-        "relocalizer": relocalizer and relocalizer.sha256,
-        "config": config.matching(),
-        "seed": options.seed,
-        "images": {image.name: image.sha256 for image in usable},
-    }
+    identity = RunIdentity(
+        version=importlib.metadata.version("jaxsfm"),
+        weights=weights.sha256,
+        relocalizer=relocalizer and relocalizer.sha256,
+        config=config.matching(),
+        seed=options.seed,
+        images={image.name: image.sha256 for image in usable},
+    )
     seconds: dict[str, float] = {}
-    with open_folder(out, identity) as folder:
+    with open_folder(out, identity.to_json()) as folder:
         skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
         if plan.retrieval:
             with _timed(seconds, "retrieval"):
@@ -104,29 +115,24 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
         with folder.publish() as fresh:
             made = _map(fresh, good, handed_on, intrinsics, kept, config, options, seconds)
             report = run_report(
-                Done(
+                StageResults(
                     folder=images,
                     identity=identity,
                     usable=good,
                     skipped=skipped,
                     results=results,
                     handed_on=handed_on,
-                    given=given,
-                    made=made,
-                    weights=weights.described(config),
+                    external=given,
+                    reconstructed=made,
+                    weights=from_json(UsedWeights, weights.described(config)),
                     seconds=seconds,
                 ),
                 config=config,
                 options=options,
             )
             if reference is not None and made.models:
-                try:
-                    found = evaluate(model_poses(made.models[0]), reference)
-                    report["evaluation"] = found.as_dict()
-                except UserError as error:  # the model is there; only its comparison is not
-                    report["evaluation_failed"] = str(error)
-            text = json.dumps(report, indent=1, default=str)
-            write_atomic(fresh / "report.json", text.encode())
+                report = evaluated(report, model_poses(made.models[0]), reference)
+            write_report(fresh, report)
         if not options.keep_features:
             folder.drop_features()
         # While the folder is ours: another run there would replace what the page shows.

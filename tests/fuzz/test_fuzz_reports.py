@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from foreign_model import NAMES, camera, exact_model, write_run
 from fuzz_children import run_cases
 from mutations import damaged_json, outcome
@@ -9,8 +10,9 @@ from mutations import damaged_json, outcome
 from jaxsfm.cli.export_commands import _recorded_photos
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.page.write import page
+from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.scene import shown_scene
-from jaxsfm.report.schema import REPORT, misfit
+from jaxsfm.report.typed_json import Misfit
 
 ERRORS = {"mean": 0.01, "median": 0.02, "max": 0.03}
 VERDICT = {"trusted": True, "strength": 0.5, "rotation_error_deg": 0.1, "reason": ""}
@@ -125,10 +127,17 @@ def test_a_damaged_report_is_shown_or_refused_by_name(tmp_path):
 
 
 def test_what_runs_report_is_what_their_readers_need(plain, tmp_path):
-    """The shape that is checked is that of real reports, and names the place of a misfit."""
+    """The types that are checked are those of real reports, and an error names the place."""
+
+    def place(value) -> str:
+        with pytest.raises(Misfit) as misfit:
+            RunReport.from_json(value)
+        return misfit.value.place
+
     real = plain[1]
-    assert misfit(real, REPORT) is None and misfit(whole(tmp_path), REPORT) is None
-    assert misfit([], REPORT) == "" and misfit({**real, "lost": None}, REPORT) == "lost"
+    assert RunReport.from_json(real).to_json() == real
+    RunReport.from_json(whole(tmp_path))
+    assert place([]) == "" and place({**real, "lost": None}) == "lost"
     real = json.loads(json.dumps(real))
     real["pairs"]["each"][1]["view_graph"]["strength"] = "0.5"
-    assert misfit(real, REPORT) == "pairs.each.1.view_graph.strength"
+    assert place(real) == "pairs.each.1.view_graph.strength"

@@ -14,6 +14,7 @@ from kept_runs import HOSTILE, change_report, renamed
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.core.grid import FINE_STRIDE
+from jaxsfm.core.types import Status
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.page import write
 from jaxsfm.report.page.close_ups import close_ups
@@ -22,8 +23,10 @@ from jaxsfm.report.page.matrices import _reduced, pair_matrices
 from jaxsfm.report.page.pair_states import NOT_TRUSTED, STATES, USED, state
 from jaxsfm.report.page.view_graph import BEST_OF_EACH, chosen_edges
 from jaxsfm.report.page.write import page
+from jaxsfm.report.run_results import LostPhoto, PairRow
 from jaxsfm.report.scene import shown_scene
 from jaxsfm.sfm.evaluation import Similarity
+from jaxsfm.sfm.view_graph import Verdict
 
 SECTIONS = ("the-model", "photos", "pairs", "matches", "keypoints", "run", "next")
 FIGURES = ("model", "reprojection", "tracks", "view-graph", "inliers", "states")
@@ -42,18 +45,23 @@ def text(plain) -> str:
     return (plain[0] / "report.html").read_text()
 
 
-def row(a: str, b: str, inliers=100, verified=80, strength=0.5, trusted=True) -> dict:
-    verdict = {"trusted": trusted, "strength": strength, "rotation_error_deg": 1.0}
-    return {
-        "pair": [a, b],
-        "status": "verified",
-        "tentative": 2 * inliers,
-        "inliers": inliers,
-        "planes": 3,
-        "handed_on": inliers > 0,
-        "colmap_inliers": verified,
-        "view_graph": {**verdict, "reason": "" if trusted else "it is off"} if verified else None,
-    }
+def row(a: str, b: str, inliers=100, verified=80, strength=0.5, trusted=True) -> PairRow:
+    verdict = Verdict(
+        trusted=trusted,
+        strength=strength,
+        rotation_error_deg=1.0,
+        reason="" if trusted else "it is off",
+    )
+    return PairRow(
+        pair=(a, b),
+        status=Status.VERIFIED,
+        tentative=2 * inliers,
+        inliers=inliers,
+        planes=3,
+        handed_on=inliers > 0,
+        colmap_inliers=verified,
+        view_graph=verdict if verified else None,
+    )
 
 
 # -- what is in it ------------------------------------------------------------------------------
@@ -101,12 +109,13 @@ def test_shown_cameras_differ_from_the_reference_by_the_evaluated_errors(plain, 
     run = read_run(plain[0], reference=scene / "reference")
     shown = shown_scene(run)
     truth = {camera.name: camera for camera in shown.reference}
-    errors = run.report["evaluation"]["images"]
+    assert run.report.evaluation is not None
+    errors = run.report.evaluation.images
     assert len(shown.cameras) == len(truth) == 3
     for camera in shown.cameras:
         other = truth[camera.name]
         off = np.linalg.norm(camera.pose.centre - other.pose.centre)
-        assert off == pytest.approx(errors[camera.name]["position"], abs=1e-9)
+        assert off == pytest.approx(errors[camera.name].position, abs=1e-9)
         # Both look at the same things: frusta point the same way.
         ahead = [c.corners.mean(0) / np.linalg.norm(c.corners.mean(0)) for c in (camera, other)]
         assert ahead[0] @ ahead[1] > 0.99 and camera.corners.mean(0) @ camera.pose.rotation[2] > 0
@@ -144,7 +153,7 @@ def test_names_from_files_are_only_ever_text(plain, scene, tmp_path):
         json.loads(source)
 
 
-def many(n: int, lost: int) -> list[dict]:
+def many(n: int, lost: int) -> list[PairRow]:
     names = [f"s/{k:04d}.jpg" for k in range(n - lost)]
     near = lambda a, b: 3000 // (b - a) if b - a < 40 else 30  # noqa: E731
     return [
@@ -159,15 +168,16 @@ def test_a_large_run_has_a_small_page_that_says_what_is_left_out(plain):
     rows = many(n, lost)
     run = read_run(plain[0])
     missing = [
-        {"image": f"s/{k:04d}.jpg", "stage": "pairs", "detail": f"gone {k}"}
+        LostPhoto(image=f"s/{k:04d}.jpg", stage="pairs", detail=f"gone {k}")
         for k in range(n - lost, n)
     ]
-    report = {
-        **run.report,
-        "pairs": {**run.report["pairs"], "each": rows},
-        "models": [{**run.report["models"][0], "images": [f"s/{k:04d}.jpg" for k in range(330)]}],
-        "lost": missing,
-    }
+    names = [f"s/{k:04d}.jpg" for k in range(330)]
+    report = dataclasses.replace(
+        run.report,
+        pairs=dataclasses.replace(run.report.pairs, each=rows),
+        models=[dataclasses.replace(run.report.models[0], images=names)],
+        lost=missing,
+    )
     text = page(dataclasses.replace(run, report=report))
     small = len((plain[0] / "report.html").read_text())
     assert len(text) < small + 1_000_000
@@ -318,12 +328,12 @@ def test_states_follow_a_pair_through_the_pipeline():
         row("a", "b"),
         row("a", "b", trusted=False),
         row("a", "b", verified=0),
-        {**row("a", "b"), "handed_on": False},
+        dataclasses.replace(row("a", "b"), handed_on=False),
         row("a", "b", inliers=0, verified=0),
     ]
     names = [STATES[state(r)].name for r in rows]
     assert names == ["used", "not trusted", "not verified", "not chosen", "no plane"]
-    assert STATES[state({**row("a", "b"), "view_graph": None})].name == "used"
+    assert STATES[state(dataclasses.replace(row("a", "b"), view_graph=None))].name == "used"
 
 
 def test_matrices_are_symmetrical_and_reduced_to_the_best():
@@ -346,9 +356,9 @@ def test_a_cut_graph_keeps_the_best_of_every_photo():
     edges = chosen_edges(rows, 100, 80)
     assert len(edges) == 100
     for name in names:
-        assert sum(name in r["pair"] for r in edges) >= BEST_OF_EACH
+        assert sum(name in r.pair for r in edges) >= BEST_OF_EACH
     assert chosen_edges(rows[:50], 100, 80) == sorted(
-        rows[:50], key=lambda r: -r["view_graph"]["strength"]
+        rows[:50], key=lambda r: -(r.view_graph.strength if r.view_graph else 0)
     )
 
 

@@ -1,26 +1,44 @@
-"""A run's last lines."""
+"""The summary of a run."""
 
 import pytest
 
 from jaxsfm.io.images import ImageError, inspect_image
+from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.summary import summary_lines
 
-MODEL = {"registered": 2, "points": 321, "track_length": 2.5, "reprojection_error_px": 0.71}
+MODEL = {
+    "registered": 2,
+    "points": 321,
+    "track_length": 2.5,
+    "reprojection_error_px": 0.71,
+    "images": ["a", "b"],
+}
+PAIRS = {"tried": 3, "verified": 2, "handed_on": 1, "trusted": 1, "overflowed": 0, "each": []}
+OPTIONS = {
+    "config": {"max_size": 1600, "enlarge": 1.0},
+    "pairs": "exhaustive",
+    "intrinsics": None,
+    "seed": 0,
+    "threads": -1,
+}
 
 
-def report(**changes) -> dict:
-    return {
+def report(**changes) -> RunReport:
+    plain = {
+        "version": "0",
+        "identity": {"version": "0", "config": {}, "images": {}},
+        "weights": {},
+        "options": OPTIONS,
         "images": {"found": 4, "usable": 3, "skipped": {}},
-        "pairs": {"tried": 3, "verified": 2, "handed_on": 1, "trusted": 1, "overflowed": 0},
+        "pairs": PAIRS,
         "models": [MODEL],
         "mapping": [{"mapper": "incremental", "initial_pair": None, "registered": [2]}],
         "refinement": [],
         "seconds": {"extraction": 1.25, "mapping": 2.0},
-        "view_graph": {"components": [{"images": ["a", "b", "c"]}]},
         "lost": [],
         "no_model": None,
-        **changes,
     }
+    return RunReport.from_json(plain | changes)
 
 
 def test_a_summary_has_the_counts_of_every_stage():
@@ -33,9 +51,26 @@ def test_a_summary_has_the_counts_of_every_stage():
 
 
 def test_second_tries_and_refinement_are_said():
-    figures = {"accepted": True, "kept": 5, "dropped": 3, "added": 4, "weak_views": ["night"]}
-    attempts = [{"registered": []}, {"registered": [2, 1]}]
-    night = {"name": "night", "registered": True, "agreed": 7, "octave_px": None, "error_px": None}
+    figures = {
+        "accepted": True,
+        "candidates": 9,
+        "kept": 5,
+        "dropped": 3,
+        "added": 4,
+        "weak_views": ["night"],
+        "points": 321,
+        "reprojection_error_px": 0.71,
+    }
+    start = {"mapper": "incremental", "initial_pair": ["a", "b"]}
+    attempts = [start | {"registered": []}, start | {"registered": [2, 1]}]
+    night = {
+        "name": "night",
+        "registered": True,
+        "candidates": 900,
+        "agreed": 7,
+        "octave_px": None,
+        "error_px": None,
+    }
     dusk = night | {"name": "dusk", "agreed": 321, "octave_px": 4, "error_px": 1.26}
     late = dusk | {"name": "late", "registered": False}
     never = night | {"name": "never", "registered": False}
@@ -47,13 +82,18 @@ def test_second_tries_and_refinement_are_said():
     assert "started 2 times, images registered: 0, 2" in text
     assert "5 observations agreed, 3 dropped, 4 added in the last of 2 passes" in text
     assert "not refined      night" in text and "taken back" not in text
-    assert "placed           dusk: 321 points agree at 1/4 size, 1.3 px" in text
+    assert (
+        "placed           dusk: 321 points agree at 1/4 size, with a median error of 1.3 px" in text
+    )
     assert "placed           dusk: 321 points agree at full size" in text
-    assert "late: 321 points agree at 1/4 size, 1.3 px; the mapper had left it out" in text
+    assert (
+        "late: 321 points agree at 1/4 size, with a median error of 1.3 px; the mapper had left"
+        in text
+    )
     assert "never" not in text and text.count("left it out") == 1
     back = {"passes": [figures | {"accepted": False}], "placed": []}
     text = "\n".join(summary_lines(report(refinement=[back])))
-    assert "too few, taken back" in text
+    assert "too few agreed, so this pass was taken back" in text
 
 
 def test_a_failed_evaluation_is_said():
@@ -62,7 +102,7 @@ def test_a_failed_evaluation_is_said():
 
 
 def test_overflow_and_evaluation_are_said():
-    pairs = {"tried": 3, "verified": 2, "handed_on": 1, "trusted": 1, "overflowed": 2}
+    pairs = PAIRS | {"overflowed": 2}
     errors = {"mean": 0.01, "median": 0.02, "max": 0.03}
     evaluation = {
         "registered": 2,
@@ -71,9 +111,10 @@ def test_overflow_and_evaluation_are_said():
         "position": errors,
         "rotation_deg": errors,
         "within_10deg": {"0.5": 2 / 3},
+        "images": {},
     }
     text = "\n".join(summary_lines(report(pairs=pairs, evaluation=evaluation)))
-    assert "2 pairs had more matches than kept" in text
+    assert "2 pairs had more matches than could be kept" in text
     assert "2 of 3 images, aligned on 2" in text and "0.5: 67 %" in text
     assert text.count("mean 0.0100  median 0.0200  max 0.0300") == 2
 

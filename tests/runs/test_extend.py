@@ -17,7 +17,7 @@ from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.poses import model_poses, read_model, read_poses
 from jaxsfm.io.work_folder import RESULTS, lock_folder
 from jaxsfm.report.finished_run import read_run
-from jaxsfm.report.schema import read_report
+from jaxsfm.report.run_report import read_report
 from jaxsfm.runs import extend as extend_module
 from jaxsfm.sfm.evaluation import umeyama
 
@@ -159,7 +159,7 @@ def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_
     assert main(["extend", str(run)]) == 1
     text = capsys.readouterr().out
     assert all(f"skipped    {name}" in text for name in bad) and "0 of 0 new photos" in text
-    report = read_report(run)
+    report = read_report(run).to_json()
     assert set(report["images"]["skipped"]) == set(bad) and "evaluation" in report
     assert report["images"]["found"] == 5 and report["images"]["usable"] == 3
     assert main(["extend", str(run)]) == 0 and "no new photos" in capsys.readouterr().out
@@ -168,7 +168,7 @@ def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_
     shutil.rmtree(tmp_path / "reference")
     focal = f"PINHOLE:{SIZE[0] + 0.5},{SIZE[0] + 0.5},{SIZE[0] / 2},{SIZE[1] / 2}"
     assert main(["extend", str(run), "--intrinsics", focal]) == 0
-    report, model = read_report(run), read_model(run / "sparse" / "0")
+    report, model = read_report(run).to_json(), read_model(run / "sparse" / "0")
     assert report["images"]["skipped"] == {} and report["extended"][-1]["added"] == sorted(bad)
     assert report["images"]["found"] == report["images"]["usable"] == 5
     for image in model.images.values():

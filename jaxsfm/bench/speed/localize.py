@@ -30,10 +30,11 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.versions import versions
-from jaxsfm.report.finished_run import KeptRun, read_run
+from jaxsfm.report.finished_run import FinishedRun, read_run
+from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.finished_model import choose_camera, known_model
 from jaxsfm.runs.localize import locate_photo
-from jaxsfm.runs.localize_report import error_against, located_figures
+from jaxsfm.runs.localize_report import error_against, localized_photo
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.view_graph import trusted_pairs
 
@@ -41,18 +42,17 @@ LIMITS = (0.3, 1.0)
 """Units of the reference, degrees."""
 
 
-def verified(run: KeptRun, files: dict[str, ImageFile], scratch: Path) -> Path:
+def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Path:
     """A database of all the run's pairs, verified: each by itself, whatever the others."""
     database = scratch / "verified.db"
     if database.exists():
         return database
     assert run.model is not None
     known = None
-    if run.report["options"]["intrinsics"] is not None:  # its file may be gone
+    if run.report.options.intrinsics is not None:  # its file may be gone
         camera = run.model.views[0].camera
         known = Intrinsics(model=camera.model_name, params=tuple(camera.params))
-    rows = run.report["pairs"]["each"]
-    pairs = [tuple(row["pair"]) for row in rows if row["handed_on"]]
+    pairs = [row.pair for row in run.report.pairs.each if row.handed_on]
     partial, options = scratch / "partial.db", map_options(run, files)
     colmap.write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
     colmap.verify(
@@ -65,21 +65,22 @@ def verified(run: KeptRun, files: dict[str, ImageFile], scratch: Path) -> Path:
     return partial.rename(database)
 
 
-def map_options(run: KeptRun, files: dict[str, ImageFile]) -> MapOptions:
+def map_options(run: FinishedRun, files: dict[str, ImageFile]) -> MapOptions:
     """The run's."""
-    options = run.report["options"]
-    refines = options["refine_intrinsics"]
+    options = run.report.options
+    refines, mapper = options.others["refine_intrinsics"], options.others["mapper"]
+    assert mapper == "incremental" or mapper == "global"  # noqa: PLR1714
     return MapOptions(
-        mapper=options["mapper"],
-        refine_intrinsics=options["intrinsics"] is None if refines == "auto" else refines == "yes",
-        seed=options["seed"],
-        threads=options["threads"],
+        mapper=mapper,
+        refine_intrinsics=options.intrinsics is None if refines == "auto" else refines == "yes",
+        seed=options.seed,
+        threads=options.threads,
         scale=Photos(files.values(), run.config).median_scale(),
     )
 
 
 def without(
-    run: KeptRun, name: str, files: dict[str, ImageFile], scratch: Path, refined: bool
+    run: FinishedRun, name: str, files: dict[str, ImageFile], scratch: Path, refined: bool
 ) -> None:
     """The model without an image, in `scratch`/NAME/sparse, from its pairs' verification on."""
     folder, options = scratch / name, map_options(run, files)
@@ -106,24 +107,37 @@ def without(
     database.unlink()
 
 
-def localized(run: KeptRun, name: str, files: dict[str, ImageFile], folder: Path) -> dict[str, Any]:
+def localized(
+    run: FinishedRun, name: str, files: dict[str, ImageFile], folder: Path
+) -> dict[str, Any]:
     """The image's row."""
-    seed = run.report["options"]["seed"]
+    seed = run.report.options.seed
     model, image = known_model(folder / "sparse" / "0", run.config, seed=seed), files[name]
     chosen = choose_camera(image, model.views, None)
     names = [view.name for view in model.views]
-    pairs = [tuple(row["pair"]) for row in run.report["pairs"]["each"] if name in row["pair"]]
+    pairs = [row.pair for row in run.report.pairs.each if name in row.pair]
     pairs = [pair for pair in pairs if set(pair) - {name} <= set(names)]
     matches = SavedMatches(run.matches, pairs)
     start = time.monotonic()
     found = locate_photo(
         image, chosen, model, names, matches, Photos(files.values(), run.config).gray
     )
-    row = located_figures(found, chosen.source, matches)
-    row |= {"photo": name, "seconds": time.monotonic() - start, "registered": len(names)}
+    seconds, error = time.monotonic() - start, None
     if found.view is not None and run.reference is not None:
-        row["error"] = error_against(name, found.view, model.views, run.reference.poses)
-    return row
+        error = error_against(name, found.view, model.views, run.reference.poses)
+    row = to_json(
+        localized_photo(
+            name,
+            found,
+            matches,
+            source=chosen.source,
+            in_run=name,
+            shortlist=names,
+            error=error,
+        )
+    )
+    assert isinstance(row, dict)
+    return row | {"seconds": seconds, "registered": len(names)}
 
 
 def line(row: dict[str, Any]) -> str:
@@ -172,7 +186,7 @@ def main() -> int:
         assert found is not None, f"{view.name} is gone"
         files[view.name] = found
     key = {
-        "run": digest(run.report["identity"], run.report["options"]),
+        "run": digest(run.report.identity.to_json(), to_json(run.report.options)),
         "reference": str(args.reference.absolute()),
         "version": versions(),
         "unrefined": args.unrefined,

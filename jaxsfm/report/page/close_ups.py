@@ -10,7 +10,7 @@ import numpy as np
 from jaxsfm.core.grid import FINE_STRIDE, rescale
 from jaxsfm.io.images import WorkingImage
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
-from jaxsfm.report.finished_run import KeptRun, Model
+from jaxsfm.report.finished_run import FinishedModel, FinishedRun
 from jaxsfm.report.page.embedded import data_uri
 
 TRACKS, PHOTOS = 5, 6
@@ -45,7 +45,7 @@ class ShownTrack(NamedTuple):
     patches: list[Patch]
 
 
-def _candidates(model: Model) -> list[int]:
+def _candidates(model: FinishedModel) -> list[int]:
     """Points that many photos see, from all over the model."""
     lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
     least = min(LEAST, int(lengths.max(initial=0)))
@@ -122,7 +122,7 @@ def _patch(
 
 
 def _track(
-    run: KeptRun, model: Model, load: Callable[[Pair], PairResult | None], point: int
+    run: FinishedRun, model: FinishedModel, load: Callable[[Pair], PairResult | None], point: int
 ) -> ShownTrack | None:
     rows = np.flatnonzero(model.tracks.point == point)
     names = [model.views[model.tracks.view[row]].name for row in rows]
@@ -142,7 +142,7 @@ def _track(
     return ShownTrack(len(rows), float(np.mean(model.errors[rows])), patches)
 
 
-def close_ups(run: KeptRun) -> list[ShownTrack]:
+def close_ups(run: FinishedRun) -> list[ShownTrack]:
     """A few tracks; none without a model, photos or matches."""
     if run.model is None:
         return []

@@ -1,22 +1,20 @@
 """How exact the model is: by itself, and beside a reference."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 import plotly.graph_objects as go
 
-from jaxsfm.report.finished_run import Model
+from jaxsfm.report.finished_run import FinishedModel
 from jaxsfm.report.page.figures import BLUE, GREEN, Figure, figure
+from jaxsfm.report.run_results import EvaluationReport
 
 LONGEST_TRACK = 15
 
 
-def _axis(title: str, **more: Any) -> dict[str, Any]:
+def _axis(title: str, **more: object) -> dict[str, object]:
     return {"title": {"text": title}, "automargin": True, **more}
 
 
-def reprojection_figure(model: Model) -> Figure:
+def reprojection_figure(model: FinishedModel) -> Figure:
     """Histogram of every observation's reprojection error."""
     errors = model.errors[np.isfinite(model.errors)]
     top = float(max(np.percentile(errors, 99), 0.1)) if len(errors) else 1.0
@@ -39,7 +37,7 @@ def reprojection_figure(model: Model) -> Figure:
     )
 
 
-def track_figure(model: Model) -> Figure:
+def track_figure(model: FinishedModel) -> Figure:
     """How many photos see a point."""
     lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
     counts = np.bincount(np.minimum(lengths, LONGEST_TRACK), minlength=3)[2:]
@@ -68,23 +66,26 @@ def track_figure(model: Model) -> Figure:
     )
 
 
-def cumulative_figures(evaluation: Mapping[str, Any]) -> list[Figure]:
+def cumulative_figures(evaluation: EvaluationReport) -> list[Figure]:
     """Share of the reference's photos within an error, for positions and rotations."""
-    total = evaluation["reference_images"]
+    total = evaluation.reference_images
     figures = []
-    for id, field, title, unit, colour in (
-        ("positions", "position", "Position errors", "units of the reference", BLUE),
-        ("rotations", "rotation_deg", "Rotation errors", "degrees", GREEN),
+    images = evaluation.images.values()
+    positions, rotations = [e.position for e in images], [e.rotation_deg for e in images]
+    for id, what, values, unit, colour in (
+        ("positions", "position", positions, "units of the reference", BLUE),
+        ("rotations", "rotation", rotations, "degrees", GREEN),
     ):
-        errors = np.sort([image[field] for image in evaluation["images"].values()])
+        errors = np.sort(values)
         share = 100 * np.arange(1, len(errors) + 1) / total
         figures.append(
             figure(
                 id,
-                title,
-                f"Share of the reference's {total} photos whose {field.split('_')[0]} is off by no "
-                "more than the value on the axis: a good curve rises early and ends at 100 %.",
-                alt=f"Cumulative curve of {len(errors)} {field.split('_')[0]} errors",
+                f"{what.title()} errors",
+                f"The curve shows the share of the reference's {total} photos whose {what} is off "
+                "by no more than the value on the axis. A good curve rises early and ends at "
+                "100 %.",
+                alt=f"Cumulative curve of {len(errors)} {what} errors",
                 data=[
                     go.Scatter(
                         x=np.r_[0, errors].astype(np.float32),

@@ -1,10 +1,12 @@
 """What all figures of the page share."""
 
 import html
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import plotly.graph_objects as go
+from plotly.basedatatypes import BaseTraceType
 
 from jaxsfm.io.images import shown_name
 
@@ -55,8 +57,8 @@ def figure(
     caption: str,
     *,
     alt: str,
-    data: list[Any],
-    layout: dict[str, Any],
+    data: Sequence[BaseTraceType],
+    layout: dict[str, object],
     tall: bool = False,
 ) -> Figure:
     """A figure; colours of ground, text and grid come from the page."""
@@ -66,7 +68,7 @@ def figure(
         "legend": {"orientation": "h", "yanchor": "bottom", "y": 1.01, "x": 0},
         "hoverlabel": {"namelength": -1},
     }
-    made = go.Figure(data=data, layout={**base, **layout})
+    made = go.Figure(data=list(data), layout={**base, **layout})
     spec = made.to_json()
     assert spec is not None
     return Figure(id, title, caption, alt, spec, tall)

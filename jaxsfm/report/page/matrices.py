@@ -1,13 +1,13 @@
 """Every pair in two squares: how many matches, and what became of it."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 
 from jaxsfm.report.page.figures import Figure, count, figure, short, text
 from jaxsfm.report.page.pair_states import NOT_TRIED, STATES, state
+from jaxsfm.report.run_results import PairRow
 
 MAX_SQUARES = 200
 """Squares per side; photos beyond it share squares."""
@@ -22,19 +22,19 @@ def _reduced(matrix: np.ndarray, block: int) -> np.ndarray:
     return wide.reshape(n, block, n, block).max((1, 3))
 
 
-def pair_matrices(names: Sequence[str], rows: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+def pair_matrices(names: Sequence[str], rows: Sequence[PairRow]) -> tuple[np.ndarray, np.ndarray]:
     """int32 (n, n): inliers (COLMAP's where it verified) and index into STATES; symmetrical."""
     index = {name: k for k, name in enumerate(names)}
     inliers = np.zeros((len(names), len(names)), np.int32)
     states = np.zeros_like(inliers)
     for row in rows:
-        a, b = (index[name] for name in row["pair"])
-        inliers[a, b] = inliers[b, a] = row["colmap_inliers"] or row["inliers"]
+        a, b = (index[name] for name in row.pair)
+        inliers[a, b] = inliers[b, a] = row.colmap_inliers or row.inliers
         states[a, b] = states[b, a] = state(row)
     return inliers, states
 
 
-def matrix_figures(names: list[str], rows: Sequence[Any]) -> list[Figure]:
+def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> list[Figure]:
     """Matches and states of all pairs as heat maps.
 
     Args:
@@ -122,12 +122,12 @@ def matrix_figures(names: list[str], rows: Sequence[Any]) -> list[Figure]:
     ]
 
 
-def _counts_bar(most: int) -> dict[str, Any]:
+def _counts_bar(most: int) -> dict[str, object]:
     ticks = [k * 10**p for p in range(7) for k in (1, 2, 5) if k * 10**p <= most]
     return _bar(np.log10(ticks).tolist(), [count(k) for k in ticks])
 
 
-def _bar(at: Sequence[float], labels: list[str]) -> dict[str, Any]:
+def _bar(at: Sequence[float], labels: list[str]) -> dict[str, object]:
     """The colours' key, above the squares: narrow screens have no room beside them."""
     return {
         "orientation": "h",

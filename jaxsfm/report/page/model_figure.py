@@ -1,9 +1,8 @@
 """The 3-D model to turn with the mouse."""
 
-from typing import Any
-
 import numpy as np
 import plotly.graph_objects as go
+from plotly.basedatatypes import BaseTraceType
 
 from jaxsfm.report.page.figures import BLUE, ORANGE, Figure, figure, text
 from jaxsfm.report.scene import Scene, ShownCamera
@@ -15,7 +14,9 @@ def _hex(colours: np.ndarray) -> list[str]:
     return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours.tolist()]
 
 
-def _cameras(cameras: list[ShownCamera], depth: float, name: str, colour: str) -> list[Any]:
+def _cameras(
+    cameras: list[ShownCamera], depth: float, name: str, colour: str
+) -> list[BaseTraceType]:
     """Frusta as one line with gaps, and the centres to point at."""
     gap = np.full((1, 3), np.nan)
     lines = np.concatenate([p for c in cameras for p in (c.frustum(depth), gap)])
@@ -47,7 +48,7 @@ def _cameras(cameras: list[ShownCamera], depth: float, name: str, colour: str) -
     ]
 
 
-def _start(scene: Scene) -> dict[str, Any]:
+def _start(scene: Scene) -> dict[str, object]:
     """Where to look from first, in plotly's units."""
     eye = 1.55 * scene.behind()
     return {
@@ -65,7 +66,7 @@ def model_figure(scene: Scene, unit: str) -> Figure:
     n = len(scene.points)
     some = np.sort(np.random.default_rng(0).permutation(n)[:MAX_POINTS])
     points = scene.points[some].astype(np.float32)
-    data = [
+    data: list[BaseTraceType] = [
         go.Scatter3d(
             x=points[:, 0],
             y=points[:, 1],

@@ -1,14 +1,16 @@
 """The best and the most doubtful pairs, with their matches."""
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.report.finished_run import KeptRun, Photos
+from jaxsfm.io.pairs import PairResult
+from jaxsfm.report.finished_run import FinishedRun, RecordedPhotos
 from jaxsfm.report.page.embedded import Embedded, embed
-from jaxsfm.report.page.pair_states import NOT_TRUSTED, NOT_VERIFIED, USED, state
+from jaxsfm.report.page.pair_states import USED, refused_pairs, state
 from jaxsfm.report.plot import COLOURS, MAX_LINES
+from jaxsfm.report.run_results import PairRow
 
 OF_A_KIND = 3
 """Pairs shown of the best, the weakest and the refused."""
@@ -42,31 +44,29 @@ class PairPicture(NamedTuple):
     matches: int
 
 
-def _chosen(rows: Sequence[Any]) -> list[tuple[str, Any]]:
+def _chosen(rows: list[PairRow]) -> list[tuple[str, PairRow]]:
     """Headings and rows of report.json, best first."""
     used = [row for row in rows if state(row) == USED]
-    used.sort(key=lambda row: (-row["colmap_inliers"], row["pair"]))
+    used.sort(key=lambda row: (-row.colmap_inliers, row.pair))
     best, weakest = used[:OF_A_KIND], used[OF_A_KIND:][-OF_A_KIND:]
-    refused = [row for row in rows if state(row) in (NOT_TRUSTED, NOT_VERIFIED)]
-    refused.sort(key=lambda row: (-row["colmap_inliers"], -row["inliers"], row["pair"]))
     return [
         *(("Among the best pairs", row) for row in best),
         *(("Among the weakest pairs that were used", row) for row in weakest),
-        *(("Refused", row) for row in refused[:OF_A_KIND]),
+        *(("Refused", row) for row in refused_pairs(rows)[:OF_A_KIND]),
     ]
 
 
-def _note(row: Any) -> str:
-    verdict = row["view_graph"]
+def _note(row: PairRow) -> str:
+    verdict = row.view_graph
     parts = [
-        f"{row['inliers']} matches on {row['planes']} planes, "
-        f"{row['colmap_inliers']} of them verified by COLMAP"
+        f"{row.inliers} matches on {row.planes} planes, "
+        f"{row.colmap_inliers} of them verified by COLMAP"
     ]
     if verdict:
-        parts.append(f"strength {verdict['strength']:.2f} of 1")
-        if verdict["reason"]:
-            parts.append(f"refused because {verdict['reason']}")
-    elif not row["colmap_inliers"]:
+        parts.append(f"strength {verdict.strength:.2f} of 1")
+        if verdict.reason:
+            parts.append(f"refused because {verdict.reason}")
+    elif not row.colmap_inliers:
         parts.append("no common geometry found")
     return "; ".join(parts)
 
@@ -75,7 +75,7 @@ def _some(index: np.ndarray, limit: int) -> np.ndarray:
     return index[:: max(1, -(-len(index) // limit))]
 
 
-def _planes(result: Any, xy0: np.ndarray, xy1: np.ndarray) -> list[Plane]:
+def _planes(result: PairResult, xy0: np.ndarray, xy1: np.ndarray) -> list[Plane]:
     planes = []
     for k in range(len(result.homographies)):
         member = np.flatnonzero(result.plane == k)
@@ -89,8 +89,10 @@ def _planes(result: Any, xy0: np.ndarray, xy1: np.ndarray) -> list[Plane]:
     return planes
 
 
-def _picture(run: KeptRun, heading: str, row: Any, seen: dict[str, Embedded]) -> PairPicture | None:
-    a, b = row["pair"]
+def _picture(
+    run: FinishedRun, heading: str, row: PairRow, seen: dict[str, Embedded]
+) -> PairPicture | None:
+    a, b = row.pair
     result = run.load_matches((a, b))
     if result is None:
         return None
@@ -118,18 +120,16 @@ def _picture(run: KeptRun, heading: str, row: Any, seen: dict[str, Embedded]) ->
     )
 
 
-def _photo(photos: Photos, name: str, number: int) -> Embedded | None:
+def _photo(photos: RecordedPhotos, name: str, number: int) -> Embedded | None:
     image = photos.read(name)
     return image and embed(image, id=f"photo{number}", side=SIDE)
 
 
-def pair_pictures(run: KeptRun) -> tuple[list[PairPicture], Iterable[Embedded]]:
+def pair_pictures(run: FinishedRun) -> tuple[list[PairPicture], Iterable[Embedded]]:
     """Pictures of a few pairs, and the photos they use, each once.
 
     Pairs whose photos or matches are gone have none.
     """
     seen: dict[str, Embedded] = {}
-    made = [
-        _picture(run, heading, row, seen) for heading, row in _chosen(run.report["pairs"]["each"])
-    ]
+    made = [_picture(run, heading, row, seen) for heading, row in _chosen(run.report.pairs.each)]
     return [picture for picture in made if picture is not None], list(seen.values())

@@ -1,13 +1,13 @@
 """The view graph: photos on a circle, pairs as lines."""
 
 from collections.abc import Collection, Sequence
-from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 
 from jaxsfm.report.page.figures import BLUE, ORANGE, Figure, figure, short, text
 from jaxsfm.report.page.pair_states import LOST, NOT_TRUSTED, REGISTERED, USED, state, strength
+from jaxsfm.report.run_results import PairRow
 
 MAX_USED, MAX_NOT_TRUSTED = 1200, 300
 """Lines drawn of either kind, the strongest first."""
@@ -18,22 +18,22 @@ BINS = ((0.0, 0.1, 0.8, 0.5), (0.1, 0.4, 1.3, 0.65), (0.4, np.inf, 2.4, 0.9))
 """Of the strength: from, to, line width in pixels, opacity."""
 
 
-def chosen_edges(rows: Sequence[Any], limit: int, most: int) -> list[Any]:
+def chosen_edges(rows: Sequence[PairRow], limit: int, most: int) -> list[PairRow]:
     """At most `limit` rows, strongest first, but every photo's best before anyone's tenth."""
-    ranked = sorted(rows, key=lambda row: (-strength(row, most), row["pair"]))
+    ranked = sorted(rows, key=lambda row: (-strength(row, most), row.pair))
     if len(ranked) <= limit:
         return ranked
     degree: dict[str, int] = {}
     first, rest = [], []
     for row in ranked:
-        wanted = any(degree.get(name, 0) < BEST_OF_EACH for name in row["pair"])
+        wanted = any(degree.get(name, 0) < BEST_OF_EACH for name in row.pair)
         (first if wanted else rest).append(row)
-        for name in row["pair"]:
+        for name in row.pair:
             degree[name] = degree.get(name, 0) + wanted
     return (first + rest)[:limit]
 
 
-def view_graph(names: list[str], rows: Sequence[Any], registered: Collection[str]) -> Figure:
+def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection[str]) -> Figure:
     """Photos as dots, in order of name around a circle; verified pairs as lines.
 
     Args:
@@ -42,7 +42,7 @@ def view_graph(names: list[str], rows: Sequence[Any], registered: Collection[str
       registered: images with a pose in the best model.
     """
     by_state = {k: [row for row in rows if state(row) == k] for k in (USED, NOT_TRUSTED)}
-    most = max((row["colmap_inliers"] for row in rows), default=1)
+    most = max((row.colmap_inliers for row in rows), default=1)
     used = chosen_edges(by_state[USED], MAX_USED, most)
     odd = chosen_edges(by_state[NOT_TRUSTED], MAX_NOT_TRUSTED, most)
     left_out = sum(map(len, by_state.values())) - len(used) - len(odd)
@@ -50,9 +50,9 @@ def view_graph(names: list[str], rows: Sequence[Any], registered: Collection[str
     xy = np.stack([np.sin(angle), np.cos(angle)], axis=1)
     at = dict(zip(names, xy, strict=True))
 
-    def lines(some: list[Any], name: str, colour: str, width: float, opacity: float):
+    def lines(some: list[PairRow], name: str, colour: str, width: float, opacity: float):
         gap = np.full(2, np.nan)
-        path = [p for row in some for p in (at[row["pair"][0]], at[row["pair"][1]], gap)]
+        path = [p for row in some for p in (at[row.pair[0]], at[row.pair[1]], gap)]
         points = np.asarray(path, np.float32).reshape(-1, 2)
         return go.Scatter(
             x=points[:, 0],
@@ -72,7 +72,7 @@ def view_graph(names: list[str], rows: Sequence[Any], registered: Collection[str
     labels = [text(name) for name in short(names)]
     partners = dict.fromkeys(names, 0)
     for row in by_state[USED]:
-        for name in row["pair"]:
+        for name in row.pair:
             partners[name] += 1
     for colour, what, wanted in ((REGISTERED, "in the model", True), (LOST, "lost", False)):
         own = [k for k, name in enumerate(names) if (name in registered) == wanted]

@@ -1,0 +1,104 @@
+"""The part of a run's report that says what the run was made with."""
+
+import dataclasses
+from dataclasses import field
+from typing import Annotated
+
+from jaxsfm.report.typed_json import OTHERS, Count, Range, to_json
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunIdentity:
+    """What the matches of a run depend on (`jaxsfm.io.store.Identity`)."""
+
+    version: str
+    """The version of jaxsfm."""
+    weights: str | None = None
+    """SHA-256 of the network's weights."""
+    relocalizer: str | None = None
+    """SHA-256 of the learned relocalizer; None if the run used none."""
+    config: dict[str, object]
+    """The part of the config that matches depend on (`Config.matching`)."""
+    seed: Count = 0
+    images: dict[str, str]
+    """The SHA-256 of every usable photo, by name."""
+
+    def to_json(self) -> dict[str, object]:
+        """The identity as `jaxsfm.io.store.Store` takes it."""
+        plain = to_json(self)
+        assert isinstance(plain, dict)
+        return plain
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class UsedWeights:
+    """The network and the relocalizer of a run."""
+
+    backbone: str | None = None
+    family: str | None = None
+    source: str | None = None
+    sha256: str | None = None
+    relocalizer_sha256: str | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordedConfig:
+    """The fields of a run's `Config` that readers of reports of any version need."""
+
+    max_size: Annotated[int, Range(1, 2**31)]
+    """Longer side of a working image, pixels."""
+    enlarge: Annotated[float, Range(1, 2**31)]
+    """The largest factor by which a smaller photo was enlarged."""
+    others: dict[str, object] = field(default_factory=dict, metadata=OTHERS)
+    """All other fields, which may be unknown to this version."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordedOptions:
+    """The options of a run."""
+
+    config: RecordedConfig
+    pairs: str
+    """The value of `--pairs`."""
+    intrinsics: str | None
+    """The value of `--intrinsics`; None if the focal lengths were estimated."""
+    seed: Count
+    threads: Annotated[int, Range(-1, 2**31)]
+    """The number of threads; -1 stands for all."""
+    reference: str | None = None
+    """The path of the reference poses."""
+    others: dict[str, object] = field(default_factory=dict, metadata=OTHERS)
+    """All other options, which may be unknown to this version."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PhotoFolder:
+    """The folder of the photos of a run."""
+
+    folder: str | None = None
+    """Its absolute path; None if it is not known."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FoundPhotos(PhotoFolder):
+    """The files that the run found in the folder of photos."""
+
+    found: Count
+    usable: Count
+    skipped: dict[str, str]
+    """Why a file could not be used, by name."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class UsedExternalMatches:
+    """The matches of another tool that were mapped together with the run's own."""
+
+    files: list[str]
+    sha256: list[str]
+    verified: bool
+    """Whether the other tool had verified them."""
+    images: Count
+    ignored: list[str]
+    """Images of the other tool that are not among the photos."""
+    pairs: Count
+    matches: Count

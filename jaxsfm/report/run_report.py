@@ -1,0 +1,144 @@
+"""The report of a run: what is written into report.json, and read from it again.
+
+Pixels are those of the original photos unless a field says otherwise. A field with a default may be
+missing in the report of an earlier version.
+"""
+
+import dataclasses
+import json
+from dataclasses import field
+from pathlib import Path
+from typing import Annotated
+
+from jaxsfm.colmap.mapper import Attempt
+from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import read_json, write_atomic
+from jaxsfm.report.run_inputs import (
+    FoundPhotos,
+    RecordedOptions,
+    RunIdentity,
+    UsedExternalMatches,
+    UsedWeights,
+)
+from jaxsfm.report.run_results import (
+    EvaluationReport,
+    LostPhoto,
+    ModelRow,
+    TriedPairs,
+    ViewGraph,
+)
+from jaxsfm.report.typed_json import OMITTED, Count, Misfit, Number, Range, T, from_json, to_json
+from jaxsfm.sfm.refine.passes import RefinementFigures
+
+FILE = "report.json"
+FORMAT = 2
+"""The version of the format. Reports of format 1 have no key `format`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Extension:
+    """One call of `jaxsfm extend`."""
+
+    finished: str
+    """Date and time, UTC."""
+    added: list[str]
+    """New photos that could be used."""
+    placed: list[str]
+    """Those of `added` that have a pose now."""
+    skipped: list[str]
+    """New files that could not be used."""
+    rounds: Count
+    pairs: Count
+    """Pairs that were tried."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunReport:
+    """Everything that is told about a run, except its model and its matches."""
+
+    format: Annotated[int, Range(1, FORMAT + 1)] = 1
+    version: str
+    """The version of jaxsfm."""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Versions of jaxsfm and of the packages below it, the system and the devices."""
+    finished: str = ""
+    """Date and time, UTC."""
+    identity: RunIdentity
+    weights: UsedWeights
+    options: RecordedOptions
+    images: FoundPhotos
+    pairs: TriedPairs
+    given: UsedExternalMatches | None = None
+    models: list[ModelRow]
+    """The one with most photos first; empty if there is none."""
+    mapping: list[Attempt] = field(default_factory=list)
+    """Every start of the mapper."""
+    refinement: list[RefinementFigures | None] = field(default_factory=list)
+    """One for each model; None for a model that was not refined."""
+    view_graph: ViewGraph = field(default_factory=ViewGraph)
+    lost: list[LostPhoto]
+    """Sorted by name."""
+    no_model: str | None = None
+    """Why there is no model; None if there is one."""
+    seconds: dict[str, Number]
+    """Wall-clock time of each stage, seconds."""
+    evaluation: EvaluationReport | None = field(default=None, metadata=OMITTED)
+    """Errors against the reference poses; None without reference poses."""
+    evaluation_failed: str | None = field(default=None, metadata=OMITTED)
+    """Why the model could not be compared with the reference poses."""
+    extended: list[Extension] | None = field(default=None, metadata=OMITTED)
+    """Calls of `jaxsfm extend` since the run."""
+
+    def to_json(self) -> dict[str, object]:
+        """The report as plain JSON."""
+        plain = to_json(self)
+        assert isinstance(plain, dict)
+        return plain
+
+    @classmethod
+    def from_json(cls, value: object) -> "RunReport":
+        """A report from plain JSON.
+
+        Raises:
+          Misfit: the value is not a report that this version can read.
+        """
+        return from_json(cls, value)
+
+
+def write_report(folder: Path, report: RunReport) -> None:
+    """Write a run's report.json."""
+    write_atomic(folder / FILE, json.dumps(report.to_json(), indent=1).encode())
+
+
+def read_report(folder: Path) -> RunReport:
+    """Read a run's report.json.
+
+    Raises:
+      UserError: there is no report, or it is damaged or of another version.
+    """
+    return read_part(folder, RunReport)
+
+
+def read_part(folder: Path, kind: type[T], *keys: str) -> T:
+    """Read one part of a run's report.json, whatever the rest of the file is.
+
+    Args:
+      kind: the dataclass that the part becomes.
+      keys: they lead to the part.
+
+    Raises:
+      UserError: there is no report, or the part is damaged or of another version.
+    """
+    value = read_json(folder / FILE)
+    if value is None:
+        raise UserError(f"{folder}: no finished run here ({FILE} is missing or damaged)")
+    try:
+        for key in keys:
+            if not isinstance(value, dict) or key not in value:
+                raise Misfit(f"an object with the key {key!r}", value)
+            value = value[key]
+        return from_json(kind, value)
+    except Misfit as misfit:
+        raise UserError(
+            f"{folder}: {FILE} is damaged, or of another version of jaxsfm ({misfit})"
+        ) from misfit

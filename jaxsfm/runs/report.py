@@ -1,0 +1,260 @@
+"""The report of a run, written by `reconstruct` and continued by `extend`."""
+
+import dataclasses
+import json
+from collections.abc import Collection, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jaxsfm.colmap.external_matches import Given
+from jaxsfm.colmap.poses import Poses, model_poses
+from jaxsfm.config import Config
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import Pair, PairCounts
+from jaxsfm.io.store import SavedMatches
+from jaxsfm.io.versions import versions
+from jaxsfm.report.advice import Circumstances
+from jaxsfm.report.finished_run import FinishedRun, evaluation_report
+from jaxsfm.report.lost_photos import explain
+from jaxsfm.report.pair_outcomes import PairOutcomes
+from jaxsfm.report.run_inputs import (
+    FoundPhotos,
+    RecordedOptions,
+    RunIdentity,
+    UsedExternalMatches,
+    UsedWeights,
+)
+from jaxsfm.report.run_report import FORMAT, Extension, RunReport
+from jaxsfm.report.run_results import ModelRow, PairRow, TriedPairs
+from jaxsfm.report.typed_json import from_json
+from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.reconstruction import Reconstructed
+from jaxsfm.sfm.register.grow import Grown
+from jaxsfm.sfm.view_graph import Verdict
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StageResults:
+    """The results of a run's stages."""
+
+    folder: Path
+    """The folder of the photos."""
+    identity: RunIdentity
+    usable: list[ImageFile]
+    skipped: dict[str, str]
+    """Why a photo could not be used, by name."""
+    results: Mapping[Pair, PairCounts]
+    """The counts of every pair that was tried."""
+    handed_on: Collection[Pair]
+    """The pairs whose matches were written into COLMAP's database."""
+    external: Given
+    """The matches of another tool, mapped together with ours."""
+    reconstructed: Reconstructed
+    weights: UsedWeights
+    seconds: dict[str, float]
+    """Wall-clock time of each stage, seconds."""
+
+
+class NewPhotos(NamedTuple):
+    """The photos that were added to the folder of a run since."""
+
+    images: dict[str, ImageFile]
+    skipped: dict[str, str]
+    """Why a new file cannot be used, by name."""
+
+
+def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> RunReport:
+    """The report of a new run, without the evaluation."""
+    made, results = stages.reconstructed, stages.results
+    about, counts = stages.external.about, stages.external.counts(results)
+    untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
+    report = RunReport(
+        format=FORMAT,
+        version=stages.identity.version,
+        versions=versions(),
+        finished=_now(),
+        identity=stages.identity,
+        weights=stages.weights,
+        options=_recorded_options(config, options),
+        images=FoundPhotos(
+            folder=str(stages.folder.absolute()),
+            found=len(stages.usable) + len(stages.skipped),
+            usable=len(stages.usable),
+            skipped=stages.skipped,
+        ),
+        pairs=TriedPairs(
+            tried=len(results),
+            verified=sum(r.num_inliers > 0 for r in results.values()),
+            handed_on=len(stages.handed_on),
+            trusted=len(made.verified) - len(untrusted) if made.verdicts else None,
+            overflowed=sum(r.num_dropped > 0 for r in results.values()),
+            each=[
+                _pair_row(
+                    pair,
+                    each,
+                    pair in stages.handed_on,
+                    made.verified.get(pair, 0),
+                    made.verdicts.get(pair),
+                )
+                for pair, each in sorted(counts.items())
+            ],
+        ),
+        given=None if about is None else from_json(UsedExternalMatches, about),
+        models=[model_row(model) for model in made.models],
+        mapping=made.attempts,
+        refinement=made.refinement,
+        lost=[],
+        seconds=stages.seconds,
+    )
+    sizes = {image.name: image.size for image in stages.usable}
+    return _explained(report, config, sizes, made.angles)
+
+
+def extended_report(
+    run: FinishedRun,
+    models: "list[pycolmap.Reconstruction]",
+    grown: Grown,
+    new: NewPhotos,
+    matches: SavedMatches,
+    verified: Mapping[Pair, int],
+    sizes: Mapping[str, tuple[int, int]],
+) -> RunReport:
+    """The report of a run that was extended by new photos.
+
+    Args:
+      run: the run before.
+      models: the models now.
+      matches: the matches of the pairs that were tried for the new photos.
+      verified: the number of inliers that COLMAP found in these pairs.
+      sizes: (width, height) of every usable photo that is still there, old and new.
+    """
+    old = run.report
+    counts = {pair: result.counts for pair, result in matches.items()}
+    good = {pair for pair, each in counts.items() if each.num_inliers}
+    rows = [_pair_row(p, c, p in good, verified.get(p, 0), None) for p, c in counts.items()]
+    before = old.images.skipped
+    skipped = {n: why for n, why in before.items() if n not in new.images} | new.skipped
+    extension = Extension(
+        finished=_now(),
+        added=sorted(new.images),
+        placed=sorted(grown.placed),
+        skipped=sorted(new.skipped),
+        rounds=grown.rounds,
+        pairs=len(counts),
+    )
+    pairs = old.pairs
+    report = dataclasses.replace(
+        old,
+        format=FORMAT,
+        finished=extension.finished,
+        images=FoundPhotos(
+            folder=run.photos.folder and str(run.photos.folder.absolute()),
+            found=old.images.found
+            + len(before.keys() | new.images.keys() | new.skipped.keys())
+            - len(before),
+            usable=old.images.usable + len(new.images),
+            skipped=skipped,
+        ),
+        pairs=TriedPairs(
+            tried=pairs.tried + len(counts),
+            verified=pairs.verified + len(good),
+            handed_on=pairs.handed_on + len(good),
+            overflowed=pairs.overflowed + sum(c.num_dropped > 0 for c in counts.values()),
+            # The view graph does not judge the new pairs.
+            trusted=None if pairs.trusted is None else pairs.trusted + len(verified),
+            each=sorted([*pairs.each, *rows], key=lambda row: row.pair),
+        ),
+        models=[model_row(model) for model in models],
+        extended=[*(old.extended or ()), extension],
+    )
+    report = _explained(report, run.config, sizes, {})
+    lost = []
+    for photo in report.lost:
+        found = grown.located.get(photo.image)
+        why = found.why if found is not None else None
+        lost.append(dataclasses.replace(photo, detail=why or photo.detail))
+    report = dataclasses.replace(report, lost=lost, evaluation=None, evaluation_failed=None)
+    if run.reference is not None:
+        return evaluated(report, model_poses(models[0]), run.reference.poses)
+    if old.options.reference is not None:
+        failed = "the run's reference poses cannot be used any more"
+        return dataclasses.replace(report, evaluation_failed=failed)
+    return report
+
+
+def evaluated(report: RunReport, poses: Poses, reference: Poses) -> RunReport:
+    """The report with the errors against reference poses, or why they cannot be compared."""
+    try:
+        return dataclasses.replace(report, evaluation=evaluation_report(poses, reference))
+    except UserError as error:
+        return dataclasses.replace(report, evaluation_failed=str(error))
+
+
+def model_row(model: "pycolmap.Reconstruction") -> ModelRow:
+    """The numbers of one COLMAP model."""
+    return ModelRow(
+        registered=model.num_reg_images(),
+        points=model.num_points3D(),
+        observations=model.compute_num_observations(),
+        track_length=model.compute_mean_track_length(),
+        reprojection_error_px=model.compute_mean_reprojection_error(),
+        images=sorted(model.image(i).name for i in model.reg_image_ids()),
+    )
+
+
+def _now() -> str:
+    return f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+
+
+def _recorded_options(config: Config, options: RunOptions) -> RecordedOptions:
+    plain = dataclasses.asdict(options) | {"config": dataclasses.asdict(config)}
+    del plain["progress"]
+    if options.reference is not None:  # to be found from any working directory
+        plain["reference"] = options.reference.absolute()
+    return from_json(RecordedOptions, json.loads(json.dumps(plain, default=str)))
+
+
+def _pair_row(
+    pair: Pair, counts: PairCounts, handed_on: bool, colmap_inliers: int, verdict: Verdict | None
+) -> PairRow:
+    return PairRow(
+        pair=pair,
+        status=counts.status,
+        tentative=counts.num_tentative,
+        inliers=counts.num_inliers,
+        planes=counts.num_planes,
+        handed_on=handed_on,
+        colmap_inliers=colmap_inliers,
+        view_graph=verdict,
+    )
+
+
+def _explained(
+    report: RunReport,
+    config: Config,
+    sizes: Mapping[str, tuple[int, int]],
+    angles: Mapping[Pair, float],
+) -> RunReport:
+    """The report with what follows from its pairs and models: why photos were lost, and what may
+    help."""
+    explanation = explain(
+        [model.images for model in report.models],
+        PairOutcomes(
+            rows={row.pair: row for row in report.pairs.each},
+            angles=angles,
+            min_inliers=config.min_inliers,
+        ),
+        Circumstances(
+            config=config,
+            pairs=report.options.pairs,
+            known_camera=report.options.intrinsics is not None,
+            sizes=sizes,
+        ),
+        report.refinement,
+    )
+    return dataclasses.replace(report, **explanation._asdict())
