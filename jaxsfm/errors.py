@@ -1,5 +1,9 @@
-"""The one exception whose text is meant for a user: one sentence that names the file or option."""
+"""The exception for whatever a user can correct."""
 
 
 class UserError(Exception):
-    """Something the user gave cannot be used; the CLI prints the text and exits with 2."""
+    """A file or an option that the user gave cannot be used.
+
+    The text is one sentence that names the file or option. The command line prints it and exits
+    with status 2.
+    """

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.database import verify
+from jaxsfm.colmap.database import VerificationOptions, verify
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.two_views import read_two_views
 
@@ -14,10 +14,7 @@ def verified(path: Path, options: MapOptions):
     """The pairs of a database after COLMAP's verification."""
     verify(
         path,
-        seed=options.seed,
-        threads=options.threads,
-        scale=options.scale,
-        relative_poses=True,
+        VerificationOptions(seed=options.seed, threads=options.threads, scale=options.scale),
     )
     return read_two_views(path)
 

@@ -6,9 +6,13 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, render, room
-from jaxsfm.colmap.model_arrays import Tracks, View, build_model, bundle_adjust
+from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import CameraPose, model_poses
+from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine.passes import refine_model
 
@@ -43,7 +47,7 @@ def view_of(pose: CameraPose, number: int) -> View:
         rotation=pose.rotation,
         centre=pose.centre,
         camera=camera(),
-        scale=np.ones(2),
+        pixels=Pixels((1.0, 1.0)),
         size=SIZE,
     )
 
@@ -113,21 +117,20 @@ def noisy_model(scene: Room, sigma: float, *, use=None) -> pycolmap.Reconstructi
     tracks = exact_tracks(scene, use=use)
     rng = np.random.default_rng(1)
     tracks = tracks._replace(xy=tracks.xy + rng.normal(0, sigma, tracks.xy.shape))
-    model = build_model(template(scene), scene.views, tracks)
+    model = Model(scene.views, tracks).to_colmap()
     if sigma:
         bundle_adjust(model, loss_px=1.0, refine_intrinsics=False, threads=1)
     return model
 
 
-def template(scene: Room) -> pycolmap.Reconstruction:
-    """Cameras and poses alone."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(camera())
-    for view in scene.views:
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view.rotation), -view.rotation @ view.centre)
-        image = pycolmap.Image(name=view.name, camera_id=1, image_id=view.image_id)
-        model.add_image_with_trivial_frame(image, pose)
-    return model
+def exact_model(scene: Room, *, use=None) -> Model:
+    """The exact views, points and observations."""
+    return Model(scene.views, exact_tracks(scene, use=use))
+
+
+def arrays(model: pycolmap.Reconstruction, scene: Room) -> Model:
+    """A COLMAP model of the room, as arrays."""
+    return Model.from_colmap(model, sizes(scene))
 
 
 def read_of(scene: Room, change=lambda image: image):
@@ -143,7 +146,7 @@ def refine(model, scene, change=lambda image: image, **config):
     return refine_model(
         model,
         read_of(scene, change),
-        config=Refinement(**config),
+        refinement=Refinement(**config),
         refine_intrinsics=False,
         threads=1,
     )

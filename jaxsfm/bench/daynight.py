@@ -18,7 +18,7 @@ from jaxsfm.bench import scenes
 from jaxsfm.bench.common import RUN_ABLATED, Keep, method_config
 from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene, Subset
-from jaxsfm.colmap.database import drop_pairs
+from jaxsfm.colmap.database import VerificationOptions, drop_pairs
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
@@ -66,8 +66,7 @@ def _rootsift_models(scene: Scene, scratch: Path, seed: int, threads: int) -> li
         scene.folder,
         images,
         scene.camera,
-        seed=seed,
-        threads=threads,
+        VerificationOptions(seed=seed, threads=threads),
         pairs=None if blanks else sorted(pairs),
     )
     every = read_two_views(database)

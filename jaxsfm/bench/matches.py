@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsfm.bench.common import KEYPOINTS, PAIR_ABLATED, method_config
-from jaxsfm.colmap.database import read_matches
+from jaxsfm.colmap.database import VerificationOptions, read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.config import BackboneName, Config
 from jaxsfm.io.features import ImageFeatures
@@ -107,9 +107,7 @@ def _rootsift(image0: ImageFile, image1: ImageFile) -> tuple[np.ndarray, np.ndar
             image0.path.parent,
             [image0, image1],
             None,
-            seed=0,
-            threads=-1,
-            min_inliers=8,
+            VerificationOptions(min_inliers=8),
         )
         return read_matches(database, (image0.name, image1.name), verified=False)
 

@@ -19,6 +19,7 @@ from jaxsfm.bench.common import (
     method_config,
     read_rows,
 )
+from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.models import write_models
@@ -110,7 +111,8 @@ def run_rootsift(
     start = time.monotonic()
     given = parse_intrinsics(intrinsics) if intrinsics else None
     database = out / "database.db"
-    write_rootsift_database(database, folder / "images", images, given, seed=seed, threads=threads)
+    verification = VerificationOptions(seed=seed, threads=threads)
+    write_rootsift_database(database, folder / "images", images, given, verification)
     options = MapOptions(refine_intrinsics=intrinsics is None, seed=seed, threads=threads)
     models, _ = build_models(database, read_two_views(database), options)
     write_models(models, out / "sparse")

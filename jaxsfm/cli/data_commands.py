@@ -1,4 +1,4 @@
-"""`jaxsfm data`: public data sets for the benchmarks."""
+"""The commands `jaxsfm data`: list and download public data sets for the benchmarks."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ Positional = tyro.conf.Positional
 
 
 def list_all(*, to: Path | None = None) -> int:
-    """Which there are, their sizes and terms, and which are there.
+    """List the data sets with their sizes and terms, and say which of them have been fetched.
 
     Args:
       to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
@@ -18,26 +18,27 @@ def list_all(*, to: Path | None = None) -> int:
     from jaxsfm.bench import datasets
 
     for name, data_set in datasets.DATA_SETS.items():
-        here = "there" if datasets.is_complete(name, to) else "not fetched"
-        hashed = all(file.known_hash for file in data_set.files)
+        here = "fetched" if datasets.is_complete(name, to) else "not fetched"
+        published = all(file.known_hash for file in data_set.files)
+        hashes = (
+            "hash published" if published else "no published hash; that of the download is kept"
+        )
         print(f"{name:10s} {here}; {data_set.size}; for jaxsfm bench {data_set.bench}")
         print(f"{'':10s} {data_set.title}")
         print(f"{'':10s} {data_set.page}; terms: {data_set.terms}")
-        print(
-            f"{'':10s} {'hash known' if hashed else 'no published hash: that of what came is kept'}"
-        )
+        print(f"{'':10s} {hashes}")
     print(f"folder     {to or datasets.data_folder()}")
     return 0
 
 
 def fetch(name: Positional[str], *, to: Path | None = None) -> int:
-    """Download a data set; an interrupted download goes on.
+    """Download a data set. An interrupted download goes on where it stopped.
 
     For example
         $ jaxsfm data fetch wxbs
 
     Args:
-      name: Of the data set (jaxsfm data list).
+      name: Name of the data set (jaxsfm data list).
       to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
     """
     from jaxsfm.bench import datasets
@@ -47,10 +48,10 @@ def fetch(name: Positional[str], *, to: Path | None = None) -> int:
 
 
 def path(name: Positional[str], *, to: Path | None = None) -> int:
-    """The folder to give to a benchmark's --root.
+    """Print the folder of a data set, which is the --root of its benchmark.
 
     Args:
-      name: Of the data set (jaxsfm data list).
+      name: Name of the data set (jaxsfm data list).
       to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
     """
     from jaxsfm.bench import datasets
@@ -63,5 +64,5 @@ _Data = one_of({"list": list_all, "fetch": fetch, "path": path})
 
 
 def data(result: _Data) -> int:  # pyright: ignore[reportInvalidTypeForm]
-    """Public data sets for the benchmarks."""
+    """List and download public data sets for the benchmarks."""
     return result

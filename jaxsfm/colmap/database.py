@@ -8,6 +8,7 @@ where it is loaded first every later deflate (zlib.compress, PNG by OpenCV or Pi
 heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so; it is not used.
 """
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -145,26 +146,47 @@ def write_database(
                 db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
 
 
-def verify(path: Path, *, seed: int, threads: int, scale: float, relative_poses: bool) -> None:
-    """COLMAP's own two-view verification of all pairs (paper, section 4).
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VerificationOptions:
+    """Settings of COLMAP's two-view verification."""
 
-    Cameras with a known or prior focal length are verified calibrated (essential matrices).
+    seed: int = 0
+    """For RANSAC."""
+    threads: int = -1
+    """-1 takes all cores."""
+    scale: float = 1.0
+    """Original pixels per working pixel. COLMAP's 4 px are multiplied by it."""
+    relative_poses: bool = True
+    """Also find the relative pose of every pair, which the view graph needs."""
+    min_inliers: int | None = None
+    """A pair with fewer inliers has none; None: COLMAP's 15."""
 
-    Args:
-      scale: original pixels per working pixel; COLMAP's 4 px are multiplied by it.
-      relative_poses: also find the relative pose of every pair, for the view graph.
+    def for_colmap(self) -> pycolmap.TwoViewGeometryOptions:
+        """As COLMAP takes them."""
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = self.seed
+        options.ransac.max_error *= self.scale
+        options.compute_relative_pose = self.relative_poses
+        if self.min_inliers is not None:
+            options.min_num_inliers = self.min_inliers
+        return options
+
+
+def verify(path: Path, options: VerificationOptions) -> None:
+    """Run COLMAP's own two-view verification on all pairs of a database (paper, section 4).
+
+    Cameras with a known or prior focal length are verified as calibrated (essential matrices).
+
+    Raises:
+      UserError: COLMAP failed.
     """
-    two_view = pycolmap.TwoViewGeometryOptions()
-    two_view.ransac.random_seed = seed
-    two_view.ransac.max_error *= scale
-    two_view.compute_relative_pose = relative_poses
     verifier = pycolmap.GeometricVerifierOptions()
-    verifier.num_threads = threads
+    verifier.num_threads = options.threads
     native(
         lambda token: pycolmap.geometric_verification(
             path,
             verifier_options=verifier,
-            two_view_geometry_options=two_view,
+            two_view_geometry_options=options.for_colmap(),
             cancellation_token=token,
         ),
         path,

@@ -8,7 +8,7 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET, read_images, verify
+from jaxsfm.colmap.database import PIXEL_OFFSET, VerificationOptions, read_images, verify
 from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
@@ -74,20 +74,17 @@ def _rows_of(xy: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
 
 
 def add_matches(
-    path: Path,
-    results: Mapping[Pair, PairResult],
-    *,
-    seed: int,
-    threads: int,
-    scale: float,
+    path: Path, results: Mapping[Pair, PairResult], options: VerificationOptions
 ) -> dict[Pair, int]:
-    """Write matches and COLMAP's verification of them; inliers, by pair that has any.
+    """Write matches into a database, and COLMAP's verification of them.
 
-    An image's keypoints stay and get those that are new behind them.
+    The keypoints of an image stay, and new ones are added behind them.
 
     Args:
-      results: of images that are in the database, pairs that have no matches in it.
-      scale: see `jaxsfm.colmap.database.verify`.
+      results: of images that are in the database, for pairs that have no matches in it.
+
+    Returns:
+      number of inliers, by pair that has any.
     """
     ids = {name: image_id for name, (image_id, _) in read_images(path).items()}
     own: dict[str, list[Pair]] = {}
@@ -115,7 +112,7 @@ def add_matches(
             if len(both):
                 matches[pair] = both
                 db.write_matches(ids[pair[0]], ids[pair[1]], both)
-    return _verified(path, matches, ids, seed=seed, threads=threads, scale=scale)
+    return _verified(path, matches, ids, options)
 
 
 _NONE = np.zeros((0, 2), np.float32)
@@ -131,12 +128,12 @@ def _verified(
     path: Path,
     matches: Mapping[Pair, np.ndarray],
     ids: Mapping[str, int],
-    *,
-    seed: int,
-    threads: int,
-    scale: float,
+    options: VerificationOptions,
 ) -> dict[Pair, int]:
-    """COLMAP verifies all pairs of a database: those that are new in a copy without the others."""
+    """Verify new pairs alone.
+
+    COLMAP verifies all pairs of a database, so this works in a copy that holds no other pairs.
+    """
     if not matches:
         return {}
     scratch = path.with_name("new_pairs.db")
@@ -146,7 +143,7 @@ def _verified(
         db.clear_two_view_geometries()
         for (a, b), rows in matches.items():
             db.write_matches(ids[a], ids[b], rows)
-    verify(scratch, seed=seed, threads=threads, scale=scale, relative_poses=True)
+    verify(scratch, options)
     found = {pair: view.geometry.num_inliers for pair, view in read_two_views(scratch).items()}
     with (
         pycolmap.Database.open(scratch) as new,

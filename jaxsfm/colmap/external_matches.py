@@ -25,7 +25,7 @@ FOCAL_RATIO = 1.1
 """Focal lengths may differ as much: EXIF knows them to a few percent."""
 
 
-class Given(NamedTuple):
+class ExternalMatches(NamedTuple):
     """Matches beside ours."""
 
     keypoints: dict[str, np.ndarray]
@@ -41,15 +41,15 @@ class Given(NamedTuple):
         return theirs | {p: c for p, c in ours.items() if c.num_inliers or p not in theirs}
 
 
-NOTHING = Given({}, {}, None)
+NO_EXTERNAL_MATCHES = ExternalMatches({}, {}, None)
 
 
-def read_given(
+def read_external_matches(
     database: Path | None,
     hloc: tuple[Path, Path] | None,
     images: Collection[ImageFile],
     intrinsics: Intrinsics | None,
-) -> Given:
+) -> ExternalMatches:
     """The matches of `--with-database` or `--with-hloc`, checked against the photos.
 
     Of a verified database the two-view inliers count, of another one its matches. Cameras are
@@ -69,7 +69,7 @@ def read_given(
         where, files = "--with-hloc", list(hloc)
         tables = read_hloc(*hloc, [image.name for image in images], where=where)
     else:
-        return NOTHING
+        return NO_EXTERNAL_MATCHES
     return _checked(tables, images, intrinsics, where, files)
 
 
@@ -79,7 +79,7 @@ def _checked(
     intrinsics: Intrinsics | None,
     where: str,
     files: list[Path],
-) -> Given:
+) -> ExternalMatches:
     known = {image.name: image for image in images}
     ignored = sorted(tables.keypoints.keys() - known.keys())
     keypoints = {}
@@ -121,7 +121,7 @@ def _checked(
         "pairs": len(matches),
         "matches": sum(map(len, matches.values())),
     }
-    return Given(keypoints, matches, about)
+    return ExternalMatches(keypoints, matches, about)
 
 
 def _by(size: tuple[int, int]) -> str:
@@ -139,7 +139,7 @@ def _check_focal(camera: CameraRow, intrinsics: Intrinsics, where: str, name: st
         )
 
 
-def _result(pair: Pair, rows: np.ndarray, given: Given) -> PairResult:
+def _result(pair: Pair, rows: np.ndarray, given: ExternalMatches) -> PairResult:
     return PairResult(
         pair=pair,
         cells=rows,
@@ -170,7 +170,7 @@ def _joined(theirs: PairResult, ours: PairResult) -> PairResult:
     )
 
 
-class Beside(Mapping[Pair, PairResult]):
+class JoinedMatches(Mapping[Pair, PairResult]):
     """Our matches and those given, as one: theirs first in every image's list of keypoints, our
     cells counted on from there. Pairs are joined when they are asked for.
 
@@ -179,7 +179,7 @@ class Beside(Mapping[Pair, PairResult]):
     """
 
     def __init__(
-        self, ours: Mapping[Pair, PairResult], given: Given, names: Collection[str]
+        self, ours: Mapping[Pair, PairResult], given: ExternalMatches, names: Collection[str]
     ) -> None:
         self._ours, self._given = ours, given
         theirs = (pair for pair in given.matches if pair[0] in names and pair[1] in names)

@@ -22,7 +22,7 @@ ABSURD = 1e100
 """Squares of such numbers are still finite."""
 
 
-class Damaged(ValueError):
+class DamagedModelError(ValueError):
     """What is wrong with a file, in words."""
 
 
@@ -32,8 +32,8 @@ class _Reader:
     def __init__(self, path: Path) -> None:
         self.name, self.data, self.at = path.name, path.read_bytes(), 0
 
-    def bad(self, what: str) -> Damaged:
-        return Damaged(f"{self.name}: {what}")
+    def bad(self, what: str) -> DamagedModelError:
+        return DamagedModelError(f"{self.name}: {what}")
 
     def skip(self, size: int) -> int:
         """Where a block of so many bytes begins."""
@@ -85,7 +85,7 @@ def check_binary(folder: Path) -> None:
     """Look through a binary model.
 
     Raises:
-      Damaged: a file that ends early, lies about a count, or names what is not there.
+      DamagedModelError: a file that ends early, lies about a count, or names what is not there.
       OSError: one is missing.
     """
     cameras = _cameras(_Reader(folder / "cameras.bin"))
@@ -96,7 +96,7 @@ def check_binary(folder: Path) -> None:
         _frames(_Reader(folder / "frames.bin"), images)
     points = _points(_Reader(folder / "points3D.bin"), images)
     if not np.isin(seen, np.append(points, np.uint64(NO_POINT))).all():
-        raise Damaged("images.bin: a keypoint of a point that is not there")
+        raise DamagedModelError("images.bin: a keypoint of a point that is not there")
 
 
 def _cameras(file: _Reader) -> set[int]:

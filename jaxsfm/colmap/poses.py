@@ -7,7 +7,7 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.model_files import Damaged, check_binary
+from jaxsfm.colmap.model_files import DamagedModelError, check_binary
 from jaxsfm.errors import UserError
 
 
@@ -57,9 +57,9 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         if not all(
             np.isfinite([*p.rotation.flat, *p.centre]).all() for p in model_poses(model).values()
         ):
-            raise Damaged("a pose that is not finite")
+            raise DamagedModelError("a pose that is not finite")
         return model
-    except Damaged as error:
+    except DamagedModelError as error:
         raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
     except Exception as error:  # native errors of several kinds; the text is long and technical
         raise UserError(f"{path}: not a readable COLMAP model") from error

@@ -1,4 +1,4 @@
-"""A camera's pose from points of known place (COLMAP's resection), in working pixels."""
+"""Resection: the pose of a camera from points whose places are known, by COLMAP."""
 
 import dataclasses
 
@@ -6,11 +6,13 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.model_arrays import View
+from jaxsfm.colmap.view import View
 
 MIN_POINTS = 6
+"""Fewer matches give no pose."""
 MIN_INLIER_SHARE = 0.05
-"""Matches of a dark image are mostly wrong; COLMAP expects a quarter of them to be right."""
+"""RANSAC expects at least this share of the matches to be right. COLMAP's own value is a quarter,
+but most matches of a dark image are wrong."""
 
 
 def _moved(view: View, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera) -> View:
@@ -22,15 +24,25 @@ def _moved(view: View, cam_from_world: pycolmap.Rigid3d, camera: pycolmap.Camera
 def adjust_view(
     view: View, xy: np.ndarray, points: np.ndarray, *, refine_focal_length: bool
 ) -> View | None:
-    """The view where points (n, 3) seen at pixels (n, 2) want it: least squares from where it is,
-    with a Cauchy loss of one working pixel. None if the solver fails."""
+    """Adjust the pose of a view to observations, starting from the pose that it has.
+
+    Least squares with a Cauchy loss of one working pixel.
+
+    Args:
+      xy: float64 (n, 2), where the view shows the points, working pixels.
+      points: float64 (n, 3), world units.
+      refine_focal_length: also adjust the focal length.
+
+    Returns:
+      None if the solver fails.
+    """
     options = pycolmap.AbsolutePoseRefinementOptions()
-    options.loss_function_scale = float(view.scale.mean())
+    options.loss_function_scale = view.mean_scale
     options.refine_focal_length = refine_focal_length
     camera = pycolmap.Camera(view.camera.todict())  # the solver writes into it
     found = pycolmap.refine_absolute_pose(
         view.cam_from_world(),
-        (xy + 0.5) * view.scale,
+        view.pixels.to_colmap(xy),
         points,
         np.ones(len(points), bool),
         camera,
@@ -48,16 +60,21 @@ def find_view(
     estimate_focal_length: bool,
     seed: int,
 ) -> View | None:
-    """The same by RANSAC, from nothing; None if nothing is found.
+    """Find the pose of a view by RANSAC. The pose that `view` has plays no part.
 
     Args:
-      max_error_px: of an inlier, working pixels.
+      xy, points: as in `adjust_view`; some of them may be wrong.
+      max_error_px: the largest reprojection error of an inlier, working pixels.
+      estimate_focal_length: find the focal length too.
+
+    Returns:
+      None if no pose is found.
     """
     if len(points) < MIN_POINTS:
         return None
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.estimate_focal_length = estimate_focal_length
-    options.ransac.max_error = max_error_px * float(view.scale.mean())
+    options.ransac.max_error = max_error_px * view.mean_scale
     options.ransac.min_inlier_ratio = MIN_INLIER_SHARE
     options.ransac.random_seed = seed
     camera = pycolmap.Camera(view.camera.todict())
@@ -65,6 +82,6 @@ def find_view(
     refinement.refine_focal_length = estimate_focal_length
     refinement.loss_function_scale = options.ransac.max_error / 4
     found = pycolmap.estimate_and_refine_absolute_pose(
-        (xy + 0.5) * view.scale, points, camera, options, refinement
+        view.pixels.to_colmap(xy), points, camera, options, refinement
     )
     return None if found is None else _moved(view, found["cam_from_world"], camera)

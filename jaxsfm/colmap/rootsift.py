@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
 
+from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.native import native
 from jaxsfm.errors import UserError
@@ -19,25 +20,24 @@ def write_rootsift_database(
     folder: Path,
     images: list[ImageFile],
     intrinsics: Intrinsics | None,
+    verification: VerificationOptions,
     *,
-    seed: int,
-    threads: int,
-    min_inliers: int | None = None,
     pairs: Iterable[Pair] | None = None,
 ) -> None:
-    """A new database with COLMAP's DoG + RootSIFT features, matched and verified.
+    """Write a new database with COLMAP's DoG + RootSIFT features, matched and verified.
 
-    COLMAP's defaults throughout; one camera for all images if intrinsics are given, else one per
-    image from EXIF or 1.2 x the longer side.
+    COLMAP's defaults are used throughout. If intrinsics are given, there is one camera for all
+    images; otherwise one per image, from EXIF or with 1.2 x the longer side as focal length.
 
     Args:
       folder: the images' folder.
-      pairs: the ones matched; None: all.
-      min_inliers: pairs with fewer matches or inliers are emptied; None: COLMAP's 15.
+      verification: its threads are those of extraction and matching too. Pairs with fewer matches
+        or inliers than its `min_inliers` are emptied.
+      pairs: those to match; None: all.
 
     Raises:
-      UserError: an image that COLMAP leaves out (a format it does not read, or, with given
-        intrinsics, another size).
+      UserError: COLMAP leaves an image out, because it does not read the format or, with given
+        intrinsics, because of another size.
     """
     path.unlink(missing_ok=True)
     reader = pycolmap.ImageReaderOptions()
@@ -47,16 +47,12 @@ def write_rootsift_database(
         reader.camera_params = ",".join(repr(float(p)) for p in intrinsics.params)
         mode = pycolmap.CameraMode.SINGLE
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.num_threads = threads
+    extraction.num_threads = verification.threads
     extraction.use_gpu = False
     matching = pycolmap.FeatureMatchingOptions()
-    matching.num_threads = threads
+    matching.num_threads = verification.threads
     matching.use_gpu = False
-    two_view = pycolmap.TwoViewGeometryOptions()
-    two_view.ransac.random_seed = seed
-    two_view.compute_relative_pose = True
-    if min_inliers is not None:
-        two_view.min_num_inliers = min_inliers
+    two_view = verification.for_colmap()
 
     def work(_: pycolmap.CancellationToken) -> None:
         pycolmap.extract_features(

@@ -1,4 +1,7 @@
-"""Files and folders that appear whole or not at all, whenever the process is killed."""
+"""Files and folders are written whole or not at all, even if the process is killed.
+
+Every result that jaxsfm writes goes through this module.
+"""
 
 import contextlib
 import json
@@ -6,28 +9,36 @@ import math
 import os
 import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxsfm.errors import UserError
 
+Json: TypeAlias = Mapping[str, "Json"] | Sequence["Json"] | str | int | float | bool | None
+"""What `json.dumps` writes. What `json.loads` returns is a dict, a list or one of the others."""
 PARTIAL = ".partial"
-"""Ends the name of what is being written."""
+"""The suffix of a file or folder that is still being written."""
 SPARE_BYTES = 4_000_000
-"""Left on the disk beside what is counted: tables' indices, poses, the page."""
+"""Disk space that callers of `check_disk_space` add for what they do not count: the indices of
+tables, poses and the report page."""
 
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write that appears whole or not at all.
+    """Open a file for writing; it takes the place of `path` when the block ends.
+
+    Until then its bytes are in a file of another name. Data that the system has not written to the
+    disk yet may be lost if power fails; `write_atomic` waits for them.
 
     Raises:
-      UserError: it cannot be written (permission, disk full).
+      UserError: the file cannot be written (for example: no permission, or the disk is full).
     """
-    partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")  # nobody else's
+    # The process id keeps two processes from writing the same partial file.
+    partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     try:
         with partial.open("wb") as file:
             yield file
@@ -39,27 +50,35 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Write a file that is either whole or absent, after a failure of power too."""
+    """Write a file so that even after a power failure it is whole or absent."""
     with atomic_file(path) as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
 
 
-def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Write arrays into an .npz whose zip carries checksums: where power failed the file may be
-    torn, and is then read as absent."""
+def save_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
+    """Write arrays into an .npz file.
+
+    This does not wait for the disk, so a power failure may tear the file. The zip format carries
+    checksums; `load_arrays` treats a torn file as absent.
+
+    Raises:
+      UserError: the file or its folder cannot be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{path.parent}: cannot be written ({error.strerror})") from error
     with atomic_file(path) as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]  names are no options
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """What `save_arrays` wrote; None if there is none or it is damaged. Never unpickles, and
-    allocates no more than the file is long."""
+    """The arrays that `save_arrays` wrote, or None if the file is missing or damaged.
+
+    Objects are never unpickled, and no more memory is allocated than the file is long.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist():
@@ -71,7 +90,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
 
 
 def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
-    """ValueError unless an array takes the room in the file that its header says."""
+    """Raise ValueError unless an array has as many bytes in the file as its header says."""
     with archive.open(info) as file:
         read = np.lib.format
         version = read.read_magic(file)  # pyright: ignore[reportArgumentType]
@@ -82,8 +101,8 @@ def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
             raise ValueError(f"{info.filename}: {info.file_size} bytes for {shape} {dtype}")
 
 
-def read_json(path: Path) -> Any:
-    """The content of a file, None where it cannot be read as JSON."""
+def read_json(path: Path) -> Json:
+    """The content of a JSON file, or None if it cannot be read as JSON."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -91,15 +110,17 @@ def read_json(path: Path) -> Any:
 
 
 def check_disk_space(folder: Path, needed: int) -> None:
-    """Refuse what would not fit on the disk, before code that does not survive that begins.
+    """Refuse to start what would not fit on the disk.
 
-    COLMAP ends the process where a database cannot grow, and writes models that are cut off.
+    COLMAP does not survive a full disk: it ends the process when its database cannot grow, and it
+    writes models that are cut off.
 
     Args:
-      needed: bytes.
+      folder: an existing folder on the disk in question.
+      needed: the space that will be used, bytes.
 
     Raises:
-      UserError: what is needed and what there is.
+      UserError: there is less space; the message gives both numbers.
     """
     free = shutil.disk_usage(folder).free
     if free < needed:
@@ -111,9 +132,10 @@ def check_disk_space(folder: Path, needed: int) -> None:
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """A folder to fill that takes the place of `path` when it is complete.
+    """Make an empty folder; it takes the place of `path` when the block ends.
 
-    Between the old one's end and the new one's beginning there may be none.
+    The old folder is removed before the new one is renamed, so a process that is killed between
+    the two leaves neither.
     """
     partial = path.with_name(path.name + PARTIAL)
     shutil.rmtree(partial, ignore_errors=True)

@@ -1,4 +1,8 @@
-"""Files from the network: resumed where they stopped, compared with their hash, unpacked safely."""
+"""Downloads of public weights and data sets.
+
+An interrupted download is resumed, the file is compared with its hash, and archives are unpacked so
+that they cannot write outside their folder.
+"""
 
 import contextlib
 import fcntl
@@ -11,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
 import pooch
 import requests
@@ -20,11 +24,11 @@ from tqdm import tqdm
 from jaxsfm.errors import UserError
 
 CHUNK = 1 << 16
+"""Bytes that are read at once."""
 TIMEOUT = (10, 60)
-"""Seconds: to connect, and between two parts of a file."""
+"""The longest time to wait for the connection, and between two parts of a file, seconds."""
 OnBytes = Callable[[int, int | None], None]
-"""Told how many bytes there are by now, and how many there will be where the server says."""
-
+"""Is called with the bytes received so far and in total; None if the server does not say."""
 
 _DAMAGED = (
     tarfile.TarError,
@@ -32,21 +36,22 @@ _DAMAGED = (
     zlib.error,
     lzma.LZMAError,
     EOFError,
-    RuntimeError,  # an encrypted zip; and what is not implemented
+    RuntimeError,  # the zip is encrypted, or something in it is not implemented
 )
 
 
 class _Resuming:
-    """A downloader for pooch that goes on with what an earlier attempt left in FILE.part.
+    """A downloader for pooch that continues what an earlier attempt left in FILE.part.
 
-    The server's validator lies beside it: if the file has changed since, it starts again.
+    The server's validator (ETag) is kept beside it. If the file on the server has changed since,
+    the download starts again.
     """
 
     def __init__(self, part: Path, on_bytes: OnBytes) -> None:
         self.part, self.on_bytes = part, on_bytes
 
     def __call__(
-        self, url: str, output_file: Any, pooch: Any, check_only: bool | None = False
+        self, url: str, output_file: str | Path, pooch: object, check_only: bool | None = False
     ) -> None:
         known = self.part.with_name(self.part.name + ".etag")
         with self.part.open("ab") as file:
@@ -55,7 +60,7 @@ class _Resuming:
             except OSError as error:
                 raise UserError(f"{self.part}: another process is downloading it") from error
             try:
-                while not self._received(url, file, known):  # what is there is of another file
+                while not self._received(url, file, known):  # the part belongs to another file
                     file.truncate(0)
             except BaseException:
                 if not file.seek(0, os.SEEK_END):
@@ -64,8 +69,11 @@ class _Resuming:
             known.unlink(missing_ok=True)
             os.replace(self.part, output_file)
 
-    def _received(self, url: str, file: Any, known: Path) -> bool:
-        """Whether the rest came, or all of it; False: the server has nothing after our part."""
+    def _received(self, url: str, file: BinaryIO, known: Path) -> bool:
+        """Receive the rest of the file, or all of it.
+
+        Returns: False if the file on the server ends before our part does.
+        """
         start, headers = file.seek(0, os.SEEK_END), {"Accept-Encoding": "identity"}
         if start and known.is_file():
             headers["Range"] = f"bytes={start}-"
@@ -97,17 +105,23 @@ class _Resuming:
 def download(
     url: str, path: Path, *, known_hash: str | None, on_bytes: OnBytes = lambda _, __: None
 ) -> Path:
-    """The file at `url` as `path`; nothing is asked for where it is there already and right.
+    """Download a file, unless it is there already with the right hash.
 
     Args:
-      known_hash: "sha256:...", "md5:..."; None: any content will do, and what is there stays.
+      url: the address of the file.
+      path: the file to write.
+      known_hash: "sha256:..." or "md5:..."; with None any content is accepted, and a file that is
+        there already is kept.
+      on_bytes: is told how many bytes have been received.
+
+    Returns: `path`.
 
     Raises:
-      UserError: it cannot be had, cannot be written, or has another hash.
+      UserError: the file cannot be downloaded, cannot be written, or has another hash.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pooch.get_logger().disabled = True  # it would announce every file
+        pooch.get_logger().disabled = True  # else pooch announces every file
         pooch.retrieve(
             url,
             known_hash,
@@ -132,7 +146,7 @@ def download(
 
 @contextlib.contextmanager
 def progress_bar(label: str, *, shown: bool) -> Iterator[OnBytes]:
-    """What `download` tells, as a bar."""
+    """Show the progress of `download` as a bar."""
     with tqdm(desc=label, unit="B", unit_scale=True, disable=not shown) as bar:
 
         def on_bytes(done: int, total: int | None) -> None:
@@ -153,16 +167,18 @@ def _reason(error: requests.RequestException) -> str:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """A zip or tar archive into `folder`, beside what is there; nothing if it is damaged.
+    """Unpack a zip or tar archive into a folder, beside the files that are there.
+
+    If the archive is damaged, nothing is written.
 
     Raises:
-      UserError: it cannot be unpacked, or would write outside the folder.
+      UserError: the archive cannot be unpacked, or it would write outside the folder.
     """
     fresh = Path(tempfile.mkdtemp(prefix=".unpacking-", dir=folder))
     try:
         if zipfile.is_zipfile(archive):
             with zipfile.ZipFile(archive) as opened:
-                opened.extractall(fresh)  # drops ".." and roots from names by itself
+                opened.extractall(fresh)  # zipfile removes ".." and roots from the names
         else:
             with tarfile.open(archive) as opened:
                 opened.extractall(fresh, filter="data")

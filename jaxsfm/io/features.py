@@ -1,8 +1,9 @@
-"""The shapes and the memory of an image's features: buckets, so that few programs are compiled.
+"""The features of one image, the sizes to which they are padded, and the memory they need.
 
-An image is padded to a multiple of `SIDE_BUCKET` pixels per side and its cells to a menu of
-capacities. Both follow from the image's own size alone, so what is computed for an image never
-depends on the other images.
+A program is compiled for each shape of its arrays. To need few programs, each side of an image is
+padded to a multiple of `SIDE_BUCKET` pixels, and the number of its cells to one of a few
+capacities. Both depend on the size of the image alone, so the features of an image do not depend on
+the other images.
 """
 
 import os
@@ -17,50 +18,50 @@ from jaxsfm.config import Config
 from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import (
-    ImageFile,
-    shown_name,
-    working_size,
-)
+from jaxsfm.io.images import ImageFile, shown_name, working_size
 
 SIDE_BUCKET = 128
-"""Padding costs at most 8 % of a 1600 px side."""
+"""Pixels. On a side of 1600 pixels at most 8 % is padding."""
 BYTES_PER_PIXEL, OCTAVES_BYTES_PER_PIXEL = 700, 900
-"""Peak memory of an extraction on CPUs per working pixel, with one octave and with four: between
-800 x 600 and 1600 x 1200 it grows by 660 and 860 (measured, docs/performance.md)."""
+"""Peak memory of the extraction on a CPU, for each pixel of the working image, with one octave and
+with four. Between 800 x 600 and 1600 x 1200 pixels it grows by 660 and 860 bytes per pixel
+(docs/performance.md)."""
 PROCESS_BYTES = 900_000_000
-"""Beside that: libraries and weights 0.3 GB, programs and their compilation 0.4 to 0.6 GB."""
+"""Memory that the process needs besides: 0.3 GB for libraries and weights, and 0.4 to 0.6 GB for
+programs and their compilation."""
 _MENU = tuple(1024 * n // 2 for n in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64))
-"""Coarse capacities: 512 .. 32768, half an octave apart."""
+"""The capacities for coarse cells: 512 .. 32768, each about 1.4 times the one before."""
 
 
 class FeatureCapacity(NamedTuple):
-    """What fixes the shapes of a pair's program."""
+    """The padded size of an image's features; the program that matches a pair depends on it."""
 
     num_coarse: int
-    """Capacity for coarse cells; there are four times as many fine ones."""
+    """The capacity for coarse cells; that for fine cells is four times as large."""
     columns: int
-    """Of the coarse grid."""
+    """The number of columns of the coarse grid."""
 
 
 class ImageFeatures(NamedTuple):
-    """Features of one image and the way back to its original pixels."""
+    """The features of one image, and how its working image lies on the original."""
 
     image: ImageFile
     scale: tuple[float, float]
     """Original pixels per working pixel, (x, y)."""
     dense: DenseFeatures
-    """numpy arrays."""
+    """The features; the arrays are numpy arrays."""
 
     @property
     def capacity(self) -> FeatureCapacity:
-        """As `feature_capacity` the working image."""
+        """The capacity to which these features are padded."""
         return FeatureCapacity(self.dense.coarse[0].shape[0], int(self.dense.coarse_grid[1]))
 
 
 def padded_cells(num_coarse: int) -> int:
-    """The smallest capacity of the menu that holds `num_coarse` cells (multiples of its largest
-    beyond that)."""
+    """The smallest capacity that holds `num_coarse` coarse cells.
+
+    Beyond the largest capacity of the menu, it is a multiple of that one.
+    """
     for size in _MENU:
         if num_coarse <= size:
             return size
@@ -68,27 +69,27 @@ def padded_cells(num_coarse: int) -> int:
 
 
 def padded_size(size: tuple[int, int]) -> tuple[int, int]:
-    """(rows, columns), pixels, that a working image of (width, height) is padded to."""
+    """(rows, columns), in pixels, to which a working image of (width, height) is padded."""
     width, height = size
     return -(-height // SIDE_BUCKET) * SIDE_BUCKET, -(-width // SIDE_BUCKET) * SIDE_BUCKET
 
 
 def feature_capacity(size: tuple[int, int]) -> FeatureCapacity:
-    """For the cells of a working image of (width, height)."""
+    """The capacity for the features of a working image of (width, height)."""
     width, height = size
-    # 4 cells of pool3 to one of pool4, and the odd last row and column.
+    # Four cells of pool3 belong to each cell of pool4; an odd last row and column come on top.
     odd = height // 8 * (width // 8) - 4 * (height // 16) * (width // 16)
     cells = height // 16 * (width // 16) + -(-odd // 4)
     return FeatureCapacity(padded_cells(cells), width // 16)
 
 
 def image_capacity(image: ImageFile, *, config: Config) -> FeatureCapacity:
-    """The room of an image's features, known before it is decoded."""
+    """The capacity for the features of an image; it is known before the image is decoded."""
     return feature_capacity(working_size(image.size, config.max_size, config.enlarge))
 
 
 def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
-    """The same features with room for `num_coarse` coarse and 4 x as many fine cells."""
+    """Pad features to `num_coarse` coarse cells and four times as many fine cells."""
 
     def pad(array: Array, rows: int) -> np.ndarray:
         return np.pad(np.asarray(array), ((0, rows - array.shape[0]), (0, 0)))
@@ -106,9 +107,10 @@ def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
 
 
 def total_memory() -> int | None:
-    """Bytes this process may use at all; None where the system does not tell.
+    """The memory that this process may use, bytes; None if the system does not say.
 
-    The total and not what is free just now: a result must not depend on other processes.
+    This is the total and not what is free at the moment, because a result must not depend on other
+    processes.
     """
     try:
         total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -116,19 +118,21 @@ def total_memory() -> int | None:
         return None
     try:
         total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    except (OSError, ValueError):  # no limit ("max"), or another system
+    except (OSError, ValueError):  # there is no limit ("max"), or the system is not Linux
         pass
     return total
 
 
 def check_memory(image: ImageFile, at_once: int = 1, *, config: Config) -> None:
-    """Refuse an image whose features cannot fit, before the system kills the process.
+    """Refuse an image whose features do not fit into memory, before the system kills the process.
 
     Args:
-      at_once: so many like it are computed together.
+      image: the image.
+      at_once: the number of such images that are computed together.
+      config: it says the working size.
 
     Raises:
-      UserError: what it needs and what there is.
+      UserError: there is too little memory; the message gives both numbers.
     """
     width, height = working_size(image.size, config.max_size, config.enlarge)
     per_pixel = BYTES_PER_PIXEL if config.octaves == 1 else OCTAVES_BYTES_PER_PIXEL

@@ -1,4 +1,4 @@
-"""What a file's content is known by."""
+"""Digests of the content of files and of SQLite databases."""
 
 import contextlib
 import hashlib
@@ -7,17 +7,22 @@ from pathlib import Path
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file's content, hexadecimal; read in parts. Raises OSError."""
+    """Return the SHA-256 of a file's content, hexadecimal; the file is read in parts.
+
+    Raises:
+      OSError: the file cannot be read.
+    """
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def rows_sha256(database: Path) -> str:
-    """SHA-256 of every row of every table, hexadecimal: COLMAP writes into the header of a database
-    whenever it opens it.
+    """Return the SHA-256 of every row of every table of an SQLite database, hexadecimal.
+
+    The file's own hash is of no use: COLMAP writes into a database's header whenever it opens it.
 
     Raises:
-      sqlite3.DatabaseError: it is damaged.
+      sqlite3.DatabaseError: the database is damaged.
     """
     digest = hashlib.sha256()
     uri = f"{database.absolute().as_uri()}?mode=ro&immutable=1"

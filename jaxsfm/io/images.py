@@ -1,7 +1,7 @@
-"""Finding and reading images: one function for everything that looks at pixels.
+"""Finding and reading images. All code that looks at the pixels of a photo reads it here.
 
-EXIF orientation is ignored, because COLMAP 4.2 ignores it (measured): the pixels lie as they are
-stored, so keypoints, intrinsics and COLMAP's own tools agree.
+Pixels are read as they are stored; the orientation in the EXIF data is ignored. COLMAP 4.2 does the
+same (measured), so keypoints and intrinsics agree with COLMAP's own tools.
 """
 
 import contextlib
@@ -26,45 +26,45 @@ logger = logging.getLogger(__name__)
 
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split())
 MAX_DECODED_PIXELS = 250_000_000
-"""Decoding more than this (0.75 GB) is refused, or done at reduced size where the format can."""
+"""Larger images (0.75 GB) are refused, or decoded at reduced size if their format allows it."""
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _REDUCED = {
     2: cv2.IMREAD_REDUCED_COLOR_2,
     4: cv2.IMREAD_REDUCED_COLOR_4,
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # we report damage ourselves
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # damage is reported by jaxsfm
 
 
 class ImageError(UserError):
-    """One image cannot be used; a run reports it and goes on with the others."""
+    """One image cannot be used. A run reports it and goes on with the others."""
 
 
 class DamagedImage(ImageError):
-    """Its very content cannot be decoded: trying again will not help."""
+    """The content of an image cannot be decoded, so trying again will not help."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImageFile:
-    """An image on disk, checked."""
+    """An image file that has been checked (`inspect_image`)."""
 
     name: str
-    """Path below the image folder, with '/'; what COLMAP and the reports call it."""
+    """The path below the image folder, with '/'. COLMAP and the reports use this name."""
     path: Path
     size: tuple[int, int]
     """(width, height) as stored, pixels."""
     sha256: str
-    """Of the file's bytes."""
+    """The SHA-256 of the file's bytes, hexadecimal."""
 
     @property
     def identity(self) -> int:
-        """32 bits of the content: the image's part in a pair's random key."""
+        """32 bits of the hash. They are the image's part in the random key of a pair."""
         return int(self.sha256[:8], 16)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WorkingImage:
-    """Pixels at working size."""
+    """The pixels of an image at working size."""
 
     rgb: np.ndarray
     """uint8 (height, width, 3)."""
@@ -73,7 +73,13 @@ class WorkingImage:
 
 
 def find_images(folder: Path) -> list[str]:
-    """Names of the image files below a folder, sorted; sub-folders included, hidden ones not."""
+    """Return the names of the image files in a folder and its sub-folders, sorted.
+
+    Hidden files and folders are left out.
+
+    Raises:
+      UserError: there is no such folder, it cannot be read, or it holds no images.
+    """
     try:
         if not folder.exists():
             raise UserError(f"{folder}: no such folder")
@@ -100,10 +106,15 @@ def find_images(folder: Path) -> list[str]:
 
 
 def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
-    """Size and identity of an image without decoding it.
+    """Check an image file and find its size and hash, without decoding it.
+
+    Args:
+      path: the file.
+      name: the image's name; None takes the name of the file.
 
     Raises:
-      ImageError: unreadable, empty, not an image, or too small for one matching window.
+      ImageError: the file is unreadable, empty, truncated or not an image, or the image is too
+        small for one matching window.
     """
     shown = shown_name(name or str(path))
     try:
@@ -114,17 +125,17 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
         data = path.read_bytes()
     except OSError as error:
         raise ImageError(f"{shown}: cannot be read ({error.strerror})") from error
-    except ValueError as error:  # no path can hold such a name
+    except ValueError as error:  # the name contains what no path can
         raise ImageError(f"{shown}: not a file's name") from error
     if not data:
         raise ImageError(f"{shown}: the file is empty")
     try:
         with warnings.catch_warnings(), _any_size():
-            warnings.simplefilter("ignore")  # odd metadata; only the size is wanted
-            # Not the path: reading from a file allocates what the header asks for.
+            warnings.simplefilter("ignore")  # about odd metadata; only the size is needed
+            # Pillow is not given the path: reading from a file, it allocates what the header says.
             with Image.open(io.BytesIO(data)) as header:
                 size = header.size
-    except Exception as error:  # its readers of fifty formats raise nearly anything
+    except Exception as error:  # Pillow's readers can raise almost anything
         raise ImageError(f"{shown}: not a readable image") from error
     if min(size) < MIN_SIDE:
         raise ImageError(
@@ -136,7 +147,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
 
 
 def shown_name(name: str) -> str:
-    """A file name that stays on one line in messages."""
+    """Return a file name for messages: line breaks and the like are replaced by escapes."""
     return name if name.isprintable() else name.encode("unicode_escape").decode()
 
 
@@ -144,9 +155,9 @@ _SCAN_END = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 
 
 def _jpeg_is_complete(data: bytes) -> bool:
-    """Whether the end marker follows the last scan; what a camera appends after it is ignored.
+    """Whether the end marker follows the last scan; bytes that a camera appends are ignored.
 
-    Source: ITU-T T.81, B.1: segments carry their length, entropy-coded data end at the next marker
+    Source: ITU-T T.81, B.1. Segments carry their length. Entropy-coded data ends at the next marker
     that is neither a stuffed zero nor a restart.
     """
     position = 2
@@ -169,14 +180,14 @@ def _jpeg_is_complete(data: bytes) -> bool:
 
 
 def _check_complete(data: bytes, shown: str) -> None:
-    """Decoders fill what is missing of a JPEG with grey, silently: refuse it here."""
+    """Refuse a truncated JPEG; decoders would fill the missing part with grey and not say so."""
     if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
         raise ImageError(f"{shown}: the file is truncated")
 
 
 @contextlib.contextmanager
 def _any_size() -> Iterator[None]:
-    """Let Pillow read the header of any image: we set our own limit on decoding."""
+    """Let Pillow read the header of an image of any size; `_decode` has a limit of its own."""
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
     try:
@@ -186,10 +197,12 @@ def _any_size() -> Iterator[None]:
 
 
 def image_bytes(image: ImageFile) -> bytes:
-    """The file as it was when it was inspected: what is made of it is kept under that content.
+    """Read the bytes of an image file, which must be those that were inspected.
+
+    Results are stored under the hash of the file, so they must not be made from other bytes.
 
     Raises:
-      ImageError: it cannot be read, or has been changed since.
+      ImageError: the file cannot be read, or it has changed since it was inspected.
     """
     try:
         data = image.path.read_bytes()
@@ -226,10 +239,12 @@ def _decode(image: ImageFile) -> np.ndarray:
 
 
 def working_size(size: tuple[int, int], max_size: int, enlarge: float = 1.0) -> tuple[int, int]:
-    """(width, height) with the longer side at most `max_size`, at least 1.
+    """Return (width, height) of the working image, each at least 1 pixel.
 
     Args:
-      enlarge: largest factor; 1: images are reduced only.
+      size: (width, height) of the original image.
+      max_size: the longer side is reduced, or enlarged, to this many pixels.
+      enlarge: the largest factor; with 1, images are never enlarged.
     """
     factor = min(max_size / max(size), enlarge)
     width, height = (max(1, round(side * factor)) for side in size)
@@ -237,10 +252,13 @@ def working_size(size: tuple[int, int], max_size: int, enlarge: float = 1.0) -> 
 
 
 def read_image(image: ImageFile, *, max_size: int, enlarge: float = 1.0) -> WorkingImage:
-    """Decode and resize; grey, alpha, 16-bit and CMYK become 8-bit RGB.
+    """Decode an image and resize it to its working size (`working_size`).
+
+    Images in grey, with alpha, with 16 bits or in CMYK are converted to RGB with 8 bits.
 
     Raises:
-      ImageError: the file cannot be decoded, or its reduced size is too narrow.
+      ImageError: the file cannot be decoded, or a side of the working image is shorter than
+        `MIN_SIDE`.
     """
     rgb = _decode(image)
     width, height = working_size(image.size, max_size, enlarge)

@@ -1,8 +1,8 @@
-"""Ctrl-C that cannot get lost.
+"""An interrupt (Ctrl-C) is noted, so that it cannot get lost; loops look for it between items.
 
-Python raises KeyboardInterrupt wherever it happens to be, and callbacks of native code swallow it:
-JAX's hook in the garbage collector did, in a test that ended with a finished run (measured). So the
-handler also leaves a note, and loops look for it between items.
+Python raises KeyboardInterrupt in whatever code is running. If that is a callback of native code,
+the exception may be swallowed: JAX's hook in the garbage collector did so in a test, and the run
+went on to its end.
 """
 
 import contextlib
@@ -21,7 +21,10 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def noted() -> Iterator[None]:
-    """Note Ctrl-C while the block runs; outside the main thread signals are not ours."""
+    """Note every Ctrl-C while the block runs, so that `check` finds it.
+
+    This does nothing outside the main thread, where Python allows no signal handlers.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -34,7 +37,7 @@ def noted() -> Iterator[None]:
 
 
 def check() -> None:
-    """Raise the KeyboardInterrupt that was noted and has not arrived."""
+    """Raise KeyboardInterrupt if Ctrl-C was noted and the exception has not arrived."""
     if _pending.is_set():
         _pending.clear()
         raise KeyboardInterrupt

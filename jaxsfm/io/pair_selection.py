@@ -1,7 +1,7 @@
-"""What `--pairs` says: which pairs are tried.
+"""The option `--pairs`: which pairs of photos are matched.
 
-`exhaustive`, a file, `sequential:K`, `retrieval:K`, or several of them joined by `+`, whose pairs
-are united.
+Its value is `exhaustive`, a file, `sequential:K`, `retrieval:K`, or several of these joined by `+`,
+which selects the pairs of all of them.
 """
 
 import os
@@ -15,21 +15,23 @@ from jaxsfm.io.pairs import Pair, exhaustive_pairs, make_pair, read_pairs
 
 
 class PairSelection(NamedTuple):
-    """The parts of `--pairs`."""
+    """The parts of a value of `--pairs`."""
 
     exhaustive: bool = False
+    """All pairs are selected."""
     files: tuple[Path, ...] = ()
+    """Files that list pairs."""
     sequential: int = 0
-    """So many next images of each; 0: none."""
+    """Each image is paired with this many images that follow it."""
     retrieval: int = 0
-    """So many most similar images of each; 0: none."""
+    """Each image is paired with this many images that are most similar to it."""
 
 
 def parse_pair_selection(text: str) -> PairSelection:
-    """The selection of a value of `--pairs`; a file of that very name comes first.
+    """Parse a value of `--pairs`. If a file of this name exists, the value is that file.
 
     Raises:
-      UserError: a part is nothing of all that.
+      UserError: a part is neither a file nor one of the known words, or its number is wrong.
     """
     parts = [text] if os.path.isfile(text) else text.split("+")
     selection = PairSelection()
@@ -57,13 +59,13 @@ def _count(part: str, number: str) -> int:
 
 
 def natural(name: str) -> tuple[list[str | int], str]:
-    """What names are sorted by for numbers to count: img2 before img10."""
+    """Return a sort key by which the numbers in names count: img2 comes before img10."""
     parts = re.split(r"([0-9]+)", name)
     return [int(p) if k % 2 else p for k, p in enumerate(parts)], name
 
 
 def sequential_pairs(names: Iterable[str], k: int) -> list[Pair]:
-    """Each image with its k next ones in the natural order of names."""
+    """Pair each image with the k that follow it in the natural order of names."""
     row = sorted(set(names), key=natural)
     return sorted(make_pair(a, b) for i, a in enumerate(row) for b in row[i + 1 : i + 1 + k])
 
@@ -71,14 +73,15 @@ def sequential_pairs(names: Iterable[str], k: int) -> list[Pair]:
 def selected_pairs(
     selection: PairSelection, names: Iterable[str], known: Iterable[str]
 ) -> list[Pair]:
-    """The pairs of a selection that need no photo to be looked at: all but those by retrieval.
+    """Return the selected pairs, without those of retrieval, which needs to look at the photos.
 
     Args:
+      selection: what is selected.
       names: the images that can be used.
-      known: those that a file may name.
+      known: the images that a file may name.
 
     Raises:
-      UserError: as `read_pairs`.
+      UserError: a file of pairs cannot be used (`read_pairs`).
     """
     names, known = list(names), list(known)
     pairs = set(exhaustive_pairs(names)) if selection.exhaustive else set()

@@ -1,8 +1,9 @@
-"""Which pairs are tried, what came of each, and which are handed on."""
+"""Pairs of images and their matches: the types, files that list pairs, and choices among pairs."""
 
+import abc
 import dataclasses
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,36 +14,42 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 
 Pair = tuple[str, str]
-"""Two image names, the lesser first."""
+"""The names of two images; the first one sorts before the second."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairResult:
-    """The verified matches of one pair, in original pixels."""
+    """The verified matches of one pair.
+
+    Coordinates are in pixels of the original images; the centre of the top-left pixel is (0, 0).
+    """
 
     pair: Pair
     cells: np.ndarray
-    """int32 (n, 2): the keypoints' indices in either image."""
+    """int32 (n, 2): for each match, the index of its keypoint in the first and second image."""
     keypoints0: np.ndarray
-    """float32 (n, 2): (x, y), original pixels of the first image, top-left centre (0, 0)."""
+    """float32 (n, 2): (x, y) in the first image."""
     keypoints1: np.ndarray
+    """float32 (n, 2): (x, y) in the second image."""
     plane: np.ndarray
-    """int32 (n,): which homography each match belongs to."""
+    """int32 (n,): the index of the homography that each match agrees with."""
     homographies: np.ndarray
-    """float64 (p, 3, 3): first image to second, original pixels."""
+    """float64 (p, 3, 3): they map points of the first image to the second one."""
     num_tentative: int
+    """The number of matches before verification."""
     num_dropped: int
-    """Candidates beyond the list's capacity, lost; 0 in practice."""
+    """The number of candidates that were lost because the list was full; 0 in practice."""
     status: Status
+    """Whether the pair was verified, and if not, why."""
 
     @property
     def num_inliers(self) -> int:
-        """One-to-one verified matches."""
+        """The number of verified matches; each keypoint is in at most one of them."""
         return len(self.plane)
 
     @property
     def counts(self) -> "PairCounts":
-        """What can be held of a hundred thousand pairs."""
+        """The numbers of this result, small enough to keep for a hundred thousand pairs."""
         return PairCounts(
             num_inliers=self.num_inliers,
             num_planes=len(self.homographies),
@@ -52,8 +59,39 @@ class PairResult:
         )
 
 
+class LazyMatches(Mapping[Pair, PairResult]):
+    """The matches of many pairs, of which each is made when it is asked for and not kept.
+
+    A subclass defines `_load`.
+
+    Args:
+      pairs: the pairs, in the order in which the mapping lists them.
+    """
+
+    def __init__(self, pairs: Iterable[Pair]) -> None:
+        self._pairs = dict.fromkeys(pairs)
+
+    @abc.abstractmethod
+    def _load(self, pair: Pair) -> PairResult:
+        """Make the matches of one of the pairs."""
+
+    def __getitem__(self, pair: Pair) -> PairResult:
+        if pair not in self._pairs:
+            raise KeyError(pair)
+        return self._load(pair)
+
+    def __contains__(self, pair: object) -> bool:
+        return pair in self._pairs
+
+    def __iter__(self) -> Iterator[Pair]:
+        return iter(self._pairs)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+
 class PairCounts(NamedTuple):
-    """A pair's result in numbers."""
+    """The numbers of a `PairResult` without its arrays."""
 
     num_inliers: int
     num_planes: int
@@ -63,17 +101,17 @@ class PairCounts(NamedTuple):
 
 
 def make_pair(a: str, b: str) -> Pair:
-    """The pair in canonical order."""
+    """Return two names as a pair, in order."""
     return (a, b) if a <= b else (b, a)
 
 
 def exhaustive_pairs(names: Iterable[str]) -> list[Pair]:
-    """All pairs, in order of their names."""
+    """Return all pairs of the images, sorted."""
     return list(itertools.combinations(sorted(names), 2))
 
 
 def _split(line: str, known: set[str]) -> Pair | None:
-    """The one way to cut a line into two known names (names may hold blanks)."""
+    """Cut a line into two names, at a tab or at the blank that has a known name on each side."""
     if "\t" in line:
         a, _, b = line.partition("\t")
         return (a.strip(), b.strip())
@@ -87,15 +125,20 @@ def _split(line: str, known: set[str]) -> Pair | None:
 
 
 def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
-    """Pairs from a text file: two names a line, by a blank or a tab; # starts a comment.
+    """Read pairs from a text file that has two names on each line, separated by a blank or a tab.
 
-    Names may hold blanks; names with a newline, or with # first, cannot be written in such a file.
+    Lines that start with # are comments. Names may contain blanks. A name that contains a newline
+    or starts with # cannot be written in such a file.
 
     Args:
-      known: the image folder's names.
+      path: the file.
+      known: the names of the images in the folder.
+
+    Returns: the pairs, sorted, each once.
 
     Raises:
-      UserError: the file, the line and what is wrong with it.
+      UserError: the file cannot be read, a line does not name two different images, or there are
+        no pairs in it.
     """
     names = set(known)
     try:
@@ -122,11 +165,14 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
 
 
 def best_pairs(num_inliers: Mapping[Pair, int], n: int) -> set[Pair]:
-    """Every image's n pairs with the most inliers, as a union.
+    """Return the union over all images of an image's n pairs with the most inliers.
 
-    A pair stays if it is among the best of *either* image, so nothing depends on the order of the
-    images (the authors' code keeps (i, j) only when j is in the list of the lower-numbered i).
-    Pairs without inliers never stay; equal counts are decided by name.
+    A pair is kept if it is among the best of *either* image. So the result does not depend on the
+    order of the images; the paper's code keeps (i, j) only if j is in the list of the
+    lower-numbered i. Pairs without inliers are never kept. Equal counts are decided by name.
+
+    Raises:
+      ValueError: n is less than 1.
     """
     if n < 1:
         raise ValueError(f"n must be at least 1; got {n}")
@@ -139,7 +185,7 @@ def best_pairs(num_inliers: Mapping[Pair, int], n: int) -> set[Pair]:
 
 
 def component_of(seeds: Iterable[str], edges: Iterable[Pair]) -> set[str]:
-    """All images reachable from `seeds` over `edges`."""
+    """Return all images that can be reached from `seeds` along `edges`, `seeds` included."""
     neighbours: dict[str, set[str]] = {}
     for a, b in edges:
         neighbours.setdefault(a, set()).add(b)
@@ -153,5 +199,5 @@ def component_of(seeds: Iterable[str], edges: Iterable[Pair]) -> set[str]:
 
 
 def describe(pair: Pair) -> str:
-    """A pair's name in messages."""
+    """Return the name of a pair for messages."""
     return f"{shown_name(pair[0])} - {shown_name(pair[1])}"

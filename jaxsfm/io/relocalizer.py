@@ -1,7 +1,7 @@
-"""Learned relocalizers: parameters of `jaxsfm.core.scores.Scores` in safetensors files.
+"""Files of learned relocalizers: the parameters of `jaxsfm.core.scores.Scores`.
 
-A file holds conv1_2.kernel, conv1_2.bias, conv1_2.out, conv1_2.place and the same of pool1 and of
-pool2, float32, and says in its metadata how it was made. Nothing in it can run code.
+A file is in the safetensors format. It holds the arrays conv1_2.kernel, conv1_2.bias, conv1_2.out
+and conv1_2.place, and the same for pool1 and pool2, all float32. Its metadata says how it was made.
 """
 
 import dataclasses
@@ -9,13 +9,13 @@ import functools
 import importlib.resources
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from jaxsfm.core.scores import PLACES, WALKED, Head
 from jaxsfm.errors import UserError
-from jaxsfm.io.safetensors_files import TensorFile, open_tensors, save_tensors
+from jaxsfm.io.atomic import Json
+from jaxsfm.io.safetensors_files import Parameters, TensorFile, open_tensors, save_tensors
 
 FORMAT = "jaxsfm relocalizer 1"
 SHIPPED = "relocalizer.safetensors"
@@ -24,17 +24,18 @@ MAX_HIDDEN = 1024
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Relocalizer:
-    """Learned scores and what is known of them."""
+    """Learned scores for keypoints, and how they were made."""
 
-    params: dict[str, Any]
-    """{'params': {level: `jaxsfm.core.scores.Head`'s fields by name}}, float32."""
+    params: Parameters
+    """{'params': {level: the fields of `jaxsfm.core.scores.Head` by name}}, float32."""
     sha256: str
-    about: dict[str, Any]
-    """The file's metadata: how the parameters were made."""
+    """The SHA-256 of the file."""
+    about: dict[str, Json]
+    """The metadata of the file: how the parameters were made."""
 
 
-def save_relocalizer(path: Path, params: Mapping[str, Any], about: Mapping[str, Any]) -> None:
-    """Write parameters of `Scores`; the same ones give the same bytes.
+def save_relocalizer(path: Path, params: Parameters, about: Mapping[str, Json]) -> None:
+    """Write the parameters of `Scores`. The same parameters always give the same bytes.
 
     Raises:
       UserError: the file cannot be written.
@@ -51,7 +52,7 @@ def load_relocalizer(path: Path) -> Relocalizer:
     """Read and check a relocalizer.
 
     Raises:
-      UserError: no such file, or not a relocalizer.
+      UserError: there is no such file, or it is not a relocalizer.
     """
     with open_tensors(
         path, marker=FORMAT, what="relocalizer", made_by="jaxsfm train relocalizer"
@@ -78,6 +79,6 @@ def _checked(file: TensorFile, level: str) -> dict[str, np.ndarray]:
 
 @functools.cache
 def shipped_relocalizer() -> Relocalizer:
-    """The one that comes with jaxsfm; docs/relocalization.md tells how it was made."""
+    """Load the relocalizer that comes with jaxsfm (docs/relocalization.md)."""
     with importlib.resources.as_file(importlib.resources.files("jaxsfm") / SHIPPED) as path:
         return load_relocalizer(path)

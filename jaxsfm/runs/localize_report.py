@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from typing import Literal, get_args
 
-from jaxsfm.colmap.model_arrays import View
 from jaxsfm.colmap.poses import CameraPose, Poses
+from jaxsfm.colmap.view import View
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.report.typed_json import OMITTED, to_json
 from jaxsfm.sfm.evaluation import ImageError, evaluate, pair_names
-from jaxsfm.sfm.register.locate_view import Located
+from jaxsfm.sfm.register.locate_view import Localization
 
 Outcome = Literal["localized", "doubtful", "lost", "unusable"]
 """A trusted pose; a pose that rests on matches alone; no pose; a file that is no usable photo."""
@@ -105,7 +105,7 @@ class LocalizedPhoto:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Localization:
+class LocalizationReport:
     """The result of one call of `localize`."""
 
     version: str
@@ -147,7 +147,7 @@ def _camera(view: View, source: str) -> PhotoCamera:
 
 def localized_photo(
     photo: str,
-    found: Located,
+    found: Localization,
     matches: Mapping[Pair, PairResult],
     *,
     source: str,
@@ -215,7 +215,7 @@ def error_against(
         return None
 
 
-def localize_lines(result: Localization) -> Iterator[str]:
+def localize_lines(result: LocalizationReport) -> Iterator[str]:
     """The result as text: a few lines for each photo, and a last line with the totals."""
     for row in result.photos:
         name = shown_name(row.photo)

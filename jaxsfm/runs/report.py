@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.external_matches import Given
+from jaxsfm.colmap.external_matches import ExternalMatches
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
@@ -31,7 +31,7 @@ from jaxsfm.report.run_results import ModelRow, PairRow, TriedPairs
 from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.reconstruction import Reconstructed
-from jaxsfm.sfm.register.grow import Grown
+from jaxsfm.sfm.register.grow import ExtendedModel
 from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class StageResults:
     """The counts of every pair that was tried."""
     handed_on: Collection[Pair]
     """The pairs whose matches were written into COLMAP's database."""
-    external: Given
+    external: ExternalMatches
     """The matches of another tool, mapped together with ours."""
     reconstructed: Reconstructed
     weights: UsedWeights
@@ -118,7 +118,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
 def extended_report(
     run: FinishedRun,
     models: "list[pycolmap.Reconstruction]",
-    grown: Grown,
+    grown: ExtendedModel,
     new: NewPhotos,
     matches: SavedMatches,
     verified: Mapping[Pair, int],

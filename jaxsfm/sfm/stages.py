@@ -1,4 +1,4 @@
-"""Stages whose files may be there from an earlier run."""
+"""Stages of a reconstruction, whose files may exist from an earlier run."""
 
 import contextlib
 import logging
@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 logger = logging.getLogger("jaxsfm")
 
 
-class Stages(Protocol):
-    """Where finished stages are kept (`jaxsfm.io.work_folder.WorkFolder`)."""
+class StageStore(Protocol):
+    """A place for the files of finished stages (`jaxsfm.io.work_folder.WorkFolder`)."""
 
     def stage(self, name: str, key: str) -> Path | None: ...
 
@@ -22,19 +22,19 @@ class Stages(Protocol):
     def forget_stage(self, name: str) -> None: ...
 
 
-class Kept(NamedTuple):
-    """Stages that may be there already."""
+class StageCache(NamedTuple):
+    """Stages of earlier runs, and what tells whether they still hold."""
 
-    stages: Stages
+    store: StageStore
     matches_key: str
-    """Of all that the matches are made of."""
+    """Identifies the matches. A stage is used again only for the same matches."""
 
 
-class InScratch:
-    """Stages that nothing is kept of."""
+class TemporaryStages:
+    """A store that starts empty, in a folder that the caller deletes."""
 
-    def __init__(self, scratch: str) -> None:
-        self._scratch = Path(scratch)
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder)
 
     def stage(self, name: str, key: str) -> Path | None:
         return None
@@ -46,18 +46,23 @@ class InScratch:
         yield folder
 
     def stage_folder(self, name: str) -> Path:
-        return self._scratch / name
+        return self._folder / name
 
     def forget_stage(self, name: str) -> None:
         pass
 
 
-def made(stages: Stages, name: str, key: str, make: Callable[[Path], None]) -> Path:
-    """The folder of a stage, made if it is not there."""
-    folder = stages.stage(name, key)
+def run_stage(store: StageStore, name: str, key: str, compute: Callable[[Path], None]) -> Path:
+    """The folder with the files of a stage. The stage runs only if `store` does not have it.
+
+    Args:
+      key: identifies everything that the stage depends on.
+      compute: runs the stage and writes its files into the given folder.
+    """
+    folder = store.stage(name, key)
     if folder is not None:
         logger.info("%s: as before, nothing it depends on has changed", name)
         return folder
-    with stages.record_stage(name, key) as fresh:
-        make(fresh)
-    return stages.stage_folder(name)
+    with store.record_stage(name, key) as fresh:
+        compute(fresh)
+    return store.stage_folder(name)

@@ -1,1 +1,1 @@
-"""Training of learned relocalizers: photos in, parameters of `jaxsfm.core.scores.Scores` out."""
+"""Learns relocalizers: the parameters of `jaxsfm.core.scores.Scores`, from photos."""

@@ -1,32 +1,47 @@
-"""The state of a training in one safetensors file, so that it can go on."""
+"""A checkpoint is the state of a training in one safetensors file, from which it can go on."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
 import safetensors
 import safetensors.numpy
+from jaxtyping import PyTree
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.atomic import Json, write_atomic
 
 State = TypeVar("State")
 FORMAT = "jaxsfm training 1"
 
 
-def save_checkpoint(path: Path, state: Any, about: dict[str, Any]) -> None:
-    """Write a tree of arrays and what training it is of."""
+def save_checkpoint(path: Path, state: PyTree, about: Mapping[str, Json]) -> None:
+    """Write the state of a training.
+
+    Args:
+      path: the file.
+      state: a tree of arrays.
+      about: which training it is, and what it has measured.
+
+    Raises:
+      UserError: the file cannot be written.
+    """
     leaves = {str(k): np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
     write_atomic(path, safetensors.numpy.save(leaves, metadata={FORMAT: json.dumps(about)}))
 
 
-def load_checkpoint(path: Path, like: State) -> tuple[State, dict[str, Any]]:
-    """The tree, of `like`'s structure, and what it is of.
+def load_checkpoint(path: Path, like: State) -> tuple[State, dict[str, Json]]:
+    """Read the state of a training, and what was saved about it.
+
+    Args:
+      path: the file.
+      like: a state with the same structure and shapes.
 
     Raises:
-      UserError: not such a file, or of another structure.
+      UserError: the file is not a checkpoint, or its state has another structure.
     """
     try:
         with safetensors.safe_open(path, framework="numpy") as file:

@@ -1,9 +1,9 @@
-"""What is trained for: the probability that two walks end in the same place."""
+"""The objective of the training: the probability that two walks end in the same place."""
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,28 +28,30 @@ from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 from jaxsfm.core.views import view_pair, warp_points
 
 MATCH_ERROR_PX = 3.0
-"""Of the cells that descriptors match, per axis: training with the exact cell instead loses within
-3 px what it gains within 1 px (docs/relocalization.md)."""
+"""Standard deviation per axis of the error with which descriptors match cells. Training with exact
+cells loses within 3 px what it gains within 1 px (docs/relocalization.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Objective:
-    """How walks of two views are compared; static in the training's programs."""
+    """How the walks in two views are compared. It is static in the training's programs."""
 
     temperature: float = 0.5
-    """Of the walks, in training; keypoints are hard."""
+    """Temperature of the random walks in training; the walks of keypoints always take the best
+    child."""
     sigma_px: float = 0.8
-    """How far apart two places agree."""
+    """Distance over which two places agree, pixels."""
     near_px: float = 3.0
-    """How far apart they nearly agree."""
+    """Distance over which two places nearly agree, pixels."""
     near: float = 0.3
-    """Weight of that."""
+    """Weight of nearly agreeing."""
     floor: float = 0.1
-    """Added to the probability before its logarithm: cells that cannot meet pull less."""
+    """Is added to the probability before the logarithm is taken, so that cells which cannot agree
+    have less influence."""
     peakiness: float = 0.0
-    """Weight of the walks' lack of peakiness."""
+    """Weight of the loss that makes the walks more certain of their end."""
     children: int = 2
-    """Per axis and level (K in the paper); the pipeline walks with 2."""
+    """Children per axis and level (K in the paper); the pipeline walks with 2."""
 
     def __post_init__(self) -> None:
         for name in ("temperature", "sigma_px", "near_px", "floor"):
@@ -61,27 +63,31 @@ class Objective:
 
 
 class Examples(NamedTuple):
-    """Pairs of views, as the maps that keypoints walk through, with cells that see the same."""
+    """Pairs of views with cells that show the same place."""
 
     maps0: tuple[Float[Array, "b h w c"], ...]
-    """conv1_2, pool1, pool2."""
+    """The maps of the first views that keypoints walk through: conv1_2, pool1, pool2."""
     maps1: tuple[Float[Array, "b h w c"], ...]
+    """The same maps of the second views."""
     cells: CellPairs
+    """The cells that show the same place."""
     known: Float[Array, "b 3 3"]
-    """View 0 to view 1 (pixels), or the fundamental matrix, x1' F x0 = 0."""
+    """The homography from the first view to the second (pixels), or the fundamental matrix F with
+    x1' F x0 = 0."""
 
 
 DISTANCES: dict[str, Callable[..., Array]] = {
     "homography": transfer_distances,
     "epipolar": epipolar_distances,
 }
+"""What `Examples.known` is -> the function that computes distances by it."""
 
 
 @functools.partial(jax.jit, static_argnames=("preprocessing",))
 def walked_maps(
     params: dict, views: Float[Array, "b v v 3"], *, preprocessing: Preprocessing
 ) -> tuple[Array, ...]:
-    """The maps that keypoints of whole views (0 .. 255) walk through."""
+    """Compute the maps of whole views (RGB in 0 .. 255) that keypoints walk through."""
     x = preprocess(views, preprocessing)
     size = jnp.broadcast_to(jnp.asarray(views.shape[1:3], jnp.int32), (views.shape[0], 2))
     return VGG16().apply(params, x, size, method="walked")  # pyright: ignore[reportReturnType]
@@ -96,11 +102,14 @@ def warped_examples(
     preprocessing: Preprocessing,
     size: int,
 ) -> Examples:
-    """Two views of every crop, and their maps.
+    """Make two views of every crop, related by a random homography, and compute their maps.
 
     Args:
-      params: of `VGG16`.
-      size: of the views, pixels.
+      params: the parameters of `VGG16`.
+      key: the key of all random choices.
+      crops: RGB in 0 .. 255.
+      preprocessing: what the network expects of an image.
+      size: the side of a view, pixels.
     """
     views_key, offsets_key = jax.random.split(key)
     keys = jax.random.split(views_key, crops.shape[0])
@@ -117,7 +126,7 @@ def warped_examples(
 
 
 def _scored(scores: dict | None, maps: tuple[Array, ...]) -> list[Array]:
-    """Score maps of one view, coarse to fine."""
+    """The score maps of one view, coarse to fine."""
     heads = heads_of(scores)
     return [score(x, head) for x, head in zip(maps, heads, strict=True)][::-1]
 
@@ -125,12 +134,18 @@ def _scored(scores: dict | None, maps: tuple[Array, ...]) -> list[Array]:
 def loss(
     scores: dict, examples: Examples, *, objective: Objective, supervision: str = "homography"
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Mean over cells of log((1 + floor) / (agreement + floor)), 0 for certain agreement, plus the
-    weighted lack of peakiness; and figures.
+    """Compute the loss of scores on examples.
+
+    It is the mean over cells of log((1 + floor) / (agreement + floor)), which is 0 if the walks
+    agree for certain, plus the weighted lack of peakiness.
 
     Args:
-      scores: parameters of `jaxsfm.core.scores.Scores`.
-      supervision: a key of DISTANCES: what `examples.known` is.
+      scores: the parameters of `jaxsfm.core.scores.Scores`.
+      examples: pairs of views.
+      objective: how walks are compared.
+      supervision: a key of `DISTANCES` that says what `examples.known` is.
+
+    Returns: the loss, and figures to show by name.
     """
 
     def one(maps0, maps1, cells, known):
@@ -166,10 +181,14 @@ def loss(
 
 @functools.partial(jax.jit, static_argnames=("children",))
 def shares(scores: dict | None, examples: Examples, *, children: int = 2) -> dict[str, Array]:
-    """Shares of hard keypoints within 1 and 3 px of the other view's, under the known homography.
+    """Measure how many keypoints lie within 1 and 3 px of the other view's keypoint.
 
     Args:
-      scores: parameters of `jaxsfm.core.scores.Scores`; None: the norm rule.
+      scores: the parameters of `jaxsfm.core.scores.Scores`; None takes the norm as the score.
+      examples: pairs of views with known homographies.
+      children: children per axis and level.
+
+    Returns: the shares `within_1` and `within_3`, and `cells`, the number of keypoints.
     """
 
     def places(maps: tuple[Array, ...], cell: Int[Array, "m 2"]) -> Float[Array, "m 2"]:
@@ -185,8 +204,8 @@ def shares(scores: dict | None, examples: Examples, *, children: int = 2) -> dic
     return within | {"cells": jnp.sum(counts).astype(jnp.float32)}
 
 
-def mean_shares(each: list[dict[str, Any]]) -> dict[str, float]:
-    """Of several examples' `shares`, by their cells."""
+def mean_shares(each: Sequence[Mapping[str, Array]]) -> dict[str, float]:
+    """Return the mean of the `shares` of several examples, weighted by their numbers of cells."""
     cells = sum(float(some["cells"]) for some in each)
     names = [name for name in each[0] if name != "cells"]
     return {

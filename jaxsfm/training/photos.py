@@ -1,4 +1,4 @@
-"""Square crops of photos, drawn by step: what views are made from."""
+"""Square crops of photos, from which the views of each training step are made."""
 
 import functools
 from collections.abc import Sequence
@@ -9,18 +9,21 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, read_image
 
 MAX_SIZE = 1024
-"""Longer side of the photos, pixels: views of 192 pixels then show more than a patch of wall."""
+"""Longer side of the photos, pixels. At this size, a view of 192 pixels usually shows more than a
+patch of wall."""
 DECODED = 64
-"""Photos kept in memory, 2 MB each."""
+"""The number of decoded photos that are kept in memory, 2 MB each."""
 HELD_OUT = 5
-"""Every fifth photo is not trained on; losses and figures of it are measured during training."""
+"""Every fifth photo is held out: it is not trained on, but used to measure the progress."""
 
 
 def split(images: Sequence[ImageFile]) -> tuple[list[ImageFile], list[ImageFile]]:
-    """Photos to train on and photos held out; by their content, not by their names or order.
+    """Split photos into those to train on and those held out.
+
+    The split depends on the content of the photos, not on their names or order.
 
     Raises:
-      UserError: fewer than two different photos.
+      UserError: there are fewer than two different photos.
     """
     different = sorted({image.sha256: image for image in images}.values(), key=lambda i: i.sha256)
     if len(different) < 2:
@@ -33,7 +36,13 @@ def split(images: Sequence[ImageFile]) -> tuple[list[ImageFile], list[ImageFile]
 
 
 class Crops:
-    """Crops of photos; those of a step depend on the photos, the seed and the step alone."""
+    """Random crops of photos. Those of a step depend on the photos, the seed and the step alone.
+
+    Args:
+      images: the photos.
+      side: the side of a crop, pixels.
+      seed: the seed of all random choices.
+    """
 
     def __init__(self, images: Sequence[ImageFile], *, side: int, seed: int) -> None:
         self._images = list(images)
@@ -42,12 +51,13 @@ class Crops:
 
     def _decode(self, index: int) -> np.ndarray:
         rgb = read_image(self._images[index], max_size=MAX_SIZE).rgb
-        # Smaller photos are mirrored, not enlarged: enlarged ones have no detail to find again.
+        # Smaller photos are mirrored and not enlarged, because an enlarged photo has no fine detail
+        # that could be found again.
         missing = [max(0, self._side - length) for length in rgb.shape[:2]]
         return np.pad(rgb, ((0, missing[0]), (0, missing[1]), (0, 0)), mode="symmetric")
 
     def draw(self, step: int, count: int) -> np.ndarray:
-        """float32 (count, side, side, 3), 0 .. 255, RGB."""
+        """Draw the crops of a step, float32 (count, side, side, 3), RGB in 0 .. 255."""
         rng = np.random.default_rng([self._seed, step])
         crops = np.empty((count, self._side, self._side, 3), np.float32)
         for crop in crops:

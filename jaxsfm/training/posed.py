@@ -1,7 +1,8 @@
-"""Epipolar supervision: real pairs of photos whose cameras are known.
+"""Epipolar supervision: training on real pairs of photos whose cameras are known.
 
-Photos are matched once, by the preset `paper`; matches whose cells lie near the true epipolar line
-are kept. A step takes windows of both photos around one of them, with all matches inside both.
+The photos are matched once, with the preset `paper`. Matches whose cells lie near the true epipolar
+line are kept. A training step cuts windows out of both photos around one match, and uses all
+matches that lie inside both windows.
 """
 
 import dataclasses
@@ -21,6 +22,7 @@ from jaxsfm.core.losses import CellPairs
 from jaxsfm.core.soft_matching import fundamental_matrix
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, read_image, working_size
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.pipeline import extract, match
 from jaxsfm.sfm.two_view import sampson_error
@@ -28,27 +30,32 @@ from jaxsfm.training.objective import Examples, walked_maps
 from jaxsfm.training.photos import DECODED, MAX_SIZE
 
 NEIGHBOURS = 3
-"""Photos that each photo is paired with: those taken from the nearest places, in its direction."""
+"""The number of photos that each photo is paired with: those whose cameras are nearest to it, among
+those that look in a similar direction."""
 MIN_COSINE = 0.7
-"""Between the optical axes of a pair (45 deg)."""
+"""The least cosine of the angle between the optical axes of a pair (45 degrees)."""
 MAX_ERROR_PX = 8.0
-"""Largest distance of a match's cell centres to the epipolar geometry: a cell's side."""
+"""The largest distance of the centres of matched cells to the epipolar geometry: a cell's side."""
 MIN_MATCHES = 50
+"""A pair with fewer matches is not used."""
 CAPACITY = 256
-"""Matches of a window."""
+"""The most matches of a window."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Pair:
     images: tuple[ImageFile, ImageFile]
     f: np.ndarray
-    """float64 (3, 3): x1' F x0 = 0, working pixels."""
+    """float64 (3, 3): the fundamental matrix in working pixels, x1' F x0 = 0."""
     cells: tuple[np.ndarray, np.ndarray]
-    """int (n, 2) each: (row, column) of the matches."""
+    """int (n, 2) each: (row, column) of the matched cells."""
 
 
 class PosedPairs:
-    """Windows of pairs of photos with known cameras; those of a step depend on the step alone."""
+    """Windows of pairs of photos with known cameras; `posed_pairs` makes one.
+
+    The windows of a step depend on the pairs, the seed and the step alone.
+    """
 
     def __init__(self, pairs: Sequence[_Pair], *, view: int, batch: int, seed: int) -> None:
         self._pairs, self._view, self._batch, self._seed = list(pairs), view, batch, seed
@@ -59,7 +66,7 @@ class PosedPairs:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what the windows are drawn from."""
+        """The SHA-256 of all that the windows are drawn from."""
         whole = hashlib.sha256()
         for pair in self._pairs:
             whole.update("".join(image.sha256 for image in pair.images).encode())
@@ -68,7 +75,7 @@ class PosedPairs:
         return whole.hexdigest()
 
     def draw(self, step: int, weights: Weights) -> Examples:
-        """A step's windows, as the maps that keypoints walk through."""
+        """Draw the windows of a step and compute their maps."""
         rng = np.random.default_rng([self._seed, step])
         windows = [self._window(rng) for _ in range(self._batch)]
         views0, views1, cells, known = (list(part) for part in zip(*windows, strict=True))
@@ -92,7 +99,7 @@ class PosedPairs:
             rgb = self._read(image)
             most = np.asarray(rgb.shape[:2]) // FINE_STRIDE - side
             start = np.clip(cells[chosen] - side // 2, 0, most)
-            # The window's own border changes the maps by what the network cannot see beyond it.
+            # Cells at the border are left out: the network sees zeros instead of the photo there.
             inside &= ((cells > start) & (cells < start + side - 1)).all(axis=1)
             row, col = FINE_STRIDE * start
             views.append(rgb[row : row + self._view, col : col + self._view].astype(np.float32))
@@ -128,12 +135,17 @@ def posed_pairs(
     """Match the photos that have a pose with their neighbours.
 
     Args:
-      intrinsics: one pinhole camera for all of them.
+      weights: the weights of the network.
+      images: the photos; those without a pose are left out.
+      poses: poses by name.
+      intrinsics: one pinhole camera for all photos.
       view: side of the windows, pixels.
-      batch: windows a step.
+      batch: windows in a step.
+      seed: the seed of the matching and of the windows.
 
     Raises:
-      UserError: no pair with enough matches, a camera with distortion, photos of several sizes.
+      UserError: no pair has enough matches, the camera has distortion, or the photos differ in
+        size.
     """
     images = [
         image
@@ -161,7 +173,7 @@ def posed_pairs(
         ]
         k0, k1 = (_camera_matrix(intrinsics, features[name].scale) for name in (a, b))
         f = _fundamental(poses[a], poses[b], k0, k1)
-        centres = [(cell[:, ::-1] + 0.5) * FINE_STRIDE - 0.5 for cell in cells]
+        centres = [Pixels.octave(FINE_STRIDE).to_original(cell[:, ::-1]) for cell in cells]
         near = np.abs(sampson_error(f, *centres)) < MAX_ERROR_PX
         if near.sum() >= MIN_MATCHES:
             pairs.append(_Pair(images=files, f=f, cells=(cells[0][near], cells[1][near])))
@@ -188,13 +200,12 @@ def _neighbours(images: dict[str, ImageFile], poses: Poses) -> set[tuple[str, st
 
 
 def _camera_matrix(intrinsics: Intrinsics, scale: tuple[float, float]) -> np.ndarray:
-    """Of the working image; centre of the top-left pixel (0, 0)."""
+    """The camera matrix of the working image; the centre of its top-left pixel is (0, 0)."""
     if intrinsics.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
         raise UserError(f"--intrinsics: training needs a pinhole camera; got {intrinsics.model}")
     *focal, cx, cy = intrinsics.params
-    fx, fy = focal[0], focal[-1]
-    sx, sy = scale
-    return np.asarray([[fx / sx, 0, cx / sx - 0.5], [0, fy / sy, cy / sy - 0.5], [0, 0, 1]])
+    x, y = Pixels(scale).from_colmap(np.asarray([cx, cy]))
+    return np.asarray([[focal[0] / scale[0], 0, x], [0, focal[-1] / scale[1], y], [0, 0, 1]])
 
 
 def _fundamental(a: CameraPose, b: CameraPose, k0: np.ndarray, k1: np.ndarray) -> np.ndarray:

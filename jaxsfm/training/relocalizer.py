@@ -1,23 +1,25 @@
-"""Training of a relocalizer's scores: `jaxsfm train relocalizer`."""
+"""The training of a relocalizer's scores, for the command `jaxsfm train relocalizer`."""
 
 import dataclasses
 import functools
 import hashlib
 import importlib.metadata
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import PyTree
 from tqdm import tqdm
 
 from jaxsfm.core.scores import HIDDEN, init_scores
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.relocalizer import save_relocalizer
 from jaxsfm.io.weights import Weights
@@ -34,29 +36,35 @@ from jaxsfm.training.photos import Crops, split
 from jaxsfm.training.posed import PosedPairs
 
 EVALUATION_BATCHES = 8
-KEPT_EVERY = 10
-"""Steps; a file of 0.1 MB."""
+"""The number of batches of held-out views on which the progress is measured."""
+SAVED_EVERY = 10
+"""The number of steps between two checkpoints, of 0.1 MB each."""
 EVALUATION_STEP = 1 << 30
-"""Crops to measure on are drawn as if by steps from here on."""
+"""The held-out views are drawn with step numbers from here on, which no training reaches."""
+Progress = list[Mapping[str, Json]]
+"""What was measured at each evaluation: the step, the loss and its parts, and the shares."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainOptions:
-    """What a training is of, beside the photos and the network."""
+    """The settings of a training. Its result depends on them, the photos and the network."""
 
     steps: int = 400
+    """The number of steps."""
     batch: int = 8
-    """Pairs of views a step."""
+    """Pairs of views in a step."""
     view: int = 192
     """Side of a view, pixels."""
     crop: int = 400
-    """Side of the part of a photo that views are made from, pixels."""
+    """Side of the crop of a photo from which views are made, pixels."""
     hidden: int = HIDDEN
+    """Hidden units of the perceptron of each level."""
     learning_rate: float = 0.01
-    """At the start; it falls to 0 along a cosine."""
+    """The learning rate at the start; it falls to 0 along a cosine."""
     epipolar_weight: float = 1.0
-    """Of the loss of posed pairs, where there are any."""
+    """Weight of the loss of posed pairs, if there are any."""
     seed: int = 0
+    """The seed of all random choices."""
     objective: Objective = dataclasses.field(default_factory=Objective)
 
     def __post_init__(self) -> None:
@@ -78,9 +86,12 @@ class TrainOptions:
 class State(NamedTuple):
     """Everything that changes from step to step."""
 
-    scores: Any
-    optimizer: Any
+    scores: PyTree
+    """The parameters of `jaxsfm.core.scores.Scores`."""
+    optimizer: optax.OptState
+    """The state of Adam."""
     step: np.ndarray
+    """int32 (): the number of steps so far."""
 
 
 def _optimizer(options: TrainOptions) -> optax.GradientTransformation:
@@ -91,7 +102,10 @@ def _optimizer(options: TrainOptions) -> optax.GradientTransformation:
 def train_step(
     state: State, warped: Examples, posed: Examples | None, *, options: TrainOptions
 ) -> tuple[State, dict[str, jax.Array]]:
-    """One step of Adam on the loss of warped views, and of posed pairs if there are any."""
+    """Make one step of Adam on the loss of warped views, and of posed pairs if there are any.
+
+    Returns: the new state, and figures of the loss before the step.
+    """
 
     def total(scores: dict) -> tuple[jax.Array, dict[str, jax.Array]]:
         value, figures = loss(scores, warped, objective=options.objective)
@@ -108,7 +122,7 @@ def train_step(
 
 
 def start_state(options: TrainOptions) -> State:
-    """Scores that are squared norms."""
+    """Return the state before the first step, in which scores equal squared norms."""
     scores = init_scores(jax.random.key(options.seed), hidden=options.hidden)
     return State(scores, _optimizer(options).init(scores), np.zeros((), np.int32))
 
@@ -122,19 +136,27 @@ def train_relocalizer(
     posed: PosedPairs | None = None,
     progress: bool = False,
     tell: Callable[[str], None] = lambda _: None,
-) -> dict[str, Any]:
-    """Train scores on photos and write them to `out`; returns what the file says of itself.
+) -> float:
+    """Train scores on photos and write them to a file.
 
-    Ten times in between, the share of keypoints within 1 and 3 px is measured on photos held out.
-    The state is kept beside `out` as it goes: the same call goes on after an interruption and gives
-    the same parameters as without one.
+    Ten times during the training, the shares of keypoints within 1 and 3 px are measured on photos
+    that are held out. A checkpoint is kept beside `out`. After an interruption the same call goes
+    on from there, and it gives the same parameters as a training without interruption.
 
     Args:
-      posed: pairs of photos with known cameras, besides.
-      tell: takes a line now and then.
+      weights: the weights of the network.
+      images: the photos.
+      out: the file for the relocalizer.
+      options: the settings.
+      posed: pairs of photos with known cameras, to train on besides.
+      progress: shows a bar.
+      tell: is called with a line of text now and then.
+
+    Returns: the time that the training took, seconds.
 
     Raises:
-      UserError: too few photos, or the state beside `out` is of another training.
+      UserError: there are too few photos, a file cannot be read or written, or the checkpoint
+        belongs to another training.
     """
     train, held_out = split(images)
     weights = dataclasses.replace(weights, params=jax.device_put(weights.params))
@@ -174,10 +196,11 @@ def train_relocalizer(
                     values = {k: round(float(v), 5) for k, v in figures.items()}
                     rows = [*history, {"step": step + 1, **values, **found}]
                     tell(f"step {step + 1:4d}: {_within(found)}, loss {values['loss']:.3f}")
-                # Together, so that an interruption never keeps a step without its measurement.
+                # Both change in one statement, so that no checkpoint has a step without its
+                # measurement.
                 state, history = new, rows
                 bar.update()
-                if (step + 1) % KEPT_EVERY == 0:
+                if (step + 1) % SAVED_EVERY == 0:
                     keep()
     except KeyboardInterrupt:
         keep()
@@ -185,7 +208,7 @@ def train_relocalizer(
     result = {**about, "held_out": {"norm": norm, "learned": history[-1]}, "history": history}
     save_relocalizer(out, jax.device_get(state.scores), result)
     kept.unlink(missing_ok=True)
-    return result | {"seconds": time.monotonic() - start}
+    return time.monotonic() - start
 
 
 def _within(found: dict[str, float]) -> str:
@@ -195,7 +218,7 @@ def _within(found: dict[str, float]) -> str:
 def _held_out_examples(
     warp: Callable[..., Examples], held_out: list[ImageFile], options: TrainOptions
 ) -> list[Examples]:
-    """The same for every training that holds the same photos out."""
+    """The examples to measure on. They depend on the held-out photos and the options alone."""
     crops = Crops(held_out, side=options.crop, seed=0)
     steps = [EVALUATION_STEP + k for k in range(EVALUATION_BATCHES)]
     return [warp(jax.random.key(step), crops.draw(step, options.batch)) for step in steps]
@@ -207,8 +230,8 @@ def _about(
     held_out: list[ImageFile],
     posed: PosedPairs | None,
     options: TrainOptions,
-) -> dict[str, Any]:
-    """What the trained parameters depend on, as plain JSON."""
+) -> dict[str, Json]:
+    """All that the trained parameters depend on."""
 
     def digest(images: list[ImageFile]) -> str:
         return hashlib.sha256("".join(i.sha256 for i in images).encode()).hexdigest()
@@ -225,16 +248,18 @@ def _about(
 
 
 def _resume(
-    kept: Path, options: TrainOptions, about: dict[str, Any], tell: Callable[[str], None]
-) -> tuple[State, list[dict[str, Any]]]:
+    kept: Path, options: TrainOptions, about: dict[str, Json], tell: Callable[[str], None]
+) -> tuple[State, Progress]:
+    """The state and the measurements so far: those of the checkpoint, if there is one."""
     state = start_state(options)
     if not kept.exists():
         return state, []
-    found, of = load_checkpoint(kept, state)
-    if of.get("of") != about:
+    found, saved = load_checkpoint(kept, state)
+    history = saved.get("history")
+    if saved.get("of") != about or not isinstance(history, list):
         raise UserError(
             f"{kept}: the state of another training (other photos or options); "
             "delete it to start again"
         )
     tell(f"going on from step {int(found.step)} ({kept})")
-    return jax.tree.map(jnp.asarray, found), list(of["history"])
+    return jax.tree.map(jnp.asarray, found), [row for row in history if isinstance(row, dict)]

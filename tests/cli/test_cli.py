@@ -480,13 +480,12 @@ def test_remapping_without_success_keeps_the_earlier_model(scene, tmp_path, caps
 def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(
     scene, tmp_path, monkeypatch, capfd
 ):
-    import jaxsfm.sfm.refine.passes
     from jaxsfm.io.images import ImageError
 
     def gone(*_, **__):
         raise ImageError("view1.png: cannot be read")
 
-    monkeypatch.setattr(jaxsfm.sfm.refine.passes, "refine_model", gone)
+    monkeypatch.setattr("jaxsfm.sfm.reconstruction.refine_model", gone)
     report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
     assert report["models"][0]["registered"] == 3 and report["refinement"] == [None]
     assert "no refinement: view1.png" in capfd.readouterr().err
@@ -505,7 +504,7 @@ def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
         models[0].deregister_frame(image.frame_id)
         return models, attempts
 
-    monkeypatch.setattr(mapper, "build_models", without_one)
+    monkeypatch.setattr("jaxsfm.sfm.reconstruction.build_models", without_one)
     report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
     assert report["models"][0]["registered"] == 3
     (placed,) = [p for p in report["refinement"][0]["placed"] if p["name"] == "view2.png"]

@@ -5,7 +5,13 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from jaxsfm.colmap.database import camera_for, read_images, read_matches, write_database
+from jaxsfm.colmap.database import (
+    VerificationOptions,
+    camera_for,
+    read_images,
+    read_matches,
+    write_database,
+)
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
@@ -58,7 +64,7 @@ def test_keypoints_that_are_known_are_the_old_ones_and_others_follow_them(tmp_pa
     add_images(path, {"a": (new, camera_for(new, None))})
     cells = np.r_[known[::-2], np.arange(200, 200 + more)]
     pairs = [("a", "b"), ("a", "c")]
-    add_matches(path, {p: matched(p, cells) for p in pairs}, seed=0, threads=1, scale=1.0)
+    add_matches(path, {p: matched(p, cells) for p in pairs}, VerificationOptions(threads=1))
     with pycolmap.Database.open(path) as db:
         for name in "bc":
             after = db.read_keypoints(ids[name])
@@ -74,7 +80,7 @@ def test_keypoints_that_are_known_are_the_old_ones_and_others_follow_them(tmp_pa
 def test_without_matches_nothing_is_verified(tmp_path):
     path = tmp_path / "database.db"
     write_database(path, images_in(tmp_path, "bc"), {}, intrinsics=None)
-    assert add_matches(path, {}, seed=0, threads=1, scale=1.0) == {}
+    assert add_matches(path, {}, VerificationOptions(threads=1)) == {}
 
 
 def test_a_full_disk_is_said_before_anything_is_written(tmp_path, monkeypatch):

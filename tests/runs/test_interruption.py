@@ -150,7 +150,7 @@ import jaxsfm.cli.main
 from jaxsfm.colmap import mapper
 import pycolmap
 
-mapper, path = sys.argv[1:]
+kind, path = sys.argv[1:]
 options = pycolmap.SyntheticDatasetOptions(
     num_rigs=1, num_frames_per_rig=60, num_points3D=4000, num_points2D_without_point3D=0
 )
@@ -163,7 +163,7 @@ def interrupt():
 
 def stuck():
     threading.Thread(target=interrupt, daemon=True).start()
-    mapper.build_models(path, {}, mapper.MapOptions(mapper=mapper, threads=1))
+    mapper.build_models(path, {}, mapper.MapOptions(mapper=kind, threads=1))
 
 jaxsfm.cli.main.COMMANDS["stuck"] = stuck
 sys.exit(jaxsfm.cli.main.main(["stuck"]))

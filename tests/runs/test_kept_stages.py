@@ -6,8 +6,6 @@ import shutil
 import pytest
 
 from jaxsfm.cli.main import main
-from jaxsfm.colmap import database as colmap
-from jaxsfm.colmap import mapper as mapping
 from jaxsfm.colmap import models as colmap_models
 from jaxsfm.runs import reconstruct as run
 from jaxsfm.sfm import reconstruction
@@ -29,8 +27,8 @@ def counted(monkeypatch) -> dict[str, int]:
 
     count(run.WorkFolder, "save_features", "extract")
     count(run.WorkFolder, "save_matches", "match")
-    count(colmap, "verify", "verify")
-    count(mapping, "build_models", "map")
+    count(reconstruction, "verify", "verify")
+    count(reconstruction, "build_models", "map")
     count(reconstruction, "_refined", "refine")
     return counts
 
@@ -103,7 +101,7 @@ def test_a_refinement_that_a_lost_photo_prevented_is_tried_again(scene, tmp_path
         raise ImageError("gone")
 
     with monkeypatch.context() as patch:
-        patch.setattr("jaxsfm.sfm.refine.passes.refine_model", gone)
+        patch.setattr("jaxsfm.sfm.reconstruction.refine_model", gone)
         assert main([*base, "--out", str(out)]) == 0
     made = []
     original = reconstruction._refined

@@ -21,9 +21,10 @@ from jaxsfm.io.store import Store
 from jaxsfm.matching.execution import Execution
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.runs import localize as localize_module
-from jaxsfm.runs.finished_model import by_similarity, choose_camera, known_model
+from jaxsfm.runs.finished_model import camera_prior, read_working_model
 from jaxsfm.runs.localize import localize
 from jaxsfm.runs.run_options import LocalizeOptions
+from jaxsfm.runs.similar_photos import similar_photos
 
 SIZE, WIDE = (320, 240), (368, 248)
 """Of one padded size: nothing is compiled twice."""
@@ -127,19 +128,19 @@ def test_kept_features_spare_the_next_call_and_change_no_pose(
     localized, plain, photos, tmp_path, monkeypatch
 ):
     run, computed = Path(shutil.copytree(plain[0], tmp_path / "run")), []
-    extracted = localize_module.extracted
+    extract_images = LocalEngine.extract_images
 
     def counted(weights, images, **kwargs):
         computed.append(len(images))
-        return extracted(weights, images, **kwargs)
+        return extract_images(weights, images, **kwargs)
 
-    monkeypatch.setattr(localize_module, "extracted", counted)
+    monkeypatch.setattr(LocalEngine, "extract_images", staticmethod(counted))
     for keep in (True, False):  # the second call neither computes nor deletes
         options = LocalizeOptions(keep_features=keep)
         row = localize([photos / "photos" / "new.png"], run, options=options)["photos"][0]
         assert row["cam_from_world"] == localized["new.png"]["cam_from_world"]
         assert len(list(run.glob("features/*/*.npz"))) == 3
-    assert computed == [3, 0]
+    assert computed == [3, 1, 1]  # the run's photos once, the new one in each call
 
 
 def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
@@ -161,7 +162,7 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
     names = ["view0.png", "view1_night.png", "view2.png"]
 
     def shortlist(k: int, names: list[str]) -> list[str]:
-        return list(by_similarity(run, weights, k, {"photo": image}, Execution())(image, names))
+        return list(similar_photos(run, weights, k, {"photo": image}, Execution())(image, names))
 
     assert shortlist(1, names) == ["view0.png"]  # it is that photo
     two = shortlist(2, names)
@@ -175,7 +176,7 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
     cut = tmp_path / "cut.png"
     cut.write_bytes((photos / "photos" / "new.png").read_bytes()[:2000])
     bad = inspect_image(cut, name="bad")
-    choose = by_similarity(run, weights, 1, {"photo": image, "bad": bad}, Execution())
+    choose = similar_photos(run, weights, 1, {"photo": image, "bad": bad}, Execution())
     assert choose(image, [*names, "bad"]) == ["view0.png"]
     with pytest.raises(ImageError):
         choose(bad, names)
@@ -194,7 +195,7 @@ def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
 
     monkeypatch.setattr(Store, "save_descriptor", refused)
     image = inspect_image(photos / "photos" / "again.png", name="photo")
-    choose = by_similarity(run, weights, 1, {"photo": image}, Execution())
+    choose = similar_photos(run, weights, 1, {"photo": image}, Execution())
     assert choose(image, ["view0.png", "view2.png"]) == ["view0.png"]
     assert not list(home.glob("descriptors/*/*"))
 
@@ -209,7 +210,7 @@ def test_features_that_cannot_be_kept_are_one_sentence(plain, photos, tmp_path, 
 
 
 def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, photos):
-    model = known_model(plain[0] / "sparse" / "0", preset("default"))
+    model = read_working_model(plain[0] / "sparse" / "0", preset("default"))
     new = inspect_image(photos / "photos" / "new.png", name="photo")
     odd_one, wide = (
         pycolmap.Camera(
@@ -222,13 +223,13 @@ def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, phot
 
     def chosen(*more):
         views = [*model.views, *(dataclasses.replace(first, camera=camera) for camera in more)]
-        found = choose_camera(new, views, None)
+        found = camera_prior(new, views, None)
         return found.source, found.camera.camera_id
 
     shared = first.camera.camera_id
     assert chosen() == chosen(odd_one) == chosen(odd_one, wide, wide) == ("run", shared)
     assert chosen(odd_one, odd_one)[0] == "guess"  # nobody can tell which
-    assert choose_camera(new, model.views[:1], None).source == "guess"  # nobody else's
+    assert camera_prior(new, model.views[:1], None).source == "guess"  # nobody else's
 
 
 def test_an_empty_folder_keeps_no_photo_from_its_pose(plain, photos, tmp_path):

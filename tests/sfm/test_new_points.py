@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from room_scene import Room, exact_tracks, read_of
+from room_scene import Room, exact_model, exact_tracks, read_of
 
-from jaxsfm.colmap.model_arrays import Tracks, select
+from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
-from jaxsfm.sfm.register.grow import Newcomer, grow
+from jaxsfm.sfm.register.grow import UnregisteredView, grow
 from jaxsfm.sfm.register.triangulate import matched_tracks, new_points, triangulated
 
 NEW = "3.png"
@@ -41,26 +41,26 @@ def all_matches(scene: Room, *, sigma: float = 0.0) -> dict[Pair, PairResult]:
     return found
 
 
-def half_known(scene: Room) -> tuple[Tracks, np.ndarray]:
-    """The tracks of every other point, of all views but the new one, and which points are new."""
-    tracks = exact_tracks(scene)
+def half_known(scene: Room) -> Model:
+    """The model of every other point, without observations of the new view."""
+    model = exact_model(scene)
     known = np.arange(len(scene.points)) % 2 == 0
-    return select(tracks, known[tracks.point] & (tracks.view != 3)), ~known
+    return model.select(known[model.tracks.point] & (model.tracks.view != 3))
 
 
 def test_rays_meet_where_the_points_are(rendered):
-    tracks = exact_tracks(rendered)
-    found = triangulated(rendered.views, tracks._replace(points=np.zeros_like(tracks.points)))
+    model = exact_model(rendered)
+    nowhere = model.tracks._replace(points=np.zeros_like(model.tracks.points))
+    found = triangulated(model.with_tracks(nowhere)).tracks
     np.testing.assert_allclose(found.points, rendered.points, atol=1e-6)
-    alone = select(tracks, tracks.view == 0)
-    assert np.isnan(triangulated(rendered.views, alone).points).all()
+    alone = model.select(model.tracks.view == 0)
+    assert np.isnan(triangulated(alone).tracks.points).all()
 
 
 def test_what_has_a_point_gets_no_other_and_the_rest_is_found_where_it_is(rendered):
-    tracks, _ = half_known(rendered)
-    made = new_points(
-        rendered.views, tracks, {NEW}, all_matches(rendered), read_of(rendered), refinement=None
-    )
+    model = half_known(rendered)
+    tracks = model.tracks
+    made = new_points(model, {NEW}, all_matches(rendered), read_of(rendered), refinement=None)
     assert len(made.points) > 100
     distance = np.linalg.norm(made.points[:, None] - rendered.points[None], axis=2)
     nearest = distance.argmin(1)
@@ -74,10 +74,10 @@ def test_what_has_a_point_gets_no_other_and_the_rest_is_found_where_it_is(render
 
 
 def test_a_keypoint_that_leads_to_two_of_one_view_makes_no_point(rendered):
-    tracks, _ = half_known(rendered)
+    model = half_known(rendered)
     matches = all_matches(rendered)
     fresh = {NEW, "4.png"}
-    right = matched_tracks(rendered.views, tracks, fresh, matches)
+    right = matched_tracks(model, fresh, matches)
     pair = ("0.png", NEW)
     wrong = matches[pair]
     cells = wrong.cells.copy()
@@ -85,7 +85,7 @@ def test_a_keypoint_that_leads_to_two_of_one_view_makes_no_point(rendered):
     matches[pair] = dataclasses.replace(
         wrong, cells=cells, keypoints0=np.roll(wrong.keypoints0, 1, axis=0)
     )
-    mixed = matched_tracks(rendered.views, tracks, fresh, matches)
+    mixed = matched_tracks(model, fresh, matches)
     assert len(mixed.points) < len(right.points)
     for point in range(len(mixed.points)):
         seen = mixed.view[mixed.point == point]
@@ -94,11 +94,9 @@ def test_a_keypoint_that_leads_to_two_of_one_view_makes_no_point(rendered):
 
 @pytest.mark.parametrize("refinement", [None, Refinement()])
 def test_alignment_takes_the_noise_of_matches_away(rendered, refinement):
-    tracks, _ = half_known(rendered)
     matches = all_matches(rendered, sigma=1.0)
-    made = new_points(
-        rendered.views, tracks, {NEW}, matches, read_of(rendered), refinement=refinement
-    )
+    model = half_known(rendered)
+    made = new_points(model, {NEW}, matches, read_of(rendered), refinement=refinement)
     planes = np.stack([rendered.points, rendered.normals], axis=1)
     off = np.abs(np.einsum("npk,pk->np", made.points[:, None] - planes[None, :, 0], planes[:, 1]))
     error = np.median(off[np.arange(len(off)), _nearest(made.points, rendered.points)])
@@ -116,20 +114,20 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
     use[use.sum(1) < 2] = False
     tracks = exact_tracks(rendered, use=use)
     every = {view.name: view for view in rendered.views}
-    newcomers = {
-        NEW: Newcomer(every[NEW], False, ["0.png", "1.png", "2.png", "4.png"]),
-        "4.png": Newcomer(every["4.png"], False, [NEW]),
+    unregistered = {
+        NEW: UnregisteredView(every[NEW], False, ["0.png", "1.png", "2.png", "4.png"]),
+        "4.png": UnregisteredView(every["4.png"], False, [NEW]),
     }
     grown = grow(
-        rendered.views[:3],
-        tracks,
-        newcomers,
+        Model(rendered.views[:3], tracks),
+        unregistered,
         all_matches(rendered),
         read_of(rendered),
         refinement=Refinement(),
     )
     assert grown.placed == [NEW, "4.png"] and grown.rounds == 2
-    np.testing.assert_array_equal(grown.tracks.points[: len(tracks.points)], tracks.points)
-    assert len(grown.tracks.points) > len(tracks.points)
-    for view, truth in zip(grown.views, rendered.views, strict=True):
+    points = grown.model.tracks.points
+    np.testing.assert_array_equal(points[: len(tracks.points)], tracks.points)
+    assert len(points) > len(tracks.points)
+    for view, truth in zip(grown.model.views, rendered.views, strict=True):
         np.testing.assert_allclose(view.centre, truth.centre, atol=0.02)

@@ -4,32 +4,36 @@ import dataclasses
 
 import numpy as np
 import pytest
-from room_scene import SIZE, Room, exact_tracks, read_of
+from room_scene import SIZE, Room, exact_model, read_of
 
 from jaxsfm.colmap.resection import adjust_view
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine import octave_pose
 from jaxsfm.sfm.refine.octave_pose import (
-    Followed,
-    Observed,
-    Pose,
-    _doubt,
-    at_octave,
+    AlignedPoints,
+    OctavePose,
+    PoseHypothesis,
     follow,
-    pose_doubt,
+    octave_reader,
     trusted,
 )
+from jaxsfm.sfm.refine.pose_doubt import pose_doubt, projection_doubt
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 NIGHT = 2
 
 
-def observed(scene: Room, rows: np.ndarray, sigma: float) -> Observed:
+def observed(scene: Room, rows: np.ndarray, sigma: float) -> AlignedPoints:
     """Points as the night view would show them, off by noise."""
     points = scene.points[rows]
     xy = scene.views[NIGHT].project(points)[0]
     noise = np.random.default_rng(0).normal(0, sigma, xy.shape)
-    return Observed(rows, points, xy + noise, scene.points[scene.visible[:, NIGHT]])
+    return AlignedPoints(rows, points, xy + noise, scene.points[scene.visible[:, NIGHT]])
+
+
+def doubt_of(view: View, seen: AlignedPoints, error_px: float, side: float) -> float:
+    return projection_doubt(view, seen.points, seen.xy, seen.candidates, error_px, side)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 2.0])
@@ -46,8 +50,8 @@ def test_doubt_is_how_far_off_projections_are(rendered, sigma):
         assert found is not None
         off = found.project(seen.points)[0] - seen.xy
         median = float(np.median(np.linalg.norm(off, axis=1)))
-        doubts.append(_doubt(found, seen, median, 1))
-        errors.append(found.project(seen.could)[0] - view.project(seen.could)[0])
+        doubts.append(doubt_of(found, seen, median, 1))
+        errors.append(found.project(seen.candidates)[0] - view.project(seen.candidates)[0])
     true = np.sqrt(np.mean(np.square(errors)))
     assert 0.6 < np.median(doubts) / true < 1.3
 
@@ -77,7 +81,7 @@ def test_points_in_a_corner_leave_more_doubt_than_fewer_everywhere(rendered):
     corner = rows[np.argsort(at @ [1.0, 1.0])[: len(rows) // 8]]
     spread = rows[:: len(rows) // 30]
     doubt = [
-        _doubt(rendered.views[NIGHT], observed(rendered, some, 1.0), 1.0, 1)
+        doubt_of(rendered.views[NIGHT], observed(rendered, some, 1.0), 1.0, 1)
         for some in (corner, spread)
     ]
     assert len(spread) < len(corner) / 2 and doubt[0] > 2 * doubt[1]
@@ -88,12 +92,12 @@ def test_patches_that_overlap_count_once(rendered):
     seen = observed(rendered, rows, 1.0)
     twice = seen._replace(points=np.repeat(seen.points, 2, 0), xy=np.repeat(seen.xy, 2, 0))
     view = rendered.views[NIGHT]
-    assert _doubt(view, twice, 1.0, 1) == pytest.approx(_doubt(view, seen, 1.0, 1))
+    assert doubt_of(view, twice, 1.0, 1) == pytest.approx(doubt_of(view, seen, 1.0, 1))
 
 
 def test_one_point_determines_no_pose(rendered):
     seen = observed(rendered, np.full(40, np.flatnonzero(rendered.visible[:, NIGHT])[0]), 1.0)
-    assert _doubt(rendered.views[NIGHT], seen, 1.0, 15) == np.inf
+    assert doubt_of(rendered.views[NIGHT], seen, 1.0, 15) == np.inf
 
 
 @pytest.mark.parametrize(
@@ -105,8 +109,8 @@ def test_a_pose_is_trusted_with_little_doubt_and_enough_that_agrees(
 ):
     view = rendered.views[NIGHT]
     seen = observed(rendered, np.arange(40), 1.0)
-    best = Pose(view, 2, seen, 40, 1.0, doubt_px)
-    pose = Followed(view=view, own_camera=False, best=best, share=share)
+    best = OctavePose(view, 2, seen, 40, 1.0, doubt_px)
+    pose = PoseHypothesis(view=view, own_camera=False, best=best, share=share)
     assert trusted(pose) is (best if right else None)
     assert trusted(dataclasses.replace(pose, best=None)) is None
 
@@ -117,7 +121,7 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
     start, end, last = rendered.views[NIGHT], rendered.views[0], rendered.views[1]
     seen = observed(rendered, np.arange(40), 1.0)
     found = {"doubtful": 0.8, "sure": 0.3, "lost": None}
-    poses = {name: Followed(view=start, own_camera=False) for name in found}
+    poses = {name: PoseHypothesis(view=start, own_camera=False) for name in found}
     began = []
 
     def descend(moving, *_):
@@ -125,17 +129,11 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
         began.append([(name, poses[name].view) for name in names])
         for name in names:
             doubt_px = found[name]
-            best = Pose(end, 2, seen, 40, 1.0, doubt_px) if doubt_px else None
+            best = OctavePose(end, 2, seen, 40, 1.0, doubt_px) if doubt_px else None
             poses[name].view, poses[name].best = last, best
 
     monkeypatch.setattr(octave_pose, "_descend", descend)
-    follow(
-        list(poses.values()),
-        rendered.views,
-        exact_tracks(rendered),
-        read_of(rendered),
-        Refinement(),
-    )
+    follow(list(poses.values()), exact_model(rendered), read_of(rendered), Refinement())
     first, second = began
     assert [(name, view is start) for name, view in first] == [(name, True) for name in found]
     assert [(name, view is end) for name, view in second] == [("doubtful", True)]
@@ -143,8 +141,9 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
 
 @pytest.mark.parametrize("px", [1, 2, 8])
 def test_an_octaves_pixels_are_means_and_lie_where_they_lay(rendered, px):
-    tracks = exact_tracks(rendered)
-    views, smaller, read = at_octave(px, rendered.views, tracks, read_of(rendered))
+    model = exact_model(rendered)
+    tracks, views, smaller = model.tracks, model.in_octave(px).views, model.in_octave(px).tracks
+    read = octave_reader(read_of(rendered), px)
     at, _ = views[0].project(rendered.points[:50])
     whole, _ = rendered.views[0].project(rendered.points[:50])
     np.testing.assert_allclose((at + 0.5) * px - 0.5, whole)

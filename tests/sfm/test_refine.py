@@ -7,21 +7,22 @@ import pycolmap
 import pytest
 from room_scene import (
     SIZE,
+    arrays,
     errors,
+    exact_model,
     exact_tracks,
     hidden,
     noisy_model,
     other_scene,
     refine,
-    sizes,
-    template,
     view_of,
 )
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, room
-from jaxsfm.colmap.model_arrays import Tracks, build_model, read_model_arrays
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.track_alignment import neighbourhoods
@@ -58,7 +59,8 @@ def test_lost_observations_come_back_and_hidden_ones_do_not(rendered):
     after, figures = refine(before, rendered)
     assert sum(f.added for f in figures.passes) > 500
     assert after.compute_mean_track_length() > 1.5 * before.compute_mean_track_length()
-    views, tracks = read_model_arrays(after, sizes(rendered))
+    model = arrays(after, rendered)
+    views, tracks = model.views, model.tracks
     # After alignment to the truth every point lies on its plane: find the plane, ask who hides it.
     planes = room()
     wrong = 0
@@ -101,8 +103,7 @@ def test_a_view_that_agrees_with_nothing_keeps_its_observations_and_its_pose(ren
     assert errs[1]["2.png"].position < 2 * errs[0]["2.png"].position + 0.002
     others = [np.mean([e.position for n, e in es.items() if n != "2.png"]) for es in errs]
     assert others[1] < others[0]
-    views, tracks = read_model_arrays(after, sizes(rendered))
-    assert (tracks.view == 2).sum() > 100
+    assert (arrays(after, rendered).tracks.view == 2).sum() > 100
 
 
 def test_a_view_that_is_weak_in_one_pass_is_placed(rendered, monkeypatch):
@@ -186,8 +187,8 @@ def test_thresholds_refuse_what_makes_no_sense_and_have_effects(rendered):
 
 def test_arrays_of_a_model_become_the_same_model(rendered):
     tracks = exact_tracks(rendered)
-    model = build_model(template(rendered), rendered.views, tracks)
-    views, back = read_model_arrays(model, sizes(rendered))
+    model = arrays(exact_model(rendered).to_colmap(), rendered)
+    views, back = model.views, model.tracks
     np.testing.assert_allclose(back.points, tracks.points)
     order = np.lexsort((back.view, back.point))
     np.testing.assert_array_equal(back.point[order], tracks.point)
@@ -203,7 +204,7 @@ def test_projection_and_rays_undo_each_other_for_any_camera_and_scale():
     distorted = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=960, height=720, params=[900.0, 470.0, 350.0, -0.08]
     )
-    view = dataclasses.replace(view_of(pose, 0), camera=distorted, scale=np.asarray([2.0, 1.9]))
+    view = dataclasses.replace(view_of(pose, 0), camera=distorted, pixels=Pixels((2.0, 1.9)))
     xy = np.random.default_rng(0).uniform([0, 0], [479, 359], (50, 2))
     back, depth = view.project(view.centre + 3.0 * view.rays(xy))
     np.testing.assert_allclose(back, xy, atol=1e-6)
@@ -213,7 +214,7 @@ def test_projection_and_rays_undo_each_other_for_any_camera_and_scale():
 
 
 def test_normals_are_the_planes_normals_and_face_the_cameras(rendered):
-    got = plane_geometry.normals(exact_tracks(rendered), rendered.views, neighbours=12)
+    got = plane_geometry.normals(exact_model(rendered), neighbours=12)
     cosine = np.abs(np.einsum("ni,ni->n", got, rendered.normals))
     assert np.mean(cosine > np.cos(np.radians(5))) > 0.8  # the rest lies where planes meet
     centre = np.mean([view.centre for view in rendered.views], axis=0)
@@ -227,7 +228,8 @@ def test_plane_affines_are_derivatives_of_the_planes_homography(rendered):
     xy = one.project(points)[0]
     n = len(both)
     zeros, threes = np.zeros(n, int), np.full(n, 3)
-    got = plane_geometry.plane_affines(points, rendered.views, normals, zeros, threes, xy)
+    patches = plane_geometry.ReferencePatches(points, normals, zeros, xy)
+    got = plane_geometry.plane_affines(rendered.views, patches, threes)
     k = camera_matrix(SIZE)
     for i in range(0, n, 17):
         rotation = two.rotation @ one.rotation.T
@@ -242,15 +244,14 @@ def test_plane_affines_are_derivatives_of_the_planes_homography(rendered):
 
 
 def test_points_move_onto_their_reference_rays_within_their_planes(rendered):
-    tracks = exact_tracks(rendered)
-    seen = plane_geometry.visibility(tracks, rendered.views, rendered.normals)
+    model = exact_model(rendered)
+    tracks = model.tracks
+    seen = plane_geometry.visibility(model, rendered.normals)
     reference = plane_geometry.reference_views(seen)
     assert seen.tracked[np.arange(len(reference)), reference].all()
     xy = seen.xy[np.arange(len(reference)), reference]
     moved_xy = xy + np.random.default_rng(2).normal(0, 1, xy.shape)
-    moved = plane_geometry.on_reference_rays(
-        tracks, rendered.views, rendered.normals, reference, moved_xy
-    )
+    moved = plane_geometry.on_reference_rays(model, rendered.normals, reference, moved_xy)
     off = np.einsum("ni,ni->n", moved - tracks.points, rendered.normals)
     assert np.mean(np.abs(off) < 1e-9) > 0.9  # else: nearly parallel, the depth was kept
     for k, view in enumerate(rendered.views):

@@ -4,22 +4,24 @@ import dataclasses
 
 import numpy as np
 import pytest
-from room_scene import Room, camera, exact_tracks, other_scene, read_of
+from room_scene import Room, camera, exact_model, other_scene, read_of
 from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 
-from jaxsfm.colmap.model_arrays import Tracks, View, part_of
+from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.register.locate_view import Located, locate
+from jaxsfm.sfm.register.locate_view import Localization, locate
 
 
-def known(scene: Room) -> tuple[list[View], Tracks]:
+def known(scene: Room) -> Model:
     """The exact model without the view that is to be found."""
     use = scene.visible.copy()
     use[:, NIGHT] = False
-    return part_of(scene.views, exact_tracks(scene, use=use), set(scene.images) - {NIGHT_NAME})[:2]
+    return exact_model(scene, use=use).part(set(scene.images) - {NIGHT_NAME})[0]
 
 
-def found(scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, focal=1.0) -> Located:
+def found(
+    scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, focal=1.0
+) -> Localization:
     unknown = camera()
     unknown.params = [*(focal * np.asarray(unknown.params[:2])), *unknown.params[2:]]
     image = dataclasses.replace(
@@ -27,15 +29,15 @@ def found(scene: Room, *, right: int = 6, wrong: int = 18, own_camera=False, foc
     )
     return locate(
         image,
-        *known(scene),
+        known(scene),
         night_matches(scene, right=right, wrong=wrong).matches,
         read_of(scene),
-        config=Refinement(),
+        refinement=Refinement(),
         own_camera=own_camera,
     )
 
 
-def errors(located: Located, scene: Room) -> tuple[float, float]:
+def errors(located: Localization, scene: Room) -> tuple[float, float]:
     """Of centre and rotation (degrees)."""
     assert located.view is not None
     truth = scene.views[NIGHT]
@@ -83,8 +85,9 @@ def test_too_few_matches_are_no_pose_and_are_counted(rendered):
 
 
 def test_a_part_of_a_model_is_what_its_views_see(rendered):
-    tracks = exact_tracks(rendered)
-    views, part, rows = part_of(rendered.views, tracks, {"0.png", "3.png"})
+    tracks = exact_model(rendered).tracks
+    smaller, rows = exact_model(rendered).part({"0.png", "3.png"})
+    views, part = smaller.views, smaller.tracks
     assert [view.name for view in views] == ["0.png", "3.png"]
     seen = rendered.visible[:, [0, 3]]
     assert len(part.points) == seen.any(1).sum() and len(part.xy) == seen.sum()
@@ -96,14 +99,13 @@ def test_a_part_of_a_model_is_what_its_views_see(rendered):
 
 
 def test_no_view_is_no_pose(rendered):
-    views, part, _ = part_of(rendered.views, exact_tracks(rendered), set())
+    part, _ = exact_model(rendered).part(set())
     located = locate(
         rendered.views[NIGHT],
-        views,
         part,
         {},
         read_of(rendered),
-        config=Refinement(),
+        refinement=Refinement(),
         own_camera=False,
     )
     assert located.view is None and located.why

@@ -9,37 +9,34 @@ import tolerances
 from room_scene import (
     SIZE,
     Room,
+    arrays,
     camera,
+    exact_model,
     exact_tracks,
     noisy_model,
     other_scene,
     read_of,
     refine,
     sizes,
-    template,
 )
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.colmap.mapper import registered
-from jaxsfm.colmap.model_arrays import View, build_model, read_model_arrays
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import PairResult, make_pair
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry, weak_views
-from jaxsfm.sfm.refine.octave_pose import Followed, follow
+from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, matched_points
+from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.passes import refine_model
+from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
-from jaxsfm.sfm.refine.weak_views import (
-    NO_EVIDENCE,
-    Evidence,
-    LeftOut,
-    Placed,
-    place_weak_views,
-    take_out,
-)
+from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views, remove_unconfirmed
 
 NIGHT, NIGHT_NAME = 2, "2.png"
 PHOTONS = 0.02
@@ -68,7 +65,7 @@ def lost_view(
         rotation=np.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ views[NIGHT].rotation,
         centre=views[NIGHT].centre + [shift, 0, 0],
     )
-    return build_model(template(scene), views, tracks)
+    return Model(views, tracks).to_colmap()
 
 
 def place(
@@ -80,15 +77,25 @@ def place(
     evidence=NO_EVIDENCE,
     **config,
 ):
-    return place_weak_views(
-        model,
+    """The COLMAP model with its weak views placed; the same object if nothing changed."""
+    before = arrays(model, scene)
+    after, placed = place_weak_views(
+        before,
         weak,
         read_of(scene),
         sizes(scene),
-        config=Refinement(**config),
+        refinement=Refinement(**config),
         refine_intrinsics=refine_intrinsics,
         evidence=evidence,
     )
+    return (model if after is before else after.to_colmap()), placed
+
+
+def take_out(model, placed, scene: Room):
+    """The COLMAP model without its unconfirmed views; the same object if nothing changed."""
+    before = arrays(model, scene)
+    after, told = remove_unconfirmed(before, placed)
+    return (model if after is before else after.to_colmap()), told
 
 
 def night_error(model, scene: Room) -> tuple[float, float]:
@@ -121,7 +128,7 @@ def test_refinement_places_a_view_that_it_cannot_align(rendered):
     tracks = exact_tracks(night)
     sigma = np.where(tracks.view == NIGHT, 3.0, 0.7)[:, None]
     noise = sigma * np.random.default_rng(1).normal(size=tracks.xy.shape)
-    before = build_model(template(night), night.views, tracks._replace(xy=tracks.xy + noise))
+    before = Model(night.views, tracks._replace(xy=tracks.xy + noise)).to_colmap()
     after, figures = refine(before, night)
     assert [p.name for p in figures.placed] == [NIGHT_NAME] == figures.passes[-1].weak_views
     without, old = refine(before, night, weak_octaves=0)
@@ -138,7 +145,8 @@ def test_the_other_views_and_their_observations_stay(rendered):
         if before.image(image_id).name != NIGHT_NAME:
             one, two = (m.image(image_id).cam_from_world().matrix() for m in (before, after))
             np.testing.assert_allclose(one, two, atol=1e-14)
-    (_, old), (views, new) = (read_model_arrays(m, sizes(night)) for m in (before, after))
+    old, new = (arrays(m, night).tracks for m in (before, after))
+    views = arrays(after, night).views
     assert (new.view != NIGHT).sum() == (old.view != NIGHT).sum()
     own = np.flatnonzero(new.view == NIGHT)
     assert len(own) > 100 and len(np.unique(new.point[own])) == len(own)
@@ -160,15 +168,14 @@ def test_a_view_that_neither_alignment_nor_observations_hold_is_taken_out(render
     elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
     before = lost_view(elsewhere, seen=seen)
     model, placed = place(before, elsewhere)
-    after, (told,) = take_out(model, placed, sizes(elsewhere))
+    after, (told,) = take_out(model, placed, elsewhere)
     assert registered(after) == registered(before) - (set() if stays else {NIGHT_NAME})
     assert told.held == (None if stays else seen)
     if stays:
         assert after is before
         return
-    (views, tracks), (old_views, old) = (
-        read_model_arrays(m, sizes(elsewhere)) for m in (after, before)
-    )
+    new, earlier = arrays(after, elsewhere), arrays(before, elsewhere)
+    views, tracks, old_views, old = new.views, new.tracks, earlier.views, earlier.tracks
     for k, view in enumerate(views):  # of the others nothing changes
         j = [v.name for v in old_views].index(view.name)
         np.testing.assert_allclose(view.centre, old_views[j].centre, **tolerances.UNIT)
@@ -179,19 +186,19 @@ def test_a_view_that_neither_alignment_nor_observations_hold_is_taken_out(render
 def test_a_view_that_alignment_confirms_stays_however_little_held_it(rendered):
     night = by_night(rendered)
     model, placed = place(lost_view(night, seen=10), night)
-    after, (told,) = take_out(model, placed, sizes(night))
+    after, (told,) = take_out(model, placed, night)
     assert told.octave_px is not None and told.held is None and after is model
 
 
 def test_two_views_are_a_model_whatever_holds_them(rendered):
     model = lost_view(rendered, seen=0)
     weak = [
-        Placed(name=n, registered=True, octave_px=None, candidates=9, agreed=0, error_px=None)
+        Placement(name=n, registered=True, octave_px=None, candidates=9, agreed=0, error_px=None)
         for n in sorted(registered(model))
     ]
-    few = read_model_arrays(model, sizes(rendered))
-    bare = build_model(model, few[0], few[1]._replace(points=np.zeros((0, 3))))
-    assert take_out(bare, weak, sizes(rendered)) == (bare, weak)
+    few = arrays(model, rendered)
+    bare = few.with_tracks(few.tracks._replace(points=np.zeros((0, 3)))).to_colmap()
+    assert take_out(bare, weak, rendered) == (bare, weak)
 
 
 def test_refinement_takes_a_photo_of_another_place_out_of_the_model(rendered):
@@ -206,15 +213,7 @@ def test_refinement_takes_a_photo_of_another_place_out_of_the_model(rendered):
 
 def test_a_model_of_weak_views_alone_stays_as_it_was(rendered):
     before = lost_view(rendered)
-    after, placed = place_weak_views(
-        before,
-        list(rendered.images),
-        read_of(rendered),
-        sizes(rendered),
-        config=Refinement(),
-        refine_intrinsics=False,
-        evidence=NO_EVIDENCE,
-    )
+    after, placed = place(before, rendered, weak=list(rendered.images))
     assert after is before and all(p.octave_px is None and not p.candidates for p in placed)
 
 
@@ -228,9 +227,8 @@ def without_night(scene: Room) -> pycolmap.Reconstruction:
     use = without(scene.visible, NIGHT)
     views = [view for k, view in enumerate(scene.views) if k != NIGHT]
     tracks = exact_tracks(scene, use=use)
-    return build_model(
-        template(scene), views, tracks._replace(view=tracks.view - (tracks.view > NIGHT))
-    )
+    shifted = tracks._replace(view=tracks.view - (tracks.view > NIGHT))
+    return Model(views, shifted).to_colmap()
 
 
 def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
@@ -259,7 +257,7 @@ def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
             num_dropped=0,
             status=Status.VERIFIED,
         )
-    return Evidence(results, [LeftOut(NIGHT_NAME, NIGHT + 1, camera())], 0)
+    return Evidence(results, [UnmappedImage(NIGHT_NAME, NIGHT + 1, camera())], 0)
 
 
 def test_an_image_that_was_left_out_is_registered_from_a_few_right_matches(rendered):
@@ -288,7 +286,7 @@ def test_a_photo_that_went_away_is_not_missed(rendered):
     model.deregister_frame(model.image(NIGHT + 1).frame_id)
     evidence = night_matches(rendered, right=20, wrong=0)
     after, figures = refine_model(
-        model, read, config=Refinement(), refine_intrinsics=False, evidence=evidence
+        model, read, refinement=Refinement(), refine_intrinsics=False, evidence=evidence
     )
     assert after.num_reg_images() == 4 and figures.placed == []
     assert [p.accepted for p in figures.passes] == [True, True]
@@ -309,9 +307,17 @@ def test_matches_bring_a_lost_view_back(rendered):
     before = lost_view(night, turn_deg=15.0, shift=0.3)
     assert place(before, night)[1][0].octave_px is None
     after, (placed,) = place(
-        before, night, evidence=night_matches(night, right=20, wrong=20)._replace(left_out=())
+        before, night, evidence=night_matches(night, right=20, wrong=20)._replace(unmapped=())
     )
     assert placed.registered and night_error(after, night)[0] < 0.01
+
+
+def with_night_camera(model, scene: Room, alone: pycolmap.Camera) -> pycolmap.Reconstruction:
+    """The model with another camera for the night view."""
+    before = arrays(model, scene)
+    views = list(before.views)
+    views[NIGHT] = dataclasses.replace(views[NIGHT], camera=alone)
+    return before.with_views(views).to_colmap()
 
 
 @pytest.mark.parametrize(("own", "refined"), [(True, True), (False, False)])
@@ -323,9 +329,7 @@ def test_only_a_camera_of_its_own_gets_another_focal_length(rendered, own, refin
         alone = pycolmap.Camera(before.camera(1).todict())
         alone.camera_id = 2
         alone.focal_length_x = alone.focal_length_y = 1.03 * right
-        views, tracks = read_model_arrays(before, sizes(night))
-        views[NIGHT] = dataclasses.replace(views[NIGHT], camera=alone)
-        before = build_model(before, views, tracks)
+        before = with_night_camera(before, night, alone)
     after, (placed,) = place(before, night, refine_intrinsics=True)
     assert placed.octave_px is not None
     found = after.image(NIGHT + 1).camera
@@ -337,8 +341,9 @@ def test_only_a_camera_of_its_own_gets_another_focal_length(rendered, own, refin
 
 def test_targets_are_a_part_of_all_views(rendered):
     """Aligning to some views gives what aligning to all gives there, to the last bit."""
-    tracks, config = exact_tracks(rendered), Refinement()
-    arguments = (tracks, rendered.views, read_of(rendered), config, config.max_shift_px)
+    refinement = Refinement()
+    limits = AlignmentLimits.of(refinement)
+    arguments = (exact_model(rendered), read_of(rendered), refinement, limits)
     (every,) = align_blocks(*arguments)
     (some,) = align_blocks(*arguments, targets=[1, 3])
     mine = np.isin(every.found.view, [1, 3])
@@ -352,16 +357,16 @@ def test_targets_are_a_part_of_all_views(rendered):
 
 def test_only_points_that_a_target_may_show_are_looked_at(rendered):
     """A view that looks aside: what it shows is the same, the rest of the model costs nothing."""
-    tracks, config, views = exact_tracks(rendered), Refinement(), list(rendered.views)
+    model, refinement, views = exact_model(rendered), Refinement(), rendered.views
 
     def turned(degrees: float) -> View:
         turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
         return dataclasses.replace(views[1], rotation=turn @ views[1].rotation)
 
     def aligned(view: View, targets):
-        some = [*views, dataclasses.replace(view, image_id=99)]
-        read = read_of(rendered)
-        return list(align_blocks(tracks, some, read, config, config.max_shift_px, targets=targets))
+        some = model.with_views([*views, dataclasses.replace(view, image_id=99)])
+        limits = AlignmentLimits.of(refinement)
+        return list(align_blocks(some, read_of(rendered), refinement, limits, targets=targets))
 
     (every,) = aligned(turned(35), None)
     (some,) = aligned(turned(35), [len(views)])
@@ -371,8 +376,8 @@ def test_only_points_that_a_target_may_show_are_looked_at(rendered):
     np.testing.assert_array_equal(some.rows[some.found.point], every.rows[every.found.point][mine])
     np.testing.assert_array_equal(some.moved, every.moved[mine])
     assert aligned(turned(180), [len(views)]) == []
-    behind = Followed(view=turned(180), own_camera=False)
-    follow([behind], views, tracks, read_of(rendered), config)
+    behind = PoseHypothesis(view=turned(180), own_camera=False)
+    follow([behind], model, read_of(rendered), refinement)
     assert behind.best is None and behind.agreed == 0
 
 
@@ -380,11 +385,9 @@ def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendere
     before = without_night(rendered)
     evidence = night_matches(rendered, right=30, wrong=0)
     assert {pair[0] == NIGHT_NAME for pair in evidence.matches} == {True, False}
-    views, tracks = read_model_arrays(before, sizes(rendered))
-    normal = plane_geometry.normals(tracks, views, neighbours=16)
-    xy, points = weak_views.matched_points(
-        rendered.views[NIGHT], views, tracks, normal, evidence.matches
-    )
+    model = arrays(before, rendered)
+    normal = plane_geometry.normals(model, neighbours=16)
+    xy, points = matched_points(rendered.views[NIGHT], model, normal, evidence.matches)
     off = np.linalg.norm(rendered.views[NIGHT].project(points)[0] - xy, axis=1)
     assert len(off) > 60 and np.median(off) < 6 and np.quantile(off, 0.9) < 12
 
@@ -395,9 +398,7 @@ def test_a_shared_camera_is_no_views_own(monkeypatch, rendered, own):
     if own:
         alone = pycolmap.Camera(before.camera(1).todict())
         alone.camera_id = 2
-        views, tracks = read_model_arrays(before, sizes(rendered))
-        views[NIGHT] = dataclasses.replace(views[NIGHT], camera=alone)
-        before = build_model(before, views, tracks)
+        before = with_night_camera(before, rendered, alone)
     followed = []
     monkeypatch.setattr(weak_views, "follow", lambda poses, *_: followed.extend(poses))
     place(before, rendered, refine_intrinsics=True)

@@ -32,7 +32,7 @@ from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.typed_json import to_json
-from jaxsfm.runs.finished_model import choose_camera, known_model
+from jaxsfm.runs.finished_model import camera_prior, read_working_model
 from jaxsfm.runs.localize import locate_photo
 from jaxsfm.runs.localize_report import error_against, localized_photo
 from jaxsfm.sfm.refine.passes import refine_model
@@ -55,13 +55,13 @@ def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Pa
     pairs = [row.pair for row in run.report.pairs.each if row.handed_on]
     partial, options = scratch / "partial.db", map_options(run, files)
     colmap.write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
-    colmap.verify(
-        partial,
+    verification = colmap.VerificationOptions(
         seed=options.seed,
         threads=options.threads,
         scale=options.scale,
         relative_poses=run.config.view_graph,
     )
+    colmap.verify(partial, verification)
     return partial.rename(database)
 
 
@@ -98,7 +98,7 @@ def without(
         models[0], _ = refine_model(
             models[0],
             Photos(files.values(), run.config).gray,
-            config=run.config.refinement,
+            refinement=run.config.refinement,
             refine_intrinsics=options.refine_intrinsics,
             threads=options.threads,
         )
@@ -112,8 +112,8 @@ def localized(
 ) -> dict[str, Any]:
     """The image's row."""
     seed = run.report.options.seed
-    model, image = known_model(folder / "sparse" / "0", run.config, seed=seed), files[name]
-    chosen = choose_camera(image, model.views, None)
+    model, image = read_working_model(folder / "sparse" / "0", run.config, seed=seed), files[name]
+    chosen = camera_prior(image, model.views, None)
     names = [view.name for view in model.views]
     pairs = [row.pair for row in run.report.pairs.each if name in row.pair]
     pairs = [pair for pair in pairs if set(pair) - {name} <= set(names)]

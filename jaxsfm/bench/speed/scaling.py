@@ -14,6 +14,7 @@ import numpy as np
 
 import jaxsfm
 from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
+from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.config import Config, preset
 from jaxsfm.io.images import ImageFile
@@ -137,7 +138,7 @@ def measure_stage(data: Path) -> Iterator[Metric]:
     def sift() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             database = Path(scratch) / "database.db"
-            write_rootsift_database(database, folder, photos, None, seed=0, threads=-1)
+            write_rootsift_database(database, folder, photos, None, VerificationOptions())
 
     def ours(config: Config) -> None:
         features = jaxsfm.extract(weights, photos, config=config)

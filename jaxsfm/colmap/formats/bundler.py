@@ -17,7 +17,7 @@ from jaxsfm.colmap.formats.lens import (
     check_no_tangential,
     check_one_focal,
     lens_of,
-    observed,
+    point_tracks,
     registered_images,
 )
 
@@ -50,7 +50,7 @@ def write_bundler(folder: Path, model: pycolmap.Reconstruction) -> None:
         lines.append(_row(_FLIP @ pose.translation))
     sizes = [model.camera(image.camera_id) for image in images]
     centres = [np.array([camera.width, camera.height]) / 2 for camera in sizes]
-    for _, point in observed(model, images):
+    for _, point in point_tracks(model, images):
         seen = [str(len(point.seen))]
         for k, keypoint, xy in point.seen:
             x, y = xy - centres[k]

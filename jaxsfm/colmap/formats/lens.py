@@ -120,7 +120,7 @@ def check_no_blanks(names: Iterable[str], to: str) -> None:
             )
 
 
-class Observed(NamedTuple):
+class PointTrack(NamedTuple):
     """A 3-D point and where images see it."""
 
     xyz: np.ndarray
@@ -143,9 +143,9 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return sorted(images, key=lambda image: image.name)
 
 
-def observed(
+def point_tracks(
     model: pycolmap.Reconstruction, images: list[pycolmap.Image]
-) -> Iterator[tuple[int, Observed]]:
+) -> Iterator[tuple[int, PointTrack]]:
     """The points by id; indices of images are those in `images`."""
     index = {image.image_id: k for k, image in enumerate(images)}
     pixels = [
@@ -159,4 +159,4 @@ def observed(
             k = index[element.image_id]
             seen.setdefault(k, (k, element.point2D_idx, pixels[k][element.point2D_idx]))
         red, green, blue = (int(c) for c in point.color)
-        yield point_id, Observed(point.xyz, (red, green, blue), list(seen.values()))
+        yield point_id, PointTrack(point.xyz, (red, green, blue), list(seen.values()))

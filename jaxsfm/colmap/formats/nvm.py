@@ -16,7 +16,7 @@ from jaxsfm.colmap.formats.lens import (
     check_no_tangential,
     check_one_focal,
     lens_of,
-    observed,
+    point_tracks,
     registered_images,
 )
 from jaxsfm.errors import UserError
@@ -77,7 +77,7 @@ def nvm_text(model: pycolmap.Reconstruction) -> str:
         numbers = [lens.fx, w, x, y, z, *image.projection_center(), undistortion(lens)]
         lines.append(f"{image.name} {' '.join(repr(float(v)) for v in numbers)} 0")
     lines += ["", str(model.num_points3D())]
-    for _, point in observed(model, images):
+    for _, point in point_tracks(model, images):
         seen = []
         for k, keypoint, xy in point.seen:
             mx, my = xy - (lenses[k].cx, lenses[k].cy)

@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.formats.lens import Lens, check_one_focal, lens_of, observed, registered_images
+from jaxsfm.colmap.formats.lens import (
+    Lens,
+    check_one_focal,
+    lens_of,
+    point_tracks,
+    registered_images,
+)
 from jaxsfm.colmap.formats.tables import Tables
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
@@ -101,7 +107,7 @@ def sfm_data(
             rotation = image.cam_from_world().rotation.matrix().tolist()
             pose = {"rotation": rotation, "center": image.projection_center().tolist()}
             poses.append((key, pose))
-        for point_id, point in observed(model, images):
+        for point_id, point in point_tracks(model, images):
             seen = [(keys[k], {"id_feat": f, "x": (xy - 0.5).tolist()}) for k, f, xy in point.seen]
             points.append((point_id, {"X": point.xyz.tolist(), "observations": _keyed(seen)}))
     return {

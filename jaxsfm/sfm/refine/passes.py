@@ -1,46 +1,43 @@
-"""Multi-view keypoint refinement: after mapping, every track's observations are moved onto one
-reference patch, new observations are added where the point projects into a view that agrees, what
-does not agree is dropped, then bundle adjustment and filtering; repeated.
+"""Multi-view refinement of keypoints, in passes after mapping.
 
-The reference keypoint stays where it is: it *is* the point. So relocalization's spread over views
-(1-2 px) goes, and tracks reach across every view that shows the surface. Views that show too little
-to be aligned so are placed at the end, on the structure of the others
+In a pass, every observation of a track is moved onto one reference patch. Views into which the
+point projects, and that agree with the patch, get new observations; observations that do not agree
+are dropped. Bundle adjustment and filtering follow.
+
+The reference keypoint stays where it is, because it defines the point. So the spread of relocalized
+keypoints over the views (1-2 px) goes, and a track reaches every view that shows its surface. Views
+that show too little to be aligned in this way are placed at the end, on the structure of the others
 (`jaxsfm.sfm.refine.weak_views`).
 """
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import (
-    Sizes,
-    Tracks,
-    View,
-    build_model,
-    bundle_adjust,
-    errors_px,
-    read_model_arrays,
-    select,
-)
+from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.model import Model, Sizes
+from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
+from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
+from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
-from jaxsfm.sfm.refine.weak_views import NO_EVIDENCE, Evidence, Placed, place_weak_views, take_out
+from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views, remove_unconfirmed
 
 if TYPE_CHECKING:
     import pycolmap
 
 MIN_POINTS = 10
-"""A model with fewer points is left alone."""
+"""A model with fewer points is not refined."""
 MIN_POINT_SHARE = 0.25
-"""A pass that loses more of the points is taken back: the images do not agree well enough."""
+"""A pass that keeps less of the points is taken back: the images do not agree well enough."""
 WEAK_COUNT, WEAK_SHARE = 30, 0.25
-"""A view where fewer of its observations agree (in number, or of those it had) keeps the old ones:
-a night photo would else hang on a handful."""
+"""A view is weak if fewer of its observations agree (in number, or as a share of those it had). It
+keeps its old observations in the pass: otherwise a night photo would hang on a handful."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,10 +45,10 @@ class PassFigures:
     """What one pass did."""
 
     accepted: bool
-    """False: too little agreed; the model before the pass stays."""
+    """False: too little agreed, and the model before the pass stays."""
     candidates: int
     kept: int
-    """Observations of the tracks before the pass that agreed with their reference."""
+    """Observations of the tracks before the pass that agreed with their reference patch."""
     dropped: int
     added: int
     weak_views: list[str]
@@ -67,99 +64,101 @@ class RefinementFigures:
     """What the refinement of a model did."""
 
     passes: list[PassFigures]
-    placed: list[Placed]
-    """The weak views of any pass, and images that the mapper left out."""
+    placed: list[Placement]
+    """Of the views that were weak in any pass, and of images that the mapper left out."""
 
 
-def _gather(
-    tracks: Tracks, views: list[View], blocks: list[AlignedBlock]
-) -> tuple[Tracks, np.ndarray]:
-    """The new tracks, and the weak views."""
-    had = np.bincount(tracks.view, minlength=len(views))
-    agreed = np.zeros(len(views), int)
+def _gather(model: Model, blocks: Sequence[AlignedBlock]) -> tuple[Model, np.ndarray]:
+    """The model with its new tracks, and the indices of the weak views."""
+    tracks, count = model.tracks, len(model.views)
+    had = np.bincount(tracks.view, minlength=count)
+    agreed = np.zeros(count, int)
     points = tracks.points.copy()
-    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    parts: list[Observations] = []
     alive = np.zeros(len(points), bool)
-    for b in blocks:
-        points[b.rows] = b.points
-        good = np.flatnonzero(b.agrees)
-        own = np.unique(b.found.point[good])
-        alive[b.rows[own]] = True
-        parts.append((b.rows[own], b.reference[own], b.xy[own]))
-        parts.append((b.rows[b.found.point[good]], b.found.view[good], b.moved[good]))
-        kept = good[b.tracked[good]]
-        agreed += np.bincount(b.found.view[kept], minlength=len(views))
-        agreed += np.bincount(b.reference[own], minlength=len(views))
+    for block in blocks:
+        points[block.rows] = block.patches.points
+        own = block.confirmed
+        alive[block.rows[own]] = True
+        parts += block.observations()
+        agreed += np.bincount(block.found.view[block.agrees & block.tracked], minlength=count)
+        agreed += np.bincount(block.patches.reference[own], minlength=count)
     weak = np.flatnonzero(agreed < np.maximum(np.minimum(WEAK_COUNT, had), WEAK_SHARE * had))
-    point, view, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
-    # Old observations of weak views, of points that live on, where nothing new took their place.
+    # Weak views keep old observations of points that remain, where no new one took their place.
     old = np.flatnonzero(np.isin(tracks.view, weak) & alive[tracks.point])
-    taken = np.isin(tracks.point[old] * len(views) + tracks.view[old], point * len(views) + view)
-    old = old[~taken]
-    point = np.concatenate([point, tracks.point[old]])
-    view = np.concatenate([view, tracks.view[old]])
-    xy = np.concatenate([xy, tracks.xy[old]])
-    order = np.lexsort((view, point))  # whatever the blocks: sums round the same way
-    return Tracks(points, point[order], view[order], xy[order]), weak
+    taken = np.concatenate([part.point * count + part.view for part in parts])
+    old = old[~np.isin(tracks.point[old] * count + tracks.view[old], taken)]
+    parts.append(tracks.select(old).observations)
+    return model.with_tracks(Tracks.from_parts(points, parts, ordered=True)), weak
 
 
-def _size(read: Reader, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
-    gray, scale = read(name)
-    return (gray.shape[1], gray.shape[0]), scale
+def _working_sizes(
+    reconstruction: "pycolmap.Reconstruction", read: Reader, evidence: Evidence
+) -> tuple[Sizes, Evidence]:
+    """The sizes of all images, and the evidence without unmapped images that cannot be read."""
+
+    def working_size(name: str) -> tuple[tuple[int, int], tuple[float, float]]:
+        gray, scale = read(name)
+        return (gray.shape[1], gray.shape[0]), scale
+
+    sizes = {}
+    for image_id in sorted(reconstruction.reg_image_ids()):
+        name = reconstruction.image(image_id).name
+        sizes[name] = working_size(name)
+    readable = []
+    for image in evidence.unmapped:
+        with contextlib.suppress(ImageError):  # deleted since; it is not in the model anyway
+            sizes[image.name] = working_size(image.name)
+            readable.append(image)
+    return sizes, evidence._replace(unmapped=readable)
 
 
 def refine_model(
-    model: "pycolmap.Reconstruction",
+    reconstruction: "pycolmap.Reconstruction",
     read: Reader,
     *,
-    config: Refinement,
+    refinement: Refinement,
     refine_intrinsics: bool,
     evidence: Evidence = NO_EVIDENCE,
     threads: int = -1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
-    """A refined model, and what was done.
+    """Refine a model.
 
     Thresholds are in pixels of the working images. An image where too little agrees keeps its old
-    observations, at four times the error limit, until it is placed on the refined structure; one
-    that cannot be placed and that hardly any observations hold is taken out. A pass that would
-    lose most of the points is taken back.
+    observations, with four times the error limit, until it is placed on the refined structure. One
+    that cannot be placed and has hardly any observations is taken out. A pass that would lose most
+    of the points is taken back.
 
     Args:
-      model: from the mapper; not changed.
+      reconstruction: from the mapper; not changed.
       read: intensities by image name; called several times per image and pass.
       refine_intrinsics: whether bundle adjustment moves focal lengths and distortion.
       evidence: images that the mapper left out, and matches to place them and weak views by.
-      threads: of bundle adjustment; one makes the model repeatable to the last byte.
+      threads: of bundle adjustment. With one thread the model is repeatable to the last byte.
 
     Raises:
-      ImageError: an image cannot be read any more.
+      ImageError: an image of the model cannot be read any more.
     """
-    sizes = {}
-    for image_id in sorted(model.reg_image_ids()):
-        name = model.image(image_id).name
-        sizes[name] = _size(read, name)
-    readable = []
-    for image in evidence.left_out:
-        with contextlib.suppress(ImageError):  # it went away since, and is not in the model anyway
-            sizes[image.name] = _size(read, image.name)
-            readable.append(image)
-    evidence = evidence._replace(left_out=readable)
+    sizes, evidence = _working_sizes(reconstruction, read, evidence)
+    model = Model.from_colmap(reconstruction, sizes)
     figures: list[PassFigures] = []
-    for number in range(config.passes):
-        views, tracks = read_model_arrays(model, sizes)
-        if len(tracks.points) < MIN_POINTS or len(views) < 2:
+    limits = AlignmentLimits.of(refinement)
+    for number in range(refinement.passes):
+        if len(model.tracks.points) < MIN_POINTS or len(model.views) < 2:
             break
-        max_shift = config.max_shift_px / (1 if number == 0 else 2)
-        blocks = list(align_blocks(tracks, views, read, config, max_shift))
-        refined, weak = _gather(tracks, views, blocks)
-        fresh = _adjust(model, views, refined, weak, sizes, config, refine_intrinsics, threads)
-        enough = max(MIN_POINTS, MIN_POINT_SHARE * len(tracks.points))
-        accepted = fresh is not None and fresh.num_points3D() >= enough
-        if fresh is not None and accepted:
-            model = fresh
-        agrees = np.concatenate([b.agrees for b in blocks])
-        tracked = np.concatenate([b.tracked for b in blocks])
+        if number == 1:
+            limits = limits._replace(max_shift_px=limits.max_shift_px / 2)
+        blocks = list(align_blocks(model, read, refinement, limits))
+        aligned, weak = _gather(model, blocks)
+        weak_names = sorted(model.views[k].name for k in weak)
+        adjusted = _adjust(aligned, weak, sizes, refinement, refine_intrinsics, threads)
+        enough = max(MIN_POINTS, MIN_POINT_SHARE * len(model.tracks.points))
+        accepted = adjusted is not None and adjusted[0].num_points3D() >= enough
+        if adjusted is not None and accepted:
+            reconstruction, model = adjusted
+        agrees = np.concatenate([block.agrees for block in blocks])
+        tracked = np.concatenate([block.tracked for block in blocks])
         figures.append(
             PassFigures(
                 accepted=accepted,
@@ -167,57 +166,70 @@ def refine_model(
                 kept=int((agrees & tracked).sum()),
                 dropped=int((~agrees & tracked).sum()),
                 added=int((agrees & ~tracked).sum()),
-                weak_views=sorted(views[k].name for k in weak),
-                points=model.num_points3D(),
-                reprojection_error_px=model.compute_mean_reprojection_error(),
+                weak_views=weak_names,
+                points=reconstruction.num_points3D(),
+                reprojection_error_px=reconstruction.compute_mean_reprojection_error(),
             )
         )
         on_pass()
         if not accepted:
             break
-    placed: list[Placed] = []
-    # Weak in one pass is weak: what little agreed looks like much in the next (58 of 153
-    # observations after 22 of 393, and the camera 0.4 m off).
+    placed: list[Placement] = []
+    # A view that was weak in any pass is placed: what little agreed in the first pass looks like
+    # much in the next (58 of 153 observations after 22 of 393, and the camera 0.4 m off).
     weak_names = sorted({name for f in figures if f.accepted for name in f.weak_views})
-    if any(f.accepted for f in figures) and (weak_names or evidence.left_out):
+    if any(f.accepted for f in figures) and (weak_names or evidence.unmapped):
+        before = model
         model, placed = place_weak_views(
             model,
             weak_names,
             read,
             sizes,
-            config=config,
+            refinement=refinement,
             refine_intrinsics=refine_intrinsics,
             evidence=evidence,
         )
-        if config.weak_octaves:  # else nobody has tried to confirm them
-            model, placed = take_out(model, placed, sizes)
-    return model, RefinementFigures(passes=figures, placed=placed)
+        if model is not before:
+            reconstruction = model.to_colmap()
+        if refinement.weak_octaves:  # otherwise nothing has tried to confirm their poses
+            if model is not before:  # COLMAP left out points whose rays are too close
+                model = Model.from_colmap(reconstruction, sizes)
+            before = model
+            model, placed = remove_unconfirmed(model, placed)
+            if model is not before:
+                reconstruction = model.to_colmap()
+    return reconstruction, RefinementFigures(passes=figures, placed=placed)
 
 
 def _adjust(
-    template: "pycolmap.Reconstruction",
-    views: list[View],
-    tracks: Tracks,
+    model: Model,
     weak: np.ndarray,
     sizes: Sizes,
-    config: Refinement,
+    refinement: Refinement,
     refine_intrinsics: bool,
     threads: int,
-) -> "pycolmap.Reconstruction | None":
-    """Filter and bundle adjustment, twice; None if (nearly) nothing is left.
+) -> "tuple[pycolmap.Reconstruction, Model] | None":
+    """Filter the observations and adjust the bundle, twice; None if (nearly) nothing is left.
 
     Args:
-      weak: views whose observations were not aligned: they may have four times the error.
+      weak: views whose observations were not aligned; they may have four times the error.
     """
-    loss_px = float(np.median([view.scale.mean() for view in views]))
-    limit = config.max_error_px * np.where(np.isin(np.arange(len(views)), weak), 4.0, 1.0)
-    model = template
+    loss_px = float(np.median([view.mean_scale for view in model.views]))
+    weak_view = np.isin(np.arange(len(model.views)), weak)
+    limit = refinement.max_error_px * np.where(weak_view, 4.0, 1.0)
+    adjusted = None
     # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
     for slack in (4.0, 1.0):
-        good = errors_px(views, tracks) < slack * limit[tracks.view]
-        model = build_model(model, views, select(tracks, good))
-        if model.num_points3D() < MIN_POINTS:
+        good = model.errors_px() < slack * limit[model.tracks.view]
+        reconstruction = model.select(good).to_colmap()
+        if reconstruction.num_points3D() < MIN_POINTS:
             return None
-        bundle_adjust(model, loss_px=loss_px, refine_intrinsics=refine_intrinsics, threads=threads)
-        views, tracks = read_model_arrays(model, sizes)
-    return model
+        bundle_adjust(
+            reconstruction,
+            loss_px=loss_px,
+            refine_intrinsics=refine_intrinsics,
+            threads=threads,
+        )
+        model = Model.from_colmap(reconstruction, sizes)
+        adjusted = reconstruction, model
+    return adjusted

@@ -1,5 +1,5 @@
-"""Local planes at 3-D points: normals, reference views, which views could see a point, and how a
-patch maps from one view to another. Pure functions of numpy arrays.
+"""Local planes at 3-D points: their normals, their reference views, which views could see them, and
+how a patch of the plane maps from one view to another. Pure functions of numpy arrays.
 """
 
 from collections.abc import Sequence
@@ -8,26 +8,46 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.view import View
+from jaxsfm.config import Refinement
 
 MIN_NORMAL_COSINE = 0.05
+"""Where a plane is seen from the side, its scale is taken for this cosine."""
 
 
 class Visibility(NamedTuple):
-    """Every point in every view."""
+    """How every view would see every point's plane."""
 
     cosine: np.ndarray
     """float (n, v): between the normal and the direction to the camera."""
     log_scale: np.ndarray
     """float (n, v): logarithm of image area per surface area, up to a constant."""
     tracked: np.ndarray
-    """bool (n, v): the point's track has an observation there."""
+    """bool (n, v): the point's track has an observation in the view."""
     xy: np.ndarray
-    """float (n, v, 2): that observation, else NaN."""
+    """float (n, v, 2): that observation, working pixels; NaN where there is none."""
+
+
+class ReferencePatches(NamedTuple):
+    """Planar patches, each given by its keypoint in one reference view."""
+
+    points: np.ndarray
+    """float64 (n, 3): world points on the rays of the keypoints."""
+    normal: np.ndarray
+    """float64 (n, 3): unit normals."""
+    reference: np.ndarray
+    """int (n,): index of the reference view."""
+    xy: np.ndarray
+    """float64 (n, 2): the keypoint in the reference view, working pixels."""
+
+    def select(self, rows: np.ndarray) -> "ReferencePatches":
+        """Some of the patches, by index."""
+        return ReferencePatches(*(column[rows] for column in self))
 
 
 class Candidates(NamedTuple):
-    """Observations to be aligned: point `point[k]` in `view[k]`."""
+    """Possible observations, to be aligned: candidate k is of point `point[k]` in `view[k]`."""
 
     point: np.ndarray
     view: np.ndarray
@@ -37,13 +57,13 @@ class Candidates(NamedTuple):
     """float (m, 2, 2): offsets in the reference view to offsets in the view."""
 
 
-def normals(tracks: Tracks, views: list[View], *, neighbours: int) -> np.ndarray:
+def normals(model: Model, *, neighbours: int) -> np.ndarray:
     """Unit normals (n, 3) from each point's nearest points, towards the cameras that see it.
 
-    Distances are weighted down beyond the median one, so that a neighbour on another surface does
-    not turn the plane.
+    Neighbours count less the further they are beyond the median distance, so that a neighbour on
+    another surface does not turn the plane.
     """
-    points = tracks.points
+    tracks, points = model.tracks, model.tracks.points
     k = min(neighbours, len(points))
     distance, index = KDTree(points).query(points, k=k)
     local = points[index.reshape(len(points), k)]
@@ -53,20 +73,25 @@ def normals(tracks: Tracks, views: list[View], *, neighbours: int) -> np.ndarray
     _, vectors = np.linalg.eigh(np.einsum("nki,nkj,nk->nij", local, local, weight))
     normal = vectors[:, :, 0]
     towards = np.zeros_like(points)
-    centres = np.asarray([view.centre for view in views])
+    centres = np.asarray([view.centre for view in model.views])
     np.add.at(towards, tracks.point, centres[tracks.view] - points[tracks.point])
     return normal * np.where(np.einsum("ni,ni->n", towards, normal) < 0, -1.0, 1.0)[:, None]
 
 
-def visibility(tracks: Tracks, views: list[View], normal: np.ndarray) -> Visibility:
-    """How every view would see every point's plane."""
-    n, v = len(tracks.points), len(views)
+def visibility(model: Model, normal: np.ndarray) -> Visibility:
+    """How every view would see every point's plane.
+
+    Args:
+      normal: (n, 3), of the model's points.
+    """
+    tracks = model.tracks
+    n, v = len(tracks.points), len(model.views)
     cosine, log_scale = np.zeros((n, v)), np.zeros((n, v))
-    for k, view in enumerate(views):
+    for k, view in enumerate(model.views):
         ray = view.centre - tracks.points
         distance = np.linalg.norm(ray, axis=1)
         cosine[:, k] = np.einsum("ni,ni->n", ray, normal) / distance
-        focal = view.camera.mean_focal_length() / view.scale.mean()
+        focal = view.camera.mean_focal_length() / view.mean_scale
         log_scale[:, k] = np.log(np.maximum(cosine[:, k], MIN_NORMAL_COSINE)) + 2 * np.log(
             focal / distance
         )
@@ -78,29 +103,48 @@ def visibility(tracks: Tracks, views: list[View], normal: np.ndarray) -> Visibil
 
 
 def reference_views(seen: Visibility) -> np.ndarray:
-    """For every point the tracked view of median scale: neither blown up nor shrunk elsewhere."""
+    """int (n,): for every point the tracked view of median scale.
+
+    A patch of that view is enlarged little, and reduced little, in the other views.
+    """
     order = np.argsort(np.where(seen.tracked, seen.log_scale, np.inf), axis=1, kind="stable")
     middle = seen.tracked.sum(1) // 2
     return order[np.arange(len(order)), middle]
 
 
+def reference_patches(model: Model, normal: np.ndarray, seen: Visibility) -> ReferencePatches:
+    """The points' patches in their reference views, moved onto the rays of their keypoints."""
+    reference = reference_views(seen)
+    xy = seen.xy[np.arange(len(reference)), reference]
+    points = on_reference_rays(model, normal, reference, xy)
+    return ReferencePatches(points, normal, reference, xy)
+
+
 def on_reference_rays(
-    tracks: Tracks, views: list[View], normal: np.ndarray, reference: np.ndarray, xy: np.ndarray
+    model: Model, normal: np.ndarray, reference: np.ndarray, xy: np.ndarray
 ) -> np.ndarray:
-    """The points (n, 3) moved onto the rays of their reference keypoints `xy`, along their planes.
+    """The points (n, 3) moved along their planes onto the rays of their reference keypoints.
 
     Where the plane is nearly parallel to the ray, the depth is kept instead.
+
+    Args:
+      normal: (n, 3).
+      reference: int (n,), indices of views.
+      xy: (n, 2), the keypoints, working pixels.
     """
-    moved = np.empty_like(tracks.points)
-    for k, view in enumerate(views):
+    points = model.tracks.points
+    moved = np.empty_like(points)
+    for k, view in enumerate(model.views):
         rows = np.flatnonzero(reference == k)
-        moved[rows] = _on_planes(view, xy[rows], tracks.points[rows], normal[rows])
+        moved[rows] = _on_planes(view, xy[rows], points[rows], normal[rows])
     return moved
 
 
 def _on_planes(view: View, xy: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Where the rays of pixels (n, 2) meet the planes through points (n, 3); at the points' depth
-    where the plane is nearly parallel to the ray."""
+    """Where the rays of pixels (n, 2) meet the planes through points (n, 3).
+
+    Where the plane is nearly parallel to the ray, the place at the point's depth.
+    """
     ray = view.rays(xy)
     offset = points - view.centre
     depth = offset @ view.rotation[2]
@@ -112,81 +156,74 @@ def _on_planes(view: View, xy: np.ndarray, points: np.ndarray, normal: np.ndarra
 
 
 def under_pixels(
-    tracks: Tracks,
-    views: list[View],
-    normal: np.ndarray,
-    view: int,
-    xy: np.ndarray,
-    *,
-    reach_px: float,
+    model: Model, normal: np.ndarray, view: int, xy: np.ndarray, *, reach_px: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The surface (m, 3) under those of the pixels (n, 2) of a view that have an observation near,
-    and which they are: (m,) indices."""
+    """The surface under pixels (n, 2) of a view.
+
+    Args:
+      normal: (points, 3), of the model's points.
+      view: index of the view.
+      reach_px: a pixel lies on the plane of the nearest observation if that is this near.
+
+    Returns:
+      float64 (m, 3) world points, for the pixels that have an observation near; int (m,), which
+      pixels these are.
+    """
+    tracks = model.tracks
     own = np.flatnonzero(tracks.view == view)
     if not len(own) or not len(xy):
         return np.zeros((0, 3)), np.zeros(0, np.int64)
     distance, nearest = map(np.asarray, KDTree(tracks.xy[own]).query(xy))
     near = np.flatnonzero(distance <= reach_px)
     point = tracks.point[own[nearest[near]]]
-    return _on_planes(views[view], xy[near], tracks.points[point], normal[point]), near
+    return _on_planes(model.views[view], xy[near], tracks.points[point], normal[point]), near
 
 
 def candidates(
-    points: np.ndarray,
-    views: list[View],
-    normal: np.ndarray,
-    reference: np.ndarray,
-    xy: np.ndarray,
+    views: Sequence[View],
+    patches: ReferencePatches,
     seen: Visibility,
+    refinement: Refinement,
     *,
-    margin: float,
-    min_cosine: float,
-    max_stretch: float,
     targets: Sequence[int] | None = None,
 ) -> Candidates:
-    """The observations of every track, and the views that could see its point beside them.
+    """The observations of every track, and other views that could see its patch.
 
     Args:
-      targets: only these views.
-      points: on the reference rays.
-      reference, xy: the reference view of every point, and its keypoint there.
-      margin: pixels to the border of the view.
+      refinement: `min_cosine` and `max_stretch` limit the views that could see a patch; `radius`
+        gives the distance that a keypoint must have from the border.
+      targets: only these views, by index; None: all.
     """
-    every = np.arange(len(points))
-    own_scale = seen.log_scale[every, reference]
+    margin = refinement.radius + 2
+    own_scale = seen.log_scale[np.arange(len(patches.points)), patches.reference]
     parts = []
     for k in range(len(views)) if targets is None else targets:
         view = views[k]
-        at, _ = view.project(points)
+        at, _ = view.project(patches.points)
         with np.errstate(invalid="ignore"):
             inside = (at >= margin).all(1) & (at <= np.asarray(view.size) - 1 - margin).all(1)
-        fits = (seen.cosine[:, k] > min_cosine) & (
-            np.abs(seen.log_scale[:, k] - own_scale) < np.log(max_stretch)
+        fits = (seen.cosine[:, k] > refinement.min_cosine) & (
+            np.abs(seen.log_scale[:, k] - own_scale) < np.log(refinement.max_stretch)
         )
-        rows = np.flatnonzero(inside & (reference != k) & (seen.tracked[:, k] | fits))
+        rows = np.flatnonzero(inside & (patches.reference != k) & (seen.tracked[:, k] | fits))
         parts.append((rows, np.full(len(rows), k), at[rows]))
-    point = np.concatenate([p for p, _, _ in parts])
-    view = np.concatenate([v for _, v, _ in parts])
-    start = np.concatenate([s for _, _, s in parts])
-    affine = plane_affines(points[point], views, normal[point], reference[point], view, xy[point])
+    point, view, start = (np.concatenate(column) for column in zip(*parts, strict=True))
+    affine = plane_affines(views, patches.select(point), view)
     ok = np.isfinite(affine).all((1, 2))
     return Candidates(point[ok], view[ok], start[ok], affine[ok])
 
 
 def plane_affines(
-    points: np.ndarray,
-    views: list[View],
-    normal: np.ndarray,
-    reference: np.ndarray,
-    view: np.ndarray,
-    xy: np.ndarray,
-    *,
-    step: float = 2.0,
+    views: Sequence[View], patches: ReferencePatches, view: np.ndarray, *, step: float = 2.0
 ) -> np.ndarray:
-    """Derivative (m, 2, 2) of pixels in `view` by pixels in `reference`, through the plane.
+    """Derivatives (m, 2, 2) of pixels in `view` by pixels in the reference view, via the plane.
 
-    Central differences over `step` pixels, so that any camera model serves.
+    They are central differences over `step` pixels, which serves any camera model.
+
+    Args:
+      view: int (m,), for each patch the index of the other view.
     """
+    points, normal, reference, xy = patches
 
     def through(offset: tuple[float, float]) -> np.ndarray:
         target = np.empty_like(points)

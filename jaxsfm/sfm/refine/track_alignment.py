@@ -1,5 +1,5 @@
-"""The alignment of refinement: all observations a model's points have or could have, moved onto
-their reference patches, block by block of points.
+"""The alignment of whole tracks: every observation that a point of the model has, or could have, is
+moved onto the point's reference patch. Points are taken in blocks, so that memory stays bounded.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,52 +10,71 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.tracks import Observations, Tracks
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.core import align as align_core
+from jaxsfm.core.align import Patch, Templates, square_patch
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.padding import chunks, padded
+from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits, align_patches, make_templates
+from jaxsfm.sfm.refine.plane_geometry import Candidates, ReferencePatches
 
 CELLS = 5_000_000
-"""Points times views looked at together; about 100 bytes each, and 2.7 kB for each point."""
+"""Points times views that are looked at together. Each takes about 100 bytes, and each point
+2.7 kB."""
 MIN_BLOCK, MAX_BLOCK = 1000, 100_000
 """Points of a block, whatever the number of views."""
-
-
 SLACK = 0.25
-"""Of a view's sides, beyond its borders: points move along their reference rays before alignment,
-by at most 5 % of their depth."""
+"""Share of a view's sides, beyond its borders. Points outside are left out early; they may still
+move along their reference rays before they are aligned, by at most 5 % of their depth."""
 
 
 class AlignedBlock(NamedTuple):
     """The outcome of alignment for some of the points."""
 
     rows: np.ndarray
-    """The points, indices."""
-    points: np.ndarray
-    """Where they lie now: on their reference rays."""
-    reference: np.ndarray
-    xy: np.ndarray
-    """The reference keypoints."""
-    found: plane_geometry.Candidates
-    """Their `point` counts within the block."""
+    """int (n,): which points."""
+    patches: ReferencePatches
+    """Their patches; the points lie on their reference rays."""
+    found: Candidates
+    """Its `point` counts within the block."""
     moved: np.ndarray
+    """float64 (m, 2): where the candidates ended, working pixels."""
     agrees: np.ndarray
+    """bool (m,): which candidates agree with their patches."""
     tracked: np.ndarray
-    """Candidates that are observations of the old tracks."""
+    """bool (m,): which candidates are observations of the old tracks."""
+
+    @property
+    def confirmed(self) -> np.ndarray:
+        """int, ascending: the points of the block that at least one candidate agrees with."""
+        return np.unique(self.found.point[self.agrees])
+
+    def observations(self) -> list[Observations]:
+        """The confirmed points' reference keypoints, and the candidates that agree.
+
+        Their `point` counts within all points.
+        """
+        own, good = self.confirmed, np.flatnonzero(self.agrees)
+        return [
+            Observations(self.rows[own], self.patches.reference[own], self.patches.xy[own]),
+            Observations(
+                self.rows[self.found.point[good]], self.found.view[good], self.moved[good]
+            ),
+        ]
 
 
 def _templates(
-    reference: np.ndarray,
-    xy: np.ndarray,
+    patches: ReferencePatches,
     wanted: np.ndarray,
-    views: list[View],
+    views: Sequence[View],
     read: Reader,
-    patch: align_core.Patch,
-) -> align_core.Templates:
-    """Templates of the wanted points, one view's image in memory at a time."""
-    n, q = len(reference), len(patch.weights)
+    patch: Patch,
+) -> Templates:
+    """Templates of the wanted patches. One view's image is in memory at a time."""
+    n, q = len(patches.points), len(patch.weights)
     store = [
         np.zeros((n, q, 1), np.float32),
         np.zeros((n, q, 1, 2), np.float32),
@@ -63,61 +82,51 @@ def _templates(
         np.zeros(n, np.float32),
         np.zeros(n, bool),
     ]
-    for k in np.unique(reference[wanted]):
-        image, size = padded(read(views[k].name)[0])
-        for piece, count in chunks(wanted[reference[wanted] == k]):
-            made = align_core.make_templates(
-                image,  # pyright: ignore[reportArgumentType]
-                size,  # pyright: ignore[reportArgumentType]
-                np.float32(xy[piece]),  # pyright: ignore[reportArgumentType]
-                patch,
-            )
-            for held, new in zip(store, jax.device_get(made), strict=True):
-                held[piece[:count]] = new[:count]
-    return align_core.Templates(*store)  # pyright: ignore[reportArgumentType]
+    for k in np.unique(patches.reference[wanted]):
+        image = padded(read(views[k].name)[0])
+        for piece, count in chunks(wanted[patches.reference[wanted] == k]):
+            made = jax.device_get(make_templates(image, patches.xy[piece], patch))
+            for every, some in zip(store, made, strict=True):
+                every[piece[:count]] = some[:count]
+    return Templates(*store)  # pyright: ignore[reportArgumentType]
 
 
 def _align(
-    found: plane_geometry.Candidates,
-    templates: align_core.Templates,
-    views: list[View],
+    found: Candidates,
+    templates: Templates,
+    views: Sequence[View],
     read: Reader,
-    patch: align_core.Patch,
-    config: Refinement,
-    max_shift_px: float,
+    patch: Patch,
+    limits: AlignmentLimits,
+    *,
+    iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the candidates end, and which agree with their templates."""
+    """Where the candidates end, and which of them agree with their templates."""
     moved = found.start.copy()
     agrees = np.zeros(len(moved), bool)
     for k in np.unique(found.view):
-        image, size = padded(read(views[k].name)[0])
+        image = padded(read(views[k].name)[0])
         for piece, count in chunks(np.flatnonzero(found.view == k)):
-            result = jax.device_get(
-                align_core.align(
-                    image,  # pyright: ignore[reportArgumentType]
-                    size,  # pyright: ignore[reportArgumentType]
-                    jax.tree.map(lambda a, p=found.point[piece]: a[p], templates),
-                    np.float32(found.start[piece]),  # pyright: ignore[reportArgumentType]
-                    np.float32(found.affine[piece]),  # pyright: ignore[reportArgumentType]
-                    patch,
-                    iterations=config.iterations,
-                )
-            )
-            shift = np.linalg.norm(result.xy - found.start[piece], axis=1)
-            good = (
-                result.converged
-                & (result.score > config.min_score)
-                & (result.sigma < config.max_sigma_px)
-                & (shift < max_shift_px)
-            )
+            some = jax.tree.map(lambda a, p=found.point[piece]: a[p], templates)
+            start, affine = found.start[piece], found.affine[piece]
+            result = align_patches(image, some, start, affine, patch, iterations=iterations)
             moved[piece[:count]] = result.xy[:count]
-            agrees[piece[:count]] = good[:count]
+            agrees[piece[:count]] = limits.accept(result, start)[:count]
     return moved, agrees
 
 
 def neighbourhoods(tracks: Tracks, count: int) -> np.ndarray:
-    """The points (n,) in an order in which those that the same views see are near each other: by
-    their first view, where views that see the same are near each other (reverse Cuthill-McKee)."""
+    """Order points so that those that the same views see are near each other.
+
+    Points are ordered by their first view, and the views so that those that see the same points
+    follow each other (reverse Cuthill-McKee).
+
+    Args:
+      count: number of views.
+
+    Returns:
+      int (n,): the points' indices in that order.
+    """
     shape = (len(tracks.points), count)
     seen = coo_array((np.ones(len(tracks.point)), (tracks.point, tracks.view)), shape=shape).tocsr()
     place = np.empty(count, int)
@@ -128,7 +137,7 @@ def neighbourhoods(tracks: Tracks, count: int) -> np.ndarray:
 
 
 def may_show(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
-    """Whether points (n, 3) could become candidates in any of the views."""
+    """bool (n,): whether points (n, 3) could become candidates in any of the views."""
     shown = np.zeros(len(points), bool)
     for view in views:
         at, _ = view.project(points)
@@ -138,25 +147,10 @@ def may_show(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
     return shown
 
 
-def align_blocks(
-    tracks: Tracks,
-    views: list[View],
-    read: Reader,
-    config: Refinement,
-    max_shift_px: float,
-    *,
-    targets: Sequence[int] | None = None,
-) -> Iterator[AlignedBlock]:
-    """Align every point's observations, so many points at a time that memory stays bounded, and
-    those together that the same views see.
-
-    Args:
-      tracks: every point has an observation.
-      targets: only observations in these views, and only blocks of points that they may show: the
-        work is theirs, not the model's.
-    """
-    normal = plane_geometry.normals(tracks, views, neighbours=config.neighbours)
-    patch = align_core.square_patch(config.radius)
+def _blocks(
+    tracks: Tracks, views: Sequence[View], targets: Sequence[int] | None
+) -> Iterator[tuple[np.ndarray, Tracks]]:
+    """Blocks of points that the same views see: their indices, and their tracks."""
     step = max(MIN_BLOCK, min(CELLS // len(views), MAX_BLOCK))
     near = neighbourhoods(tracks, len(views))
     if targets is not None:
@@ -166,32 +160,48 @@ def align_blocks(
     block[near] = np.arange(len(near)) // step
     order = np.lexsort((tracks.point, block[tracks.point]))
     ends = np.searchsorted(block[tracks.point][order], np.arange(count + 1))
-    for number, first in enumerate(range(0, len(near), step)):
-        rows = np.sort(near[first : first + step])
+    for number in range(count):
+        rows = np.sort(near[number * step : (number + 1) * step])
         own = order[ends[number] : ends[number + 1]]
-        part = Tracks(
-            tracks.points[rows],
-            np.searchsorted(rows, tracks.point[own]),
-            tracks.view[own],
-            tracks.xy[own],
+        yield (
+            rows,
+            Tracks(
+                tracks.points[rows],
+                np.searchsorted(rows, tracks.point[own]),
+                tracks.view[own],
+                tracks.xy[own],
+            ),
         )
-        seen = plane_geometry.visibility(part, views, normal[rows])
-        reference = plane_geometry.reference_views(seen)
-        xy = seen.xy[np.arange(len(rows)), reference]
-        points = plane_geometry.on_reference_rays(part, views, normal[rows], reference, xy)
-        found = plane_geometry.candidates(
-            points,
-            views,
-            normal[rows],
-            reference,
-            xy,
-            seen,
-            margin=config.radius + 2,
-            min_cosine=config.min_cosine,
-            max_stretch=config.max_stretch,
-            targets=targets,
+
+
+def align_blocks(
+    model: Model,
+    read: Reader,
+    refinement: Refinement,
+    limits: AlignmentLimits,
+    *,
+    targets: Sequence[int] | None = None,
+) -> Iterator[AlignedBlock]:
+    """Align the observations of every point of a model, block by block.
+
+    Args:
+      model: every point has an observation.
+      read: intensities by the name of a view.
+      limits: what an aligned keypoint must fulfil to count.
+      targets: indices of views. Only observations in these views are aligned, and only points that
+        they may show are looked at. None: all views.
+    """
+    views = model.views
+    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
+    patch = square_patch(refinement.radius)
+    for rows, tracks in _blocks(model.tracks, views, targets):
+        part = model.with_tracks(tracks)
+        seen = plane_geometry.visibility(part, normal[rows])
+        patches = plane_geometry.reference_patches(part, normal[rows], seen)
+        found = plane_geometry.candidates(views, patches, seen, refinement, targets=targets)
+        templates = _templates(patches, np.unique(found.point), views, read, patch)
+        moved, agrees = _align(
+            found, templates, views, read, patch, limits, iterations=refinement.iterations
         )
-        templates = _templates(reference, xy, np.unique(found.point), views, read, patch)
-        moved, agrees = _align(found, templates, views, read, patch, config, max_shift_px)
         tracked = seen.tracked[found.point, found.view]
-        yield AlignedBlock(rows, points, reference, xy, found, moved, agrees, tracked)
+        yield AlignedBlock(rows, patches, found, moved, agrees, tracked)

@@ -1,8 +1,8 @@
-"""A finished model that grows by new views: what it has stays as it is.
+"""Registration of new views in a finished model, whose poses and points stay as they are.
 
-Round by round: views are placed on what there is (`jaxsfm.sfm.register.locate_view`), then what
-they show beside it becomes new points (`jaxsfm.sfm.register.triangulate`), on which the next round
-places further ones.
+It works in rounds. In a round, views are located in the model (`jaxsfm.sfm.register.locate_view`).
+What they show beyond the model's points becomes new points (`jaxsfm.sfm.register.triangulate`), in
+which the next round locates further views.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,77 +10,77 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View, part_of
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import Reader
-from jaxsfm.sfm.register.locate_view import Located, locate
+from jaxsfm.sfm.register.locate_view import Localization, locate
 from jaxsfm.sfm.register.triangulate import new_points
 
 
-class Newcomer(NamedTuple):
-    """A view that has no pose yet."""
+class UnregisteredView(NamedTuple):
+    """A view that is not in the model."""
 
     view: View
-    """Its pose does not count."""
+    """Its pose plays no part."""
     own_camera: bool
     """Its focal length is estimated."""
     shortlist: Sequence[str]
-    """Views that it is matched with."""
+    """Names of the views that it is matched with."""
 
 
-class Grown(NamedTuple):
+class ExtendedModel(NamedTuple):
     """A model with new views."""
 
-    views: list[View]
-    """The old ones first."""
-    tracks: Tracks
-    """The old points first."""
+    model: Model
+    """The old views come first, and so do the old points."""
     placed: list[str]
-    """In the order of their rounds."""
-    located: dict[str, Located]
-    """What became of every newcomer at its last attempt."""
+    """Names of the new views, in the order of their rounds."""
+    located: dict[str, Localization]
+    """For every unregistered view, the outcome of its last attempt."""
     rounds: int
 
 
 def grow(
-    views: list[View],
-    tracks: Tracks,
-    newcomers: Mapping[str, Newcomer],
+    model: Model,
+    unregistered: Mapping[str, UnregisteredView],
     matches: Mapping[Pair, PairResult],
     read: Reader,
     *,
     refinement: Refinement | None,
     seed: int = 0,
     on_view: Callable[[], None] = lambda: None,
-) -> Grown:
-    """Place newcomers until a round places none. Those of one round do not see each other.
+) -> ExtendedModel:
+    """Register views until a round registers none. The views of one round do not see each other.
 
     Args:
-      views, tracks: of the model, working pixels.
-      matches: of newcomers with views and with each other, original pixels.
+      unregistered: by name.
+      matches: of unregistered views with views and with each other, original pixels.
+      read: intensities of all these views, by name.
       refinement: the model's; None: it was not refined.
-      on_view: told of every view that is placed.
+      seed: for RANSAC.
+      on_view: called for every view that is registered.
     """
     placed: list[str] = []
-    located: dict[str, Located] = {}
+    located: dict[str, Localization] = {}
     rounds, latest = 0, set()
     while True:
         fresh = {}
-        names = {view.name for view in views}
-        for name in sorted(newcomers.keys() - set(placed)):
-            each = newcomers[name]
+        names = {view.name for view in model.views}
+        for name in sorted(unregistered.keys() - set(placed)):
+            each = unregistered[name]
             around = [other for other in each.shortlist if other in names]
             if name in located and not set(around) & latest:
                 continue  # nothing new since its last attempt
-            part, structure, rows = part_of(views, tracks, around)
+            part, rows = model.part(around)
             located[name] = locate(
                 each.view,
                 part,
-                structure,
                 matches_with(name, around, matches),
                 read,
-                config=refinement or Refinement(),
+                refinement=refinement or Refinement(),
                 own_camera=each.own_camera,
                 seed=seed,
             )
@@ -88,44 +88,36 @@ def grow(
                 fresh[name] = rows
                 on_view()
         if not fresh:
-            return Grown(views, tracks, placed, located, rounds)
+            return ExtendedModel(model, placed, located, rounds)
         rounds += 1
-        views, tracks = _joined(views, tracks, {name: located[name] for name in fresh}, fresh)
+        model = _with_located(model, located, fresh)
         placed += sorted(fresh)
         latest = set(fresh)
-        more = new_points(views, tracks, fresh, matches, read, refinement=refinement)
-        tracks = Tracks(
-            np.concatenate([tracks.points, more.points]),
-            np.concatenate([tracks.point, more.point + len(tracks.points)]),
-            np.concatenate([tracks.view, more.view]),
-            np.concatenate([tracks.xy, more.xy]),
-        )
+        more = new_points(model, fresh, matches, read, refinement=refinement)
+        model = model.with_tracks(model.tracks.joined(more))
 
 
 def matches_with(
     name: str, others: Sequence[str], matches: Mapping[Pair, PairResult]
 ) -> dict[Pair, PairResult]:
-    """Those of one image with others."""
+    """The matches of one image with others, by pair."""
     pairs = [make_pair(name, other) for other in others]
     return {pair: matches[pair] for pair in pairs if pair in matches}
 
 
-def _joined(
-    views: list[View],
-    tracks: Tracks,
-    located: Mapping[str, Located],
-    rows: Mapping[str, np.ndarray],
-) -> tuple[list[View], Tracks]:
-    """The model with views that have found their poses, and what they show of its points.
+def _with_located(
+    model: Model, located: Mapping[str, Localization], fresh: Mapping[str, np.ndarray]
+) -> Model:
+    """The model with views that have been located, and what they show of its points.
 
     Args:
-      rows: for each, which of the model's points its part had.
+      fresh: the views to add. By name: for each point of the part of the model in which it was
+        located, the index of that point in the model.
     """
-    every, parts = list(views), [(tracks.point, tracks.view, tracks.xy)]
-    for name, found in sorted(located.items()):
-        assert found.view is not None and found.observed is not None
-        seen = found.observed
-        parts.append((rows[name][seen.rows], np.full(len(seen.rows), len(every)), seen.xy))
-        every.append(found.view)
-    point, view, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return every, Tracks(tracks.points, point, view, xy)
+    views, parts = list(model.views), [model.tracks.observations]
+    for name, rows in sorted(fresh.items()):
+        found = located[name]
+        assert found.view is not None and found.points is not None
+        parts.append(found.points.observations(len(views), rows))
+        views.append(found.view)
+    return model.with_views(views).with_tracks(Tracks.from_parts(model.tracks.points, parts))

@@ -1,8 +1,8 @@
-"""The pose of one photo in a finished model, which stays as it is: resection from its matches, then
-followed over the octaves (`jaxsfm.sfm.refine.octave_pose`), as a weak view is.
+"""The pose of one photo in a finished model, which stays as it is.
 
-Only some views of the model take part, and the points that they see: the work does not grow with
-the model.
+The photo's matches give a first pose by resection, and alignment follows it over the octaves
+(`jaxsfm.sfm.refine.octave_pose`), as it does for weak views. Only some views of the model take
+part, with the points that they see: so the work does not grow with the model.
 """
 
 import dataclasses
@@ -10,36 +10,37 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxsfm.colmap.model_arrays import Tracks, View
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.resection import MIN_POINTS, find_view
+from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.refine.octave_pose import (
     MAX_DOUBT_PX,
     MIN_COUNT,
     MIN_SHARE,
-    Followed,
-    Observed,
+    AlignedPoints,
+    PoseHypothesis,
     follow,
-    pose_doubt,
     trusted,
 )
-from jaxsfm.sfm.refine.weak_views import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.refine.pose_doubt import pose_doubt
 
 CELL_PX = 8
-"""Side of a fine cell, working pixels: the grain of matches."""
+"""Side of a fine cell, working pixels. Matches that share a cell are not independent."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Located:
-    """What became of a photo."""
+class Localization:
+    """The outcome for a photo."""
 
     view: View | None
-    """Where it was taken; None: nowhere that alignment confirms or 30 matches agree on."""
+    """The photo with its pose. None: neither alignment confirms a pose nor do 30 matches agree."""
     trusted: bool
-    """Alignment confirms the pose; else it hangs on matches alone."""
+    """Alignment confirms the pose. Otherwise it rests on matches alone."""
     why: str | None
     """Why it has no pose, or none that is trusted."""
     on_surface: int
@@ -51,45 +52,44 @@ class Located:
     agreed: int
     """Those that alignment finds there."""
     octave_px: int | None
-    """Working pixels per pixel of the octave that gives the pose; None: not trusted."""
+    """Working pixels per pixel of the octave that gives the pose; None: it is not trusted."""
     error_px: float | None
     """Median distance of what determines the pose from where the pose puts it, working pixels."""
     doubt_px: float | None
-    """How far off projections are expected to be, working pixels (`Pose.doubt_px`)."""
+    """How far off projections are expected to be, working pixels (`OctavePose.doubt_px`)."""
     centre_error: float | None
-    """Expected error of the centre, units of the model, beside the model's own."""
+    """Expected error of the centre, units of the model. The model's own error comes on top."""
     rotation_error_deg: float | None
-    """Likewise, of the rotation."""
-    observed: Observed | None = None
-    """The points that it shows, of a trusted pose."""
+    """Expected error of the rotation. The model's own error comes on top."""
+    points: AlignedPoints | None = None
+    """The points that it shows, if the pose is trusted; working pixels."""
 
 
 def locate(
     image: View,
-    views: list[View],
-    tracks: Tracks,
+    model: Model,
     matches: Mapping[Pair, PairResult],
     read: Reader,
     *,
-    config: Refinement,
+    refinement: Refinement,
     own_camera: bool,
     seed: int = 0,
-) -> Located:
-    """The pose of a photo among views of a model.
+) -> Localization:
+    """Find the pose of a photo among views of a model.
 
     Args:
-      image: size, scale and camera of the photo; its pose does not count.
-      views, tracks: of the model or a part of it, working pixels.
+      image: size, pixels and camera of the photo; its pose plays no part.
+      model: a model, or a part of one.
       matches: of the photo with the views, original pixels.
       read: intensities of the photo and of the views, by name.
-      own_camera: the focal length is estimated too: from nothing, unless the camera's is known
-        from before (`has_prior_focal_length`).
-      seed: of the resection.
+      own_camera: estimate the focal length too. It is estimated from nothing, unless the camera's
+        was known before (`has_prior_focal_length`).
+      seed: for RANSAC in the resection.
     """
-    if not len(tracks.points):
+    if not len(model.tracks.points):
         return _nowhere(0, matches)
-    normal = plane_geometry.normals(tracks, views, neighbours=config.neighbours)
-    xy, points = matched_points(image, views, tracks, normal, matches)
+    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
+    xy, points = matched_points(image, model, normal, matches)
     found = find_view(
         image,
         xy,
@@ -102,11 +102,11 @@ def locate(
         return _nowhere(len(xy), matches)
     errors = np.linalg.norm(found.project(points)[0] - xy, axis=1)
     near = np.isfinite(errors) & (errors <= MATCH_ERROR_PX)
-    if near.sum() < MIN_POINTS:  # of the camera after its refinement
+    if near.sum() < MIN_POINTS:  # the camera has been refined since RANSAC counted
         return _nowhere(len(xy), matches)
-    pose = Followed(view=found, own_camera=own_camera)
-    if config.weak_octaves:
-        follow([pose], views, tracks, read, config)
+    pose = PoseHypothesis(view=found, own_camera=own_camera)
+    if refinement.weak_octaves:
+        follow([pose], model, read, refinement)
     best = trusted(pose)
     if best is None and near.sum() < MIN_COUNT:
         return dataclasses.replace(
@@ -121,28 +121,28 @@ def locate(
         seen, side, view = (points[near], xy[near]), CELL_PX, found
     else:
         error_px, view = best.error_px, best.view
-        seen = best.observed.points, best.observed.xy
-        side = best.octave_px * (2 * config.radius + 1)
+        seen = best.points.points, best.points.xy
+        side = best.octave_px * (2 * refinement.radius + 1)
     doubt = pose_doubt(view, *seen, error_px, side, focal=own_camera)
-    return Located(
+    return Localization(
         view=view,
         trusted=best is not None,
         why=None if best else _doubtful(pose, int(near.sum()), len(xy)),
         on_surface=len(xy),
         inliers=int(near.sum()),
-        candidates=len(best.observed.could) if best else pose.candidates,
+        candidates=len(best.points.candidates) if best else pose.candidates,
         agreed=best.agreed if best else pose.agreed,
         octave_px=best.octave_px if best else None,
         error_px=error_px,
         doubt_px=best.doubt_px if best else None,
         centre_error=doubt.centre,
         rotation_error_deg=doubt.rotation_deg,
-        observed=best.observed if best else None,
+        points=best.points if best else None,
     )
 
 
-def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Located:
-    """No pose."""
+def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Localization:
+    """The outcome where there is no pose, and why."""
     most = max((result.num_inliers for result in matches.values()), default=0)
     if most == 0:
         tentative = max((result.num_tentative for result in matches.values()), default=0)
@@ -154,7 +154,7 @@ def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Located:
         )
     else:
         why = f"no pose agrees with enough of the {on_surface} matches on the model's surface"
-    return Located(
+    return Localization(
         view=None,
         trusted=False,
         why=why,
@@ -170,8 +170,8 @@ def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Located:
     )
 
 
-def _doubtful(pose: Followed, inliers: int, on_surface: int) -> str:
-    """Why a pose from matches is not trusted."""
+def _doubtful(pose: PoseHypothesis, inliers: int, on_surface: int) -> str:
+    """Why a pose that matches give is not trusted."""
     start = f"a pose agrees with {inliers} of {on_surface} matches, but "
     if pose.best is None:
         return (

@@ -1,4 +1,4 @@
-"""New points from matches of views that have their poses, where a model has none yet."""
+"""New points of a model, triangulated from matches of views that have poses."""
 
 from collections.abc import Collection, Mapping
 
@@ -7,22 +7,24 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from jaxsfm.colmap.model_arrays import Tracks, View, errors_px, select
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Reader
+from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
 TAKEN_PX = 4.0
 """A keypoint this near to an observation is on that point, working pixels: half a fine cell."""
 MATCH_ERROR_PX = 4.0
-"""Reprojection error of a matched keypoint, working pixels: COLMAP's limit of the mapper."""
+"""Largest reprojection error of a matched keypoint, working pixels: COLMAP's limit for mapping."""
 MIN_POINTS = 10
-"""Fewer new points have no planes to be aligned by."""
+"""Fewer new points are not aligned, because they determine no planes."""
 
 
-def _taken(view: int, tracks: Tracks, xy: np.ndarray) -> np.ndarray:
-    """Which pixels (n, 2) of a view lie on a point that it shows."""
+def _on_points(tracks: Tracks, view: int, xy: np.ndarray) -> np.ndarray:
+    """bool (n,): which pixels (n, 2) of a view lie on a point that the view shows already."""
     own = tracks.view == view
     if not own.any() or not len(xy):
         return np.zeros(len(xy), bool)
@@ -31,17 +33,21 @@ def _taken(view: int, tracks: Tracks, xy: np.ndarray) -> np.ndarray:
 
 
 def matched_tracks(
-    views: list[View],
-    tracks: Tracks,
-    fresh: Collection[str],
-    matches: Mapping[Pair, PairResult],
+    model: Model, fresh: Collection[str], matches: Mapping[Pair, PairResult]
 ) -> Tracks:
-    """Tracks of keypoints that no point lies on, joined over all matches of the fresh views with
-    any view; their points are not known yet.
+    """Tracks of matched keypoints on which no point of the model lies yet.
 
-    A track that reaches two keypoints of one view is none.
+    Keypoints are joined over all matches of fresh views with any view. A track that reaches two
+    keypoints of one view is left out.
+
+    Args:
+      fresh: names of the views that are new in the model.
+      matches: original pixels. Pairs of other images are ignored.
+
+    Returns:
+      tracks in the views of the model; their points are zero, as they are not known yet.
     """
-    index = {view.name: k for k, view in enumerate(views)}
+    index = {view.name: k for k, view in enumerate(model.views)}
     ends: list[list[np.ndarray]] = [[], []]
     places: list[tuple[np.ndarray, np.ndarray]] = []
     for pair in sorted(matches):
@@ -51,14 +57,14 @@ def matched_tracks(
         free, sides = np.ones(result.num_inliers, bool), []
         for side, xy in enumerate((result.keypoints0, result.keypoints1)):
             k = index[pair[side]]
-            at = (xy + 0.5) / views[k].scale - 0.5
-            free &= ~_taken(k, tracks, at)
+            at = model.views[k].pixels.from_original(xy)
+            free &= ~_on_points(model.tracks, k, at)
             sides.append((k * 2**32 + result.cells[:, side].astype(np.int64), at))
         for end, (node, at) in zip(ends, sides, strict=True):
             end.append(node[free])
             places.append((node[free], at[free]))
     if not places:
-        return Tracks(*(np.zeros(shape, kind) for shape, kind in _EMPTY))
+        return Tracks.empty()
     nodes, xy = (np.concatenate(column) for column in zip(*places, strict=True))
     nodes, first = np.unique(nodes, return_index=True)
     xy, view = xy[first], nodes // 2**32
@@ -74,15 +80,15 @@ def matched_tracks(
     return Tracks(np.zeros((len(kept), 3)), point, view[keep], xy[keep])
 
 
-_EMPTY = (((0, 3), np.float64), ((0,), np.int64), ((0,), np.int64), ((0, 2), np.float64))
+def triangulated(model: Model) -> Model:
+    """The model with every point at the least squares of distances to its observations' rays.
 
-
-def triangulated(views: list[View], tracks: Tracks) -> Tracks:
-    """The points nearest to their observations' rays, by least squares of distances; NaN where the
-    rays are parallel or less than two."""
+    The point is NaN where the rays are parallel or there are fewer than two.
+    """
+    tracks = model.tracks
     normal = np.zeros((len(tracks.points), 3, 3))
     right = np.zeros((len(tracks.points), 3))
-    for k, view in enumerate(views):
+    for k, view in enumerate(model.views):
         own = tracks.view == k
         ray = view.rays(tracks.xy[own])
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -93,49 +99,42 @@ def triangulated(views: list[View], tracks: Tracks) -> Tracks:
     solvable = np.linalg.eigvalsh(normal)[:, 0] > 1e-6
     points = np.full(tracks.points.shape, np.nan)
     points[solvable] = np.linalg.solve(normal[solvable], right[solvable, :, None])[..., 0]
-    return tracks._replace(points=points)
+    return model.with_tracks(tracks._replace(points=points))
 
 
-def _agreeing(views: list[View], tracks: Tracks, max_error_px: float) -> Tracks:
-    """Triangulated, without observations that are off, and without points that two no longer see;
-    twice, for what was off had pulled."""
+def _agreeing(model: Model, max_error_px: float) -> Model:
+    """The model triangulated, without observations that are off and without points that fewer than
+    two observations are left of. This is done twice, because what was off had moved the points."""
     for _ in range(2):
-        tracks = triangulated(views, tracks)
-        tracks = select(tracks, errors_px(views, tracks) <= max_error_px)
-        seen = np.bincount(tracks.point, minlength=len(tracks.points))
-        keep = (seen >= 2) & np.isfinite(tracks.points).all(1)
-        tracks = select(tracks, keep[tracks.point])
-        place = np.cumsum(keep) - 1
-        tracks = tracks._replace(points=tracks.points[keep], point=place[tracks.point])
-    return tracks
+        model = triangulated(model)
+        tracks = model.tracks.select(model.errors_px() <= max_error_px)
+        keep = (tracks.num_observations() >= 2) & np.isfinite(tracks.points).all(1)
+        model = model.with_tracks(tracks.select_points(np.flatnonzero(keep)))
+    return model
 
 
 def new_points(
-    views: list[View],
-    tracks: Tracks,
+    model: Model,
     fresh: Collection[str],
     matches: Mapping[Pair, PairResult],
     read: Reader,
     *,
     refinement: Refinement | None,
 ) -> Tracks:
-    """Points on which fresh views and others agree and that the model does not have.
+    """Points on which fresh views and others agree, and which the model does not have.
 
     Args:
-      tracks: of the model.
-      fresh: names of views that are new in it.
-      refinement: move the observations onto one patch each, as the model's were; None: they stay
-        where they were matched.
+      fresh: names of the views that are new in the model.
+      matches: original pixels.
+      read: intensities by the name of a view.
+      refinement: that of the model: the observations are moved onto one patch each, as the model's
+        were. None: they stay where they were matched.
     """
-    found = _agreeing(views, matched_tracks(views, tracks, fresh, matches), MATCH_ERROR_PX)
-    if refinement is None or len(found.points) < MIN_POINTS:
-        return found
-    parts = []
-    for b in align_blocks(found, views, read, refinement, refinement.max_shift_px):
-        good = np.flatnonzero(b.agrees)
-        own = np.unique(b.found.point[good])
-        parts.append((b.rows[own], b.reference[own], b.xy[own]))
-        parts.append((b.rows[b.found.point[good]], b.found.view[good], b.moved[good]))
-    point, view, xy = (np.concatenate(column) for column in zip(*parts, strict=True))
-    aligned = Tracks(found.points, point, view, xy)
-    return _agreeing(views, aligned, refinement.max_error_px)
+    found = _agreeing(model.with_tracks(matched_tracks(model, fresh, matches)), MATCH_ERROR_PX)
+    if refinement is None or len(found.tracks.points) < MIN_POINTS:
+        return found.tracks
+    limits = AlignmentLimits.of(refinement)
+    blocks = align_blocks(found, read, refinement, limits)
+    parts = [part for block in blocks for part in block.observations()]
+    aligned = found.with_tracks(Tracks.from_parts(found.tracks.points, parts))
+    return _agreeing(aligned, refinement.max_error_px).tracks

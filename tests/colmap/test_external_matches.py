@@ -12,12 +12,12 @@ from foreign_model import NAMES, SIZE, camera, exact_model, image_files, results
 from mapped import map_database
 
 from jaxsfm.colmap.database import write_database
-from jaxsfm.colmap.external_matches import NOTHING, Beside, read_given
+from jaxsfm.colmap.external_matches import NO_EXTERNAL_MATCHES, JoinedMatches, read_external_matches
 from jaxsfm.colmap.formats.database import read_database
 from jaxsfm.colmap.formats.hloc import FEATURES, MATCHES, write_hloc
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions
-from jaxsfm.colmap.model_arrays import read_model_arrays
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import UserError
 
@@ -50,7 +50,7 @@ def halves():
 
 def merged_database(path, ours, given):
     names = set(NAMES)
-    write_database(path, IMAGES, Beside(ours, given, names), KNOWN)
+    write_database(path, IMAGES, JoinedMatches(ours, given, names), KNOWN)
     return read_database(path, where="merged")
 
 
@@ -58,7 +58,7 @@ def merged_database(path, ours, given):
 def test_theirs_come_first_and_every_match_keeps_its_two_places(tmp_path, halves, verified):
     ours, theirs = halves
     path = write_theirs(tmp_path / "theirs.db", theirs, verified=verified)
-    given = read_given(path, None, IMAGES, KNOWN)
+    given = read_external_matches(path, None, IMAGES, KNOWN)
     merged = merged_database(tmp_path / "merged.db", ours, given)
     own = read_database(path, where="theirs")
     for name in NAMES:
@@ -80,11 +80,11 @@ def test_theirs_come_first_and_every_match_keeps_its_two_places(tmp_path, halves
 
 def test_without_any_given_ours_are_as_they_were(halves):
     ours, _ = halves
-    beside = Beside(ours, NOTHING, set(NAMES))
+    beside = JoinedMatches(ours, NO_EXTERNAL_MATCHES, set(NAMES))
     assert list(beside) == sorted(ours) and len(beside) == len(ours)
     for pair in ours:
         assert np.array_equal(beside[pair].cells, ours[pair].cells)
-    assert read_given(None, None, IMAGES, None) is NOTHING
+    assert read_external_matches(None, None, IMAGES, None) is NO_EXTERNAL_MATCHES
 
 
 def test_images_that_neither_connects_alone_come_into_one_model(tmp_path, halves):
@@ -92,7 +92,7 @@ def test_images_that_neither_connects_alone_come_into_one_model(tmp_path, halves
     ours, theirs = halves
     ours = {pair: r for pair, r in ours.items() if NAMES[3] not in pair}
     theirs = {pair: r for pair, r in theirs.items() if NAMES[3] in pair}
-    given = read_given(write_theirs(tmp_path / "theirs.db", theirs), None, IMAGES, KNOWN)
+    given = read_external_matches(write_theirs(tmp_path / "theirs.db", theirs), None, IMAGES, KNOWN)
     write_database(tmp_path / "ours.db", IMAGES, ours, KNOWN)
     (alone,) = map_database(tmp_path / "ours.db", ONE)
     assert sorted(model_poses(alone)) == NAMES[:3]
@@ -107,8 +107,8 @@ def test_hlocs_files_give_what_the_database_gives(tmp_path, halves):
     path = write_theirs(tmp_path / "theirs.db", theirs)
     tables = read_database(path, where="theirs")
     write_hloc(tmp_path, tables, tables.matches, dict.fromkeys(NAMES, 1.0))
-    one = read_given(path, None, IMAGES, KNOWN)
-    other = read_given(None, (tmp_path / FEATURES, tmp_path / MATCHES), IMAGES, KNOWN)
+    one = read_external_matches(path, None, IMAGES, KNOWN)
+    other = read_external_matches(None, (tmp_path / FEATURES, tmp_path / MATCHES), IMAGES, KNOWN)
     for name in NAMES:
         assert np.array_equal(one.keypoints[name], other.keypoints[name])
     for pair, rows in one.matches.items():
@@ -132,7 +132,7 @@ def test_refinement_reads_tracks_whatever_the_order_of_keypoints():
         for element in point.track.elements:
             track.add_element(element.image_id, int(place[element.image_id][element.point2D_idx]))
         shuffled.add_point3D(point.xyz, track, point.color)
-    (_, one), (_, other) = (read_model_arrays(m, sizes) for m in (MODEL, shuffled))
+    one, other = (Model.from_colmap(m, sizes).tracks for m in (MODEL, shuffled))
     for a, b in zip(one, other, strict=True):
         assert np.array_equal(a, b)
 
@@ -144,7 +144,7 @@ def test_images_of_the_database_alone_are_ignored_with_a_note(
     path = write_theirs(tmp_path / "theirs.db", theirs)
     monkeypatch.setattr(logging.getLogger("jaxsfm"), "propagate", True)
     with caplog.at_level(logging.WARNING):
-        given = read_given(path, None, IMAGES[:3], KNOWN)
+        given = read_external_matches(path, None, IMAGES[:3], KNOWN)
     assert NAMES[3] in caplog.text and "1 images" in caplog.text
     assert sorted(given.keypoints) == NAMES[:3]
     assert given.about is not None and given.about["ignored"] == [NAMES[3]]
@@ -153,8 +153,8 @@ def test_images_of_the_database_alone_are_ignored_with_a_note(
 
 def test_images_that_are_not_mapped_take_their_pairs_with_them(tmp_path, halves):
     _, theirs = halves
-    given = read_given(write_theirs(tmp_path / "theirs.db", theirs), None, IMAGES, KNOWN)
-    beside = Beside({}, given, set(NAMES[:2]))
+    given = read_external_matches(write_theirs(tmp_path / "theirs.db", theirs), None, IMAGES, KNOWN)
+    beside = JoinedMatches({}, given, set(NAMES[:2]))
     assert list(beside) == [(NAMES[0], NAMES[1])]
     with pytest.raises(KeyError):
         beside[NAMES[0], NAMES[3]]
@@ -172,7 +172,7 @@ def test_many_to_one_matches_become_one_to_one(tmp_path, halves):
         twice[7, 1] = rows[5, 1]  # and one of the second
         db.delete_matches(ids[a], ids[b])
         db.write_matches(ids[a], ids[b], twice)
-    given = read_given(path, None, IMAGES, KNOWN)
+    given = read_external_matches(path, None, IMAGES, KNOWN)
     kept = given.matches[a, b]
     assert all(len(np.unique(column)) == len(kept) for column in kept.T)
     assert len(kept) == len(rows) - 2
@@ -193,7 +193,7 @@ def of_size(size):
 def test_other_photos_sizes_and_cameras_are_refused(tmp_path, halves, images, intrinsics, message):
     path = write_theirs(tmp_path / "theirs.db", halves[1])
     with pytest.raises(UserError, match=f"--with-database .*theirs.db: .*{message}"):
-        read_given(path, None, images, intrinsics)
+        read_external_matches(path, None, images, intrinsics)
 
 
 @pytest.mark.parametrize(("shift", "accepted"), [(0.9, True), (3.0, False)])
@@ -206,21 +206,21 @@ def test_keypoints_on_the_border_are_pulled_in_and_beyond_refused(
     write_hloc(tmp_path, tables, tables.matches, dict.fromkeys(NAMES, 1.0))
     files = tmp_path / FEATURES, tmp_path / MATCHES
     if accepted:
-        given = read_given(None, files, IMAGES, None)
+        given = read_external_matches(None, files, IMAGES, None)
         assert given.keypoints[NAMES[0]][3].tolist() == [SIZE[0] - 0.5, 10]
     else:
         with pytest.raises(UserError, match=r"--with-hloc: a\.jpg has keypoints outside"):
-            read_given(None, files, IMAGES, None)
+            read_external_matches(None, files, IMAGES, None)
 
 
 def test_one_source_at_a_time(tmp_path):
     with pytest.raises(UserError, match="--with-database and --with-hloc: one of them"):
-        read_given(tmp_path, (tmp_path, tmp_path), IMAGES, None)
+        read_external_matches(tmp_path, (tmp_path, tmp_path), IMAGES, None)
 
 
 def test_a_lost_image_is_judged_by_both(tmp_path, halves):
     ours, theirs = halves
-    given = read_given(write_theirs(tmp_path / "theirs.db", theirs), None, IMAGES, KNOWN)
+    given = read_external_matches(write_theirs(tmp_path / "theirs.db", theirs), None, IMAGES, KNOWN)
     pair, other = sorted(ours)[:2]
     mine = {pair: ours[pair].counts._replace(num_inliers=0), other: ours[other].counts}
     counts = given.counts(mine)
