@@ -7,7 +7,7 @@ comma := ,
 GPU := $(if $(shell command -v nvidia-smi 2>/dev/null),$(comma)cuda)
 WORKERS ?= 2
 
-.PHONY: demo test check lint docs clean
+.PHONY: demo test mutants check lint docs clean
 
 demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the truth, in demo/
 	rm -rf demo
@@ -15,6 +15,9 @@ demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the tr
 
 test: $(VENV)/.dev ## all tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
+mutants: $(VENV)/.dev ## deliberate mistakes in the core and the refinement: do tests fail?
+	$(BIN)/python tests/mutants/run.py
 
 lint: $(VENV)/.dev ## format, style, layers, types
 	$(BIN)/ruff format --check .

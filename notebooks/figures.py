@@ -1,4 +1,4 @@
-"""The figures of docs/how-it-works.md, taken from the notebooks as stored (tests execute them).
+"""Takes the figures of docs/how-it-works.md from the stored notebooks, which the tests execute.
 
 python notebooks/figures.py
 """
@@ -18,11 +18,11 @@ FIGURES = {
     "view_graph": ("03_reconstruct", 1),
     "refinement": ("03_reconstruct", 4),
 }
-"""Name -> notebook, and which of its figures."""
+"""The notebook of each figure, and the number of the figure in it."""
 
 
 def stored_figures(notebook: str) -> list[bytes]:
-    """JPEG files of a notebook's figures, in order."""
+    """The contents of a notebook's figures as JPEG files, in order."""
     cells = json.loads((HERE / f"{notebook}.ipynb").read_text())["cells"]
     outputs = [output for cell in cells for output in cell.get("outputs", [])]
     found = [
@@ -32,7 +32,7 @@ def stored_figures(notebook: str) -> list[bytes]:
 
 
 def figures() -> dict[str, bytes]:
-    """File name -> JPEG."""
+    """The contents of the JPEG files, by file name."""
     return {f"{name}.jpg": stored_figures(book)[k] for name, (book, k) in FIGURES.items()}
 
 

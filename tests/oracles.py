@@ -284,3 +284,25 @@ def nearest(x: np.ndarray, k: int, tie: float) -> np.ndarray:
         others = sorted((-round(float(row @ y) / tie), j) for j, y in enumerate(x) if j != i)
         rows.append([j for _, j in others[:k]])
     return np.asarray(rows)
+
+
+# -- what verification keeps -----------------------------------------------------------------------
+
+
+def one_to_one(cells: np.ndarray, keep: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """Every cell of image 0 keeps its best entry, then every cell of image 1 of those; the first
+    of equals."""
+    keep = keep.copy()
+    for side in (0, 1):
+        best: dict[int, int] = {}
+        for i in np.flatnonzero(keep).tolist():
+            cell = int(cells[i, side])
+            if cell not in best or score[i] > score[best[cell]]:
+                best[cell] = i
+        keep = np.isin(np.arange(len(keep)), list(best.values()))
+    return keep
+
+
+def inliers(h, xy0, xy1, threshold: float) -> np.ndarray:
+    """Points that h moves to less than `threshold` from their partners."""
+    return np.linalg.norm(transfer(np.asarray(h, np.float64), xy0) - xy1, axis=1) < threshold

@@ -1,13 +1,17 @@
-"""Sub-pixel alignment of keypoints: a patch of the reference view, warped by the local plane, is
-moved over another view by Gauss-Newton until the two agree up to gain and offset.
+"""Sub-pixel alignment of keypoints.
 
-Maps are (h, w, c): c = 1 for intensities, more for dense features; they may be padded at the bottom
-and on the right beyond `size`. A patch is a list of offsets around a keypoint with a weight each.
-Everything is batched by vmap, jits, and differentiates with respect to keypoints and maps: the
-iteration count is static, what fails is masked.
+A patch of the reference view is warped by the local plane and moved over another view by
+Gauss-Newton steps until the two agree up to gain and offset.
 
-The template's gradient is used (inverse compositional: Baker and Matthews, IJCV 2004, section 3.2),
-so an iteration is one sampling of the map and a 2 x 2 solve.
+Maps are (h, w, c), with c = 1 for intensities and more channels for dense features. They may be
+padded at the bottom and on the right beyond `size`. A patch is a list of offsets around a keypoint
+with a weight each. All functions are batched by vmap, can be compiled, and are differentiable with
+respect to keypoints and maps: the number of iterations is static, and failures are masked.
+
+The gradient of the template is used, so an iteration is one sampling of the map and the solution of
+a 2 x 2 system.
+
+Source: Baker and Matthews, IJCV 2004, section 3.2 (inverse compositional alignment).
 """
 
 import functools
@@ -36,8 +40,8 @@ class Templates(NamedTuple):
     values: Float[Array, "n q c"]
     """Weighted mean 0 in every channel, weighted variance 1 over all channels; 0 where flat."""
     descent: Float[Array, "n q c 2"]
-    """Derivative of `values` with respect to the shift of the patch, per reference pixel."""
-    """With gain and offset projected out."""
+    """Derivative of `values` with respect to the shift of the patch, per reference pixel. What a
+    change of gain or offset would explain has been taken out."""
     hessian: Float[Array, "n 2 2"]
     contrast: Float[Array, " n"]
     """Weighted standard deviation before normalisation, units of the map."""
@@ -46,7 +50,7 @@ class Templates(NamedTuple):
 
 
 class Aligned(NamedTuple):
-    """Where keypoints moved, and how far they can be trusted."""
+    """Where keypoints ended, and how far their places can be trusted."""
 
     xy: Float[Array, "n 2"]
     score: Float[Array, " n"]
@@ -54,11 +58,15 @@ class Aligned(NamedTuple):
     sigma: Float[Array, " n"]
     """Standard deviation of the position along its worst direction, pixels of the other view."""
     converged: Bool[Array, " n"]
-    """It came to rest inside the image, on a patch that is not flat."""
+    """The last step was short, and the patch lies inside the image and is not flat."""
 
 
 FLAT = 1e-5
-"""Deviation over root mean square below which a patch is flat."""
+"""A patch is flat if its deviation over its root mean square is below this."""
+MAX_STEP = 1.0
+"""Longest step of one iteration, reference pixels."""
+TOLERANCE = 0.02
+"""An alignment has converged if its last step is shorter, reference pixels."""
 
 
 def square_patch(radius: int, *, spacing: float = 1.0, sigma: float | None = None) -> Patch:
@@ -85,10 +93,11 @@ def _cubic(f: Float[Array, "*n"]) -> list[Float[Array, "*n"]]:
 def sample(
     image: Float[Array, "h w c"], size: Int[Array, " 2"], xy: Float[Array, "*n 2"]
 ) -> tuple[Float[Array, "*n c"], Bool[Array, "*n"]]:
-    """Values at (x, y) by cubic convolution, and which lie inside; outside is the nearest edge.
+    """Values at (x, y) by cubic convolution, and which of the points lie inside the image.
 
-    Bilinear values blur most half-way between pixels, which draws an alignment towards there: 0.05
-    px on smooth textures against 0.01 (tests/core/test_align.py).
+    A point outside the image gets the value of the nearest edge. Bilinear interpolation would blur
+    most half-way between pixels and draw alignments towards there: they were 0.05 px off on smooth
+    textures instead of 0.01 (tests/core/test_align.py).
 
     Args:
       size: valid (rows, columns) of the map.
@@ -115,9 +124,10 @@ def sample(
 def _normalise(
     values: Float[Array, "q c"], weights: Float[Array, " q"]
 ) -> tuple[Float[Array, "q c"], Float[Array, ""], Float[Array, ""]]:
-    """Weighted mean removed per channel, joint variance 1; the deviation before, and its inverse.
+    """Values with weighted mean 0 per channel and joint variance 1; their deviation before, and its
+    inverse.
 
-    Flat patches (deviation below float32's rounding of the values) become zero.
+    Flat patches, whose deviation is no more than the rounding of float32 values, become zero.
     """
     power = jnp.einsum("q,qc->", weights, values * values, precision=HIGHEST)
     values = values - jnp.einsum("q,qc->c", weights, values, precision=HIGHEST)
@@ -145,8 +155,8 @@ def make_templates(
         gy = sample(image, size, at + dy)[0] - sample(image, size, at - dy)[0]
         values, contrast, scale = _normalise(values, patch.weights)
         g = jnp.stack([gx, gy], -1) * scale
-        # Gain and offset are projected out of the gradient: a shift that only looks like a change
-        # of contrast must not count as information.
+        # Gain and offset are projected out of the gradient. A shift that looks like a change of
+        # contrast must not count as information.
         g = g - jnp.einsum("q,qck->ck", patch.weights, g, precision=HIGHEST)
         along = jnp.einsum("q,qc,qck->k", patch.weights, values, g, precision=HIGHEST)
         g = g - values[..., None] * along
@@ -173,19 +183,17 @@ def align(
     patch: Patch,
     *,
     iterations: int = 10,
-    max_step: float = 1.0,
-    tolerance: float = 0.02,
 ) -> Aligned:
     """Move keypoints of a view onto their templates.
 
     Args:
       image: the view's map.
-      size: its valid (rows, columns).
-      templates: of the same tracks in their reference views.
+      size: valid (rows, columns) of the map.
+      templates: patches of the same tracks in their reference views.
       xy: where to start, pixels of the view.
-      affine: reference offsets to offsets in the view, from the local plane.
-      max_step: longest step of one iteration, reference pixels.
-      tolerance: converged when the last step is shorter, reference pixels.
+      affine: maps reference offsets to offsets in the view (from the local plane).
+      patch: the patch that the templates were made with.
+      iterations: number of Gauss-Newton steps.
     """
 
     def one(t: Templates, start, a):
@@ -201,14 +209,15 @@ def align(
             b = jnp.einsum("q,qc,qck->k", patch.weights, r, t.descent, precision=HIGHEST)
             d = -_solve2(t.hessian, b)
             length = jnp.sqrt(jnp.sum(d * d) + 1e-20)
-            d = d * jnp.minimum(1.0, max_step / length)
-            return at + a @ d, length
+            d = d * jnp.minimum(1.0, MAX_STEP / length)
+            return at + jnp.matmul(a, d, precision=HIGHEST), length
 
         at, lengths = lax.scan(step, start, None, length=iterations)
         _, inside, contrast, values = residual(at)
         score = jnp.einsum("q,qc,qc->", patch.weights, values, t.values, precision=HIGHEST)
-        # Two patches of variance 1 differ by 2 (1 - score). Spread over the effective number of
-        # samples that is the noise of a least-squares shift (its covariance: noise / hessian).
+        # The mean square difference of two patches of variance 1 is 2 (1 - score). Divided by the
+        # effective number of samples it is the noise of a least-squares shift, whose covariance is
+        # noise / hessian.
         h = t.hessian
         mean, diff = 0.5 * (h[0, 0] + h[1, 1]), 0.5 * (h[0, 0] - h[1, 1])
         smallest = mean - jnp.sqrt(diff**2 + h[0, 1] ** 2 + 1e-30)
@@ -217,7 +226,7 @@ def align(
             2 * jnp.maximum(1 - score, 1e-6) / (jnp.maximum(smallest, 1e-9) * effective)
         )
         stretch = jnp.sqrt(0.5 * jnp.sum(a * a))
-        ok = inside & t.inside & (lengths[-1] < tolerance) & (contrast > 0) & (t.contrast > 0)
+        ok = inside & t.inside & (lengths[-1] < TOLERANCE) & (contrast > 0) & (t.contrast > 0)
         return Aligned(at, score, sigma * stretch, ok)
 
     return jax.vmap(one)(templates, xy, affine)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import lax
+from jax.lax import platform_dependent
 from jaxtyping import Array, Float, Int
 
 from jaxsfm.core.numerics import HIGHEST
@@ -84,7 +85,7 @@ def conv(
 
     if small and not bfloat16:
         return _library(x, layer.kernel) + layer.bias
-    return lax.platform_dependent(x, layer.kernel, cpu=on_cpu, default=elsewhere) + layer.bias
+    return platform_dependent(x, layer.kernel, cpu=on_cpu, default=elsewhere) + layer.bias
 
 
 def pool(x: Float[Array, "b h w c"], size: Int[Array, "b 2"]) -> Float[Array, "b h2 w2 c"]:
@@ -131,7 +132,7 @@ def scores_and_pool(
         return lax.map(lambda item: one(*item), (x, size))
 
     if large:
-        return lax.platform_dependent(x, size, layers, head, cpu=strips, default=whole)
+        return platform_dependent(x, size, layers, head, cpu=strips, default=whole)
     return whole(x, size, layers, head)
 
 

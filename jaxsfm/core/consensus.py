@@ -2,9 +2,11 @@
 
     S'(i, j) = sum over shifts d of w(d) S(i + d, j + d),  w(d) = exp(-|d|^2 / (2 r^2))
 
-with S the similarity of coarse cells i and j, the same shift d in both images, both parts of d from
--r to r. Nothing is learnt; what lies outside either image adds nothing. The idea is that of learnt
-consensus networks (Rocco et al. 2018, "Neighbourhood Consensus Networks"), with one fixed kernel.
+S is the similarity of coarse cells i and j. The shift d is the same in both images, and both of its
+parts run from -r to r. Cells outside either image add nothing, and nothing is learnt. The idea is
+that of learnt consensus networks with one fixed kernel.
+
+Source: Rocco et al. 2018, "Neighbourhood Consensus Networks".
 """
 
 import math
@@ -18,11 +20,11 @@ from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.matching import scan_mutual
 from jaxsfm.core.numerics import HIGHEST
 from jaxsfm.core.octaves import blend
-from jaxsfm.core.types import OctavePart
+from jaxsfm.core.types import DescriptorGrid, OctavePart
 
 
 def weights(radius: int) -> list[float]:
-    """The kernel along one axis; the plane's is their product."""
+    """The kernel along one axis; the kernel of the plane is the product of both axes'."""
     return [math.exp(-(d * d) / (2 * radius * radius)) for d in range(-radius, radius + 1)]
 
 
@@ -32,7 +34,8 @@ def _products(
     parts: Sequence[OctavePart],
     padding: tuple[tuple[int, int], tuple[int, int]],
 ) -> Callable[[Array, int], Float[Array, "rows m"]]:
-    """(first row, how many) -> those rows' products, counted in `a` with its padding."""
+    """A function (first row, number of rows) -> the products of these rows of `a` with all rows of
+    `others`. Rows are counted in `a` with its padding."""
     own = a.shape[1] - sum(part.flat.shape[1] for part in parts)
     rows = jnp.pad(a[:, :own], padding)
 
@@ -54,7 +57,8 @@ def _products(
 
     def all_octaves(start, count):
         each = [lax.dynamic_slice_in_dim(x, start, count, axis=1) for x in blends]
-        # A loop, because XLA would fuse the sums into the votes and repeat them for all nine.
+        # This is a loop because XLA would fuse the sums into the votes, and repeat them for each
+        # of the nine.
         return lax.scan(
             lambda total, at: (total + blend(table, *at), None), first_octave(start, count), each
         )[0]
@@ -63,38 +67,37 @@ def _products(
 
 
 def consensus_nn(
-    a: Float[Array, "n c"],
-    b: Float[Array, "m c"],
-    grid0: Int[Array, " 2"],
-    grid1: Int[Array, " 2"],
+    cells0: DescriptorGrid,
+    cells1: DescriptorGrid,
     *,
-    parts: Sequence[OctavePart] = (),
     radius: int,
     columns: int,
     tile: int = 1024,
 ) -> Int[Array, " n"]:
     """For every cell of image 0 its mutual best cell of image 1 under S', or -1.
 
-    Exact; ties go to the lowest index on both sides; a zero descriptor never matches. `tile` rows
-    of S' exist at a time, from the products of `tile` rows and of a margin on either side that
-    holds their neighbours: with cells in row order, a shift of the cell is a shift of the product.
+    The result is exact. Ties go to the lowest index on both sides, and a zero descriptor never
+    matches. `tile` rows of S' exist at a time. They are computed from the products of these rows
+    and of a margin on either side that holds their neighbours: with cells in row order, a shift of
+    the cell is a shift of the product.
 
-    Where channels of `a` are blends of a smaller octave's cells, so are their products, and there
-    is one product per cell of that octave: for four octaves a third of the arithmetic, and half of
-    the time on a CPU. These products, a third of n x m in all, exist at once.
+    Where channels of image 0 are weighted sums over the cells of a smaller octave (`parts` of
+    `cells0`), so are their products, and only one product per cell of that octave is computed. For
+    four octaves this takes a third of the arithmetic and half of the time on a CPU. These products,
+    a third of n x m in all, exist at once.
 
     Args:
-      a, b: unit descriptors, cell (row, column) at row * columns + column, zero past the grid.
-      grid0, grid1: (rows, columns).
-      parts: what the last channels of `a` are made of.
-      radius: 1: 3 x 3 cells, 2: 5 x 5.
-      columns: at least those of either grid; fixes the margin. A wider grid has no matches.
+      cells0, cells1: the coarse cells of both images; only the `parts` of `cells0` are used.
+      radius: 1 for a neighbourhood of 3 x 3 cells, 2 for 5 x 5.
+      columns: at least the number of columns of either grid. It fixes the margin; a wider grid has
+        no matches.
 
     Raises:
       ValueError: radius or columns are below 1.
     """
     if radius < 1 or columns < 1:
         raise ValueError(f"radius and columns must be at least 1; got {radius}, {columns}")
+    (a, grid0, parts), (b, grid1, _) = cells0, cells1
     n, m = a.shape[0], b.shape[0]
     tile, margin = min(tile, n), radius * (columns + 1)
     others = jnp.pad(b, ((margin, margin), (0, 0)))
@@ -115,7 +118,7 @@ def consensus_nn(
             for down, v in kernel:
                 corner = (margin + down * grid0[1] + right, margin + down * grid1[1] + right)
                 line += v * lax.dynamic_slice(block, corner, (tile, m))
-            # The cell before a row's first one is the last of another row: not a neighbour.
+            # The cell before the first of a row is the last of another row, and no neighbour.
             inside0 = (at + right >= 0) & (at + right < grid0[1])
             inside1 = (column1 + right >= 0) & (column1 + right < grid1[1])
             total += jnp.where(inside0[:, None] & inside1[None, :], w * line, 0.0)

@@ -98,7 +98,8 @@ def dense_features(
 
 def stored(features: DenseFeatures) -> DenseFeatures:
     """The same with descriptors of half the size, as they are kept: float16, which moves a unit
-    vector by 2.4e-4 at most, a thousandth of what separates neighbouring cells (docs/design.md)."""
+    vector by 2.4e-4 at most, a thousandth of what separates neighbouring cells
+    (docs/decisions/features.md)."""
 
     def half(octaves: tuple[Array, ...]) -> tuple[Array, ...]:
         return tuple(octave.astype(jnp.float16) for octave in octaves)

@@ -1,9 +1,9 @@
-"""What a relocalizer should do, as differentiable functions of where its walks end.
+"""Losses of relocalization, as differentiable functions of where its walks end.
 
-Cells of two images that see the same place, and what is known of the map between the images: a
-homography, or the epipolar geometry of two known cameras. The hard walk's success is whether two
-keypoints meet; its expectation over random walks (`jaxsfm.core.relocalize.walk`) is a sum over the
-pairs of pixels of two cells, exact and without sampling.
+Given are cells of two images that see the same place, and the map between the images: a homography,
+or the epipolar geometry of two known cameras. The hard walk succeeds if the two keypoints meet. The
+expectation of that over random walks (`jaxsfm.core.relocalize.walk`) is a sum over all pairs of
+pixels of the two cells. It is exact, without sampling.
 """
 
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class CellPairs(NamedTuple):
     """(row, column) in image 0."""
     cell1: Int[Array, "m 2"]
     weight: Float[Array, " m"]
-    """0 where there is no such pair."""
+    """1 for a pair, 0 for a row that is none."""
 
 
 def cells_under_homography(
@@ -39,13 +39,16 @@ def cells_under_homography(
     """For every fine cell of image 0 the cell of image 1 that its centre falls into.
 
     Args:
-      h: image 0 to image 1, pixels; both have rows x cols fine cells.
-      offsets: added to the mapped centres, pixels: descriptors find a cell near the right one.
-      margin: cells this close to a border do not count.
+      h: maps pixels of image 0 to pixels of image 1.
+      offsets: added to the mapped centres, pixels. They imitate descriptors, which may find a
+        cell beside the right one.
+      rows, cols: the grid of fine cells of either image.
+      margin: cells that are this close to a border do not count.
     """
     row, col = cell_rows_cols(rows * cols, jnp.int32(cols))
     centre = cell_to_px(jnp.stack([col, row], axis=-1).astype(jnp.float32), stride=FINE_STRIDE)
-    # A pixel's centre is a whole number, its cell's first edge half a pixel before.
+    # The centre of a pixel has whole coordinates; the first edge of its cell lies half a pixel
+    # before.
     found = jnp.floor((warp_points(h, centre) + offsets + 0.5) / FINE_STRIDE)
     found = jnp.where(jnp.isfinite(found), found, -1.0)
 
@@ -53,7 +56,7 @@ def cells_under_homography(
         return (r >= margin) & (r < rows - margin) & (c >= margin) & (c < cols - margin)
 
     seen = inside(found[:, 1], found[:, 0]) & inside(row, col)
-    # Where the map turns over (behind the camera) nothing is seen.
+    # Points that the map puts behind the camera are not seen.
     seen &= jnp.einsum("j,nj->n", h[2], homogeneous(centre), precision=HIGHEST) * h[2, 2] > 0
     cell1 = jnp.where(seen[:, None], found[:, ::-1], 0.0).astype(jnp.int32)
     return CellPairs(jnp.stack([row, col], axis=-1), cell1, seen.astype(jnp.float32))
@@ -62,8 +65,8 @@ def cells_under_homography(
 def transfer_distances(
     h: Float[Array, "3 3"], walks0: WalkProbabilities, walks1: WalkProbabilities
 ) -> Float[Array, "m n n"]:
-    """Squared distances, pixels of image 1, of every place where the first walk may end, mapped by
-    a homography, from every one of the second's."""
+    """Squared distances, in pixels of image 1, between every place where the first walk may end,
+    mapped by a homography, and every place where the second walk may end."""
     moved = warp_points(h, window_positions(walks0))
     apart = moved[:, :, None] - window_positions(walks1)[:, None]
     return jnp.sum(apart**2, axis=-1)
@@ -72,10 +75,10 @@ def transfer_distances(
 def epipolar_distances(
     f: Float[Array, "3 3"], walks0: WalkProbabilities, walks1: WalkProbabilities
 ) -> Float[Array, "m n n"]:
-    """Squared Sampson distances, pixels, of the same places to a fundamental matrix.
+    """Squared Sampson distances, pixels, of all pairs of places where the two walks may end.
 
     Args:
-      f: x1' F x0 = 0.
+      f: fundamental matrix, x1' F x0 = 0.
     """
     return sampson_distances(
         f, window_positions(walks0)[:, :, None], window_positions(walks1)[:, None]
@@ -85,8 +88,9 @@ def epipolar_distances(
 def sampson_distances(
     f: Float[Array, "3 3"], xy0: Float[Array, "*n 2"], xy1: Float[Array, "*m 2"]
 ) -> Float[Array, "*k"]:
-    """Squared distance of matches to the nearest exact ones, to first order; leading axes
-    broadcast. Finite at the epipoles too.
+    """Squared distance, to first order, of matches to the nearest ones that fit F exactly.
+
+    Leading axes broadcast. The value is finite at the epipoles too.
 
     Source: Hartley and Zisserman 2004, section 11.4.3.
     """
@@ -105,12 +109,11 @@ def agreement(
     *,
     sigma: float,
 ) -> Float[Array, " m"]:
-    """Probability that two walks end in places that agree, in [0, 1]: the mean of
-    exp(-d^2 / (2 sigma^2)) over both.
+    """How well the ends of two walks agree, in [0, 1]: the mean of exp(-d^2 / (2 sigma^2)).
 
     Args:
-      squared: distances d^2 of their places, pixels squared.
-      sigma: how far apart places agree, pixels.
+      squared: squared distances d^2 between places of the first and the second walk, pixels^2.
+      sigma: distance at which places still agree, pixels.
     """
     return _mean_over_ends(walks0, walks1, jnp.exp(-0.5 * squared / sigma**2))
 
@@ -122,15 +125,17 @@ def mean_distance(
     *,
     most: float,
 ) -> Float[Array, " m"]:
-    """Mean distance of the places where two walks end, each at most `most`, pixels."""
+    """Mean distance, pixels, between the places where two walks end. Distances above `most` count
+    as `most`."""
     near = squared < most**2
-    # The root's gradient at 0 is infinite; half a thousandth of a pixel is not.
+    # The gradient of the root is infinite at 0, so distances start at a thousandth of a pixel.
     apart = jnp.where(near, jnp.sqrt(jnp.where(near, squared, 1.0) + 1e-6), most)
     return _mean_over_ends(walks0, walks1, apart)
 
 
 def peakiness(walks: WalkProbabilities) -> Float[Array, " m"]:
-    """How sure a walk is of its end: 1 - entropy / log(places), 1 for one place, 0 for all alike.
+    """How certain the end of a walk is: 1 - entropy / log(places). It is 1 if there is one place,
+    and 0 if all places are equally probable.
 
     Source: the entropy form of the peakiness losses of detectors (R2D2, Revaud et al. 2019).
     """
@@ -140,7 +145,7 @@ def peakiness(walks: WalkProbabilities) -> Float[Array, " m"]:
 
 
 def weighted_mean(values: Float[Array, " m"], weight: Float[Array, " m"]) -> Float[Array, ""]:
-    """Of what counts; 0 if nothing does."""
+    """The weighted mean of values; 0 if all weights are 0."""
     total = jnp.sum(weight)
     mean = jnp.sum(jnp.where(weight > 0, values, 0.0) * weight) / jnp.where(total > 0, total, 1.0)
     return jnp.where(total > 0, mean, 0.0)
@@ -160,5 +165,5 @@ def _flat(walks: WalkProbabilities) -> Float[Array, "m n"]:
 def share_within(
     squared: Float[Array, " m"], counts: Bool[Array, " m"], *, px: float
 ) -> Float[Array, ""]:
-    """Share of the matches that count whose squared distance is within px; 0 if none does."""
+    """The share, among the matches that count, of those within `px` pixels; 0 if none counts."""
     return weighted_mean((squared <= px**2).astype(jnp.float32), counts.astype(jnp.float32))

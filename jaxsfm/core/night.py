@@ -1,6 +1,7 @@
-"""A synthetic night in JAX: the light, blur and photons of `jaxsfm.bench.night`, for training.
+"""A synthetic night for training: the light, blur and photons of `jaxsfm.bench.night`, in JAX.
 
-The same model without what cameras do afterwards (denoising, JPEG). It is a model, not a night.
+Denoising and JPEG compression, which cameras apply afterwards, are left out. The model does not
+replace photos taken at night.
 """
 
 import jax
@@ -12,7 +13,7 @@ from jaxsfm.core.types import PRNGKey
 
 GAMMA = 2.2
 AMBIENT = tuple(0.006 * colour for colour in (0.7, 0.85, 1.2))
-"""Of the night sky, RGB; 1 is daylight."""
+"""Light of the night sky, RGB; daylight is 1."""
 LAMPS = (
     (1.25, 0.9, 0.5),  # sodium
     (1.1, 1.0, 0.8),  # warm white
@@ -25,14 +26,14 @@ MIN_FULL_SCALE = 100.0
 READ_NOISE = 2.0
 BLUR_PX = 0.3
 BLUR_RADIUS = 4
-"""Taps of a blur on either side: three deviations of the widest."""
+"""Pixels on either side that a blur reaches: three standard deviations of the widest blur."""
 
 
 def blur(image: Float[Array, "h w c"], sigma: Float[Array, ""]) -> Float[Array, "h w c"]:
-    """Gaussian blur, edges repeated.
+    """Gaussian blur; edges are repeated.
 
     Args:
-      sigma: deviation, pixels, at most a third of BLUR_RADIUS; 0: none.
+      sigma: standard deviation, pixels, at most a third of BLUR_RADIUS; 0 blurs nothing.
     """
     at = jnp.arange(-BLUR_RADIUS, BLUR_RADIUS + 1, dtype=image.dtype)
     taps = jnp.exp(-0.5 * (at / jnp.maximum(sigma, 1e-2)) ** 2)
@@ -47,7 +48,7 @@ def blur(image: Float[Array, "h w c"], sigma: Float[Array, ""]) -> Float[Array, 
 
 
 def _lamp_light(key: PRNGKey, height: int, width: int) -> tuple[Array, Array]:
-    """Light on the surfaces and glare in front of them."""
+    """Light of random lamps on the surfaces (h, w, 3), and their glare (h, w, 3)."""
     diagonal = float(height**2 + width**2) ** 0.5
     y, x = jnp.mgrid[:height, :width].astype(jnp.float32)
     place, reach, colour, strength = jax.random.split(key, 4)
@@ -69,11 +70,13 @@ def _lamp_light(key: PRNGKey, height: int, width: int) -> tuple[Array, Array]:
 def night(
     key: PRNGKey, rgb: Float[Array, "h w 3"], severity: Float[Array, ""]
 ) -> Float[Array, "h w 3"]:
-    """A photo at a synthetic night, 0 .. 255.
+    """A photo as a synthetic night shows it, 0 .. 255.
 
     Args:
-      rgb: 0 .. 255.
-      severity: 0: the photo; 1: a clean night; 2: noisy; 3: dark and very noisy (at most 4).
+      key: fixes the lamps and the noise.
+      rgb: the photo, 0 .. 255.
+      severity: 0 gives the photo, 1 a clean night, 2 a noisy one, 3 a dark and very noisy one; at
+        most 4.
     """
     lamps, photons = jax.random.split(key)
     light, glare = _lamp_light(lamps, *rgb.shape[:2])
@@ -84,7 +87,8 @@ def night(
     white = (1 - dusk) + dusk * jnp.quantile(brightest, 1 - SATURATED_SHARE)
     full = FULL_WELL * 10.0**-severity
     expected = jnp.minimum(radiance / jnp.maximum(white, 1e-6), 1.0) * full
-    # Photons as a normal variable: right from ten of them on, and a tenth of Poisson's time.
+    # Numbers of photons are drawn from a normal distribution. It is right from ten photons on, and
+    # takes a tenth of the time of a Poisson distribution.
     spread = jnp.sqrt(expected + READ_NOISE**2)
     electrons = expected + spread * jax.random.normal(photons, rgb.shape)
     signal = jnp.clip(electrons / jnp.maximum(full, MIN_FULL_SCALE), 0.0, 1.0)

@@ -1,7 +1,7 @@
-"""Small numerically careful pieces shared by the stages."""
+"""Small functions that all stages share, written with care for rounding and gradients."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ def squared_norm(x: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
 def inverse_norm(x: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
     """1 / L2 norm over the last axis; 0 for an all-zero vector, with a finite gradient.
 
-    The dead branch is made safe before `where`: otherwise its gradient is NaN.
+    The unused branch is made safe before `where`; otherwise its gradient would be NaN.
     """
     square = squared_norm(x)
     safe = jnp.where(square > 0, square, 1.0)
@@ -34,10 +34,10 @@ def unit(x: Float[Array, "*batch c"]) -> Float[Array, "*batch c"]:
 
 
 def argmax_first(x: Float[Array, "*shape"], *, axis: int) -> tuple[Array, Array]:
-    """Maximum and the lowest index that reaches it.
+    """The maximum along an axis, and the lowest index that reaches it.
 
-    Two vectorised reductions instead of one (value, index) reduction, which XLA compiles to
-    scalar code on CPUs.
+    These are two vectorised reductions. A single reduction of (value, index) is compiled to scalar
+    code on CPUs.
     """
     best = jnp.max(x, axis=axis)
     index = lax.broadcasted_iota(jnp.int32, x.shape, axis)
@@ -52,10 +52,14 @@ def compact(mask: Bool[Array, " k"], *, size: int) -> tuple[Int[Array, " size"],
     )
 
 
-def one_by_one(function: Callable[[Any], Any], items: Any, *, batch_size: int) -> Any:
-    """`function` over the leading axis of `items`, `batch_size` of them vmapped at a time.
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
-    A single item is no loop: XLA then sees what it sees without a batch.
+
+def one_by_one(function: Callable[[Item], Result], items: Item, *, batch_size: int) -> Result:
+    """`function` over the leading axis of the arrays in `items`, `batch_size` vmapped at a time.
+
+    A single item is not computed in a loop, so that XLA compiles what it compiles without a batch.
     """
     if jax.tree.leaves(items)[0].shape[0] == 1:
         result = function(jax.tree.map(lambda x: x[0], items))

@@ -18,7 +18,7 @@ from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart
 
 OCTAVE_WEIGHT = 0.5
 """Of an octave's products, relative to the octave before: 1, 1/2, 1/4, ... Equal weights find a
-quarter more at night, but lose 0.1 mAA on photos of 800 px (docs/design.md)."""
+quarter more at night, but lose 0.1 mAA on photos of 800 px (docs/decisions/features.md)."""
 
 
 def halve(x: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:

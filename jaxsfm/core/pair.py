@@ -16,7 +16,14 @@ from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.numerics import one_by_one
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.ransac import peel_planes
-from jaxsfm.core.types import JoinedFeatures, PairMatches, PRNGKey, Status, Thresholds
+from jaxsfm.core.types import (
+    DescriptorGrid,
+    JoinedFeatures,
+    PairMatches,
+    PRNGKey,
+    Status,
+    Thresholds,
+)
 
 
 def pair_key(root: PRNGKey, identity0: int | Array, identity1: int | Array) -> PRNGKey:
@@ -51,11 +58,8 @@ def match_pair(
     capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
     if shape.consensus:
         coarse = consensus_nn(
-            features0.coarse,
-            features1.coarse,
-            features0.coarse_grid,
-            features1.coarse_grid,
-            parts=features0.coarse_parts,
+            DescriptorGrid(features0.coarse, features0.coarse_grid, features0.coarse_parts),
+            DescriptorGrid(features1.coarse, features1.coarse_grid),
             radius=shape.consensus,
             columns=shape.coarse_columns,
             tile=shape.coarse_tile,

@@ -1,6 +1,7 @@
-"""One descriptor for a whole image out of its local ones, and the nearest of them.
+"""Global descriptors: one descriptor for a whole image, made of its local ones.
 
-All zero rows of local descriptors are padding, or show nothing; their order does not matter.
+Zero rows of local descriptors are padding, or cells that show nothing. The order of rows does not
+matter.
 """
 
 from typing import NamedTuple
@@ -14,11 +15,12 @@ from jaxsfm.core.numerics import HIGHEST, unit
 from jaxsfm.core.vocabulary import Vocabulary, nearest_centre, seen, whitened
 
 TIE = 1e-5
-"""Products of global descriptors closer than this are equal: rounding must not order them."""
+"""Products of global descriptors that differ by less count as equal, so that rounding does not
+order them."""
 
 
 def gem(x: Float[Array, "n c"], *, power: float = 3.0) -> Float[Array, " c"]:
-    """Generalised mean of every channel, then unit length; negative values count as zero.
+    """The generalised mean of every channel, scaled to unit length. Negative values count as zero.
 
     Source: Radenovic, Tolias and Chum, TPAMI 2019, equation 3.
     """
@@ -28,8 +30,9 @@ def gem(x: Float[Array, "n c"], *, power: float = 3.0) -> Float[Array, " c"]:
 
 
 def vlad(x: Float[Array, "n c"], words: Vocabulary) -> Float[Array, " kd"]:
-    """Sums of what separates descriptors from their centres: each centre's, then the whole, of
-    unit length.
+    """For every centre the sum of the differences between its descriptors and itself.
+
+    Each sum is scaled to unit length, and then the whole vector.
 
     Source: Jegou et al., CVPR 2010, section 3; Arandjelovic and Zisserman, CVPR 2013, section 3.1.
     """
@@ -42,7 +45,7 @@ def vlad(x: Float[Array, "n c"], words: Vocabulary) -> Float[Array, " kd"]:
 
 
 class NetVLADHead(NamedTuple):
-    """Of a NetVLAD file (weights_conversion/README.md)."""
+    """The parameters in a NetVLAD file (weights_conversion/README.md)."""
 
     assignment: Float[Array, "c k"]
     centres: Float[Array, "c k"]
@@ -51,7 +54,7 @@ class NetVLADHead(NamedTuple):
 
 
 def netvlad(x: Float[Array, "n c"], head: NetVLADHead) -> Float[Array, " o"]:
-    """NetVLAD of conv5_3 before its rectifier; the descriptors get unit length here.
+    """NetVLAD of conv5_3 before its rectifier. The descriptors are scaled to unit length here.
 
     Source: Arandjelovic et al., CVPR 2016, section 3.1, and their `layerVLAD.m`, `addPCA.m`.
     """
@@ -66,12 +69,12 @@ def netvlad(x: Float[Array, "n c"], head: NetVLADHead) -> Float[Array, " o"]:
 
 
 def nearest(x: Float[Array, "n c"], *, k: int, block: int = 256) -> Int[Array, "n k"]:
-    """The k other rows of largest product with each row, best first; ties by the lower index.
+    """For each row the k other rows with the largest products, best first.
 
-    `block` rows of the table of products exist at a time.
+    The lower index comes first among equals. `block` rows of the table of products exist at a time.
 
     Raises:
-      ValueError: there are no k other rows.
+      ValueError: there are fewer than k other rows.
     """
     n = x.shape[0]
     if not 1 <= k < n:

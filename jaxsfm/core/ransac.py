@@ -19,7 +19,7 @@ from jaxsfm.core import homography as hg
 from jaxsfm.core.numerics import compact
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.planes import settle
-from jaxsfm.core.types import Planes, PRNGKey, Thresholds
+from jaxsfm.core.types import Correspondences, Planes, PRNGKey, Thresholds
 
 
 class _Problem(NamedTuple):
@@ -191,7 +191,8 @@ def peel_planes(
     plane = jnp.where(member.any(0), jnp.argmax(member, axis=0), -1).astype(jnp.int32)
     num = member.sum(axis=1, dtype=jnp.int32)
     if shape.plane_rounds:
-        h, num, plane = settle(h, num, n0, n1, valid, reach1, floor, rounds=shape.plane_rounds)
+        found = Correspondences(n0, n1, valid)
+        h, num, plane = settle(h, num, found, reach1, floor, rounds=shape.plane_rounds)
     to_pixels = jax.vmap(lambda h: hg.orient(hg.compose(hg.adjugate(t1), hg.compose(h, t0))))
     pixels = to_pixels(h)
     return Planes(jnp.where((num > 0)[:, None, None], pixels, 0.0), num, used, plane)

@@ -1,17 +1,17 @@
 """Keypoint relocalization: every fine cell walks down the pyramid to one pixel.
 
-From a pool3 cell to the child with the largest score in pool2, then in pool1, then in conv1_2; the
-score is the descriptor's norm (paper, section 3.2) or a learned one (`jaxsfm.core.scores`). It
-depends on one image alone, so a keypoint's index is its cell's index in every pair, and tracks are
-consistent by construction. With 2 x 2 children those of different cells are disjoint: two keypoints
-never coincide.
+The walk leads from a pool3 cell to the child with the largest score in pool2, then in pool1, then
+in conv1_2. The score is the norm of the descriptor (paper, section 3.2) or a learned one
+(`jaxsfm.core.scores`). The walk depends on one image alone. So a keypoint has the index of its cell
+in every pair, and tracks are consistent by construction. With 2 x 2 children, different cells have
+different children, and two keypoints never coincide.
 
-The same walk at random, where a child is taken with a probability that grows with its score, has
-probabilities for all pixels; its expectation is continuous and differentiable (`soft`), and as the
-temperature falls it becomes the hard walk.
+In a random walk a child is taken with a probability that grows with its score. The expectation of
+where it ends is continuous and differentiable (the variant "soft"). As the temperature falls, it
+becomes the hard walk.
 
-Scores are positive and only their order within a block matters to the hard walk: squared norms
-order as norms do.
+Scores are positive, and the hard walk uses only their order within a block. Squared norms have the
+same order as norms.
 """
 
 from collections.abc import Sequence
@@ -25,17 +25,17 @@ from jaxtyping import Array, Float, Int
 FACTOR = 2
 """Ratio of neighbouring levels."""
 LEAST_SCORE = 1e-3
-"""Added to scores before their logarithm: blocks of zeros have finite gradients. Squared norms of
-conv1_2 are around 10, of pool2 around 1000."""
+"""Added to scores before their logarithm, so that blocks of zeros have finite gradients. Squared
+norms are around 10 in conv1_2 and around 1000 in pool2."""
 
 Variant = Literal["hard", "soft", "straight-through"]
 
 
 class WalkProbabilities(NamedTuple):
-    """Where random walks end: for every cell a window of the finest map."""
+    """The probabilities of where random walks end: a window of the finest map for every cell."""
 
     p: Float[Array, "m s s"]
-    """Probability of each cell of the window, (row, column); they sum to 1."""
+    """Probability of each cell (row, column) of the window; they sum to 1."""
     start: Int[Array, "m 2"]
     """(x, y) of the window's first cell; it may lie outside the map, where p is 0."""
 
@@ -58,7 +58,7 @@ def _check(
 
 
 def _first_child(children: int) -> int:
-    """Of a block of `children` per axis around the 2 x 2 cells below a cell."""
+    """Offset of the first child from 2 x cell, along an axis with `children` children."""
     return -((children - FACTOR) // 2)
 
 
@@ -71,23 +71,26 @@ def relocalize(
     temperature: Float[Array, ""] | float = 1.0,
     children: int = FACTOR,
 ) -> Float[Array, "m 2"]:
-    """(x, y) that every cell walks to, in cells of the finest map: pixels if that is the image's
-    size, else to be turned into pixels by `jaxsfm.core.grid.cell_to_px`.
+    """The place (x, y) that every cell walks to, in cells of the finest map.
+
+    These are pixels if that map has the size of the image; otherwise
+    `jaxsfm.core.grid.cell_to_px` turns them into pixels.
 
     Args:
       scores: positive score maps, coarse to fine, each twice the size of the last; the first one
-        is twice the size of the map that (row, col) are cells of. As many as levels are walked.
-      row, col: the cells; those whose children lie outside the maps give unspecified values.
-      variant: "hard": the best child at every level; ties go to the first in row order, as in the
-        authors' code. "soft": the expectation of a walk that takes children with probabilities
-        in the ratio of score^(1 / temperature). "straight-through": the hard walk's value, the
-        soft one's gradient.
-      temperature: of the soft walk, without unit: a gain of the image hardly changes it.
-      children: per axis (K in the paper), around the 2 x 2 cells below a cell. With more than two
-        the blocks of neighbouring cells overlap and keypoints may coincide.
+        is twice the size of the map that (row, col) are cells of. One map for every level.
+      row, col: the cells. The result is unspecified for cells whose children lie outside the maps.
+      variant: "hard" takes the best child at every level; ties go to the first in row order, as in
+        the authors' code. "soft" gives the expectation of a walk that takes children with
+        probabilities proportional to score^(1 / temperature). "straight-through" has the value of
+        the hard walk and the gradient of the soft one.
+      temperature: of the soft walk; it has no unit, and a gain of the image hardly changes it.
+      children: number of children per axis (K in the paper), around the 2 x 2 cells below a cell.
+        With more than two, the blocks of neighbouring cells overlap and keypoints may coincide.
 
     Raises:
-      ValueError: no level, levels of other ratios, an odd or too small `children`.
+      ValueError: there is no level, the sizes of levels do not double, or `children` is odd or
+        below 2.
     """
     _check(scores, children)
     if variant == "hard":
@@ -109,8 +112,11 @@ def _hard(
     col: Int[Array, " m"],
     children: int,
 ) -> Int[Array, "m 2"]:
-    """The levels differ in shape, which `lax.scan` does not allow; laid end to end in one vector
-    they can be scanned over by (offset, rows, columns)."""
+    """The hard walk, as a scan over the levels.
+
+    `lax.scan` does not allow levels of different shapes. So they are laid end to end in one vector
+    and scanned over by (offset, rows, columns).
+    """
     shapes = [level.shape for level in scores]
     starts = [sum(h * w for h, w in shapes[:k]) for k in range(len(shapes))]
     levels = jnp.asarray([(s, *hw) for s, hw in zip(starts, shapes, strict=True)], jnp.int32)
@@ -142,8 +148,8 @@ def walk(
     temperature: Float[Array, ""] | float = 1.0,
     children: int = FACTOR,
 ) -> WalkProbabilities:
-    """Where a random walk ends that takes every child with a probability in the ratio of
-    score^(1 / temperature) within its block; arguments as `relocalize`."""
+    """Where a random walk ends that takes the children of a block with probabilities proportional
+    to score^(1 / temperature). Arguments are those of `relocalize`."""
     _check(scores, children, temperature)
     first = _first_child(children)
     p = jnp.ones((row.shape[0], 1, 1), scores[0].dtype)
@@ -170,7 +176,8 @@ def _child_probabilities(
     temperature: Float[Array, ""] | float,
     children: int,
 ) -> Float[Array, "m s s k"]:
-    """Of the children of every cell in windows of `size` that start at (row0, col0)."""
+    """Probabilities of the k children of every cell in windows of `size` x `size` cells that start
+    at (row0, col0)."""
     first = _first_child(children)
     window = jnp.arange(FACTOR * (size - 1) + children, dtype=row0.dtype) + first
     rows = FACTOR * row0[:, None] + window
@@ -187,14 +194,14 @@ def _child_probabilities(
     ]
     logits = jnp.stack([logit[block] for block in blocks], axis=-1)
     reached = jnp.stack([inside[block] for block in blocks], axis=-1)
-    # The best is 0 before the division: any temperature is cold enough, none too cold.
+    # The best child has the logit 0 before the division, so no temperature is too low.
     best = jnp.max(logits, axis=-1, keepdims=True, where=reached, initial=-jnp.inf)
     logits = (logits - lax.stop_gradient(best)) / temperature
     return jax.nn.softmax(logits, axis=-1, where=reached)
 
 
 def expectation(walks: WalkProbabilities) -> Float[Array, "m 2"]:
-    """Mean (x, y) of where walks end, in cells of the finest map."""
+    """Mean place (x, y) where walks end, in cells of the finest map."""
     index = jnp.arange(walks.p.shape[1], dtype=walks.p.dtype)
     x = jnp.sum(walks.p * index, axis=(1, 2))
     y = jnp.sum(walks.p * index[:, None], axis=(1, 2))
@@ -202,7 +209,7 @@ def expectation(walks: WalkProbabilities) -> Float[Array, "m 2"]:
 
 
 def window_positions(walks: WalkProbabilities) -> Float[Array, "m n 2"]:
-    """(x, y) of every cell of the windows in row order, as `walks.p` flattened."""
+    """(x, y) of every cell of the windows, in the row order of the flattened `walks.p`."""
     size = walks.p.shape[1]
     index = jnp.arange(size, dtype=walks.p.dtype)
     offsets = jnp.stack([jnp.tile(index, size), jnp.repeat(index, size)], axis=-1)

@@ -1,16 +1,18 @@
-"""Learnable scores for relocalization: which cell of a block is found again in another image.
+"""Learned scores for relocalization: which cell of a block is found again in another image.
 
-The paper's score is the descriptor's norm. Here it is the squared norm times a positive factor, one
-for each level: a two-layer perceptron of the unit descriptor (1 x 1: the cell alone) and a table of
-places within the fine cell,
+The score of the paper is the norm of the descriptor. Here it is the squared norm times a positive
+factor. The factor of each level is made of a two-layer perceptron of the cell's unit descriptor and
+of a table of places within the fine cell,
 
     s(f, row, column) = |f|^2 exp(v . relu(W f / |f| + b) + q[row mod n, column mod n])
 
-with n = 8, 4, 2 cells of conv1_2, pool1, pool2 to the side of a fine cell. Two matched cells hardly
-ever cover the same pixels, and what lies in the middle of one lies more often in the other too.
-With v = 0 and q = 0, as initialised, s is the squared norm exactly. A gain of the map multiplies
-all scores alike and moves no keypoint, as with norms. Other modules take the parameters and not the
-scores, for the maps of the first levels exist strip by strip only (`jaxsfm.core.blocks`).
+where a fine cell is n = 8, 4, 2 cells of conv1_2, pool1, pool2 wide. The table is there because two
+matched cells hardly ever cover the same pixels, and what lies in the middle of one cell lies more
+often in the other cell too. With v = 0 and q = 0, as initialised, s is exactly the squared norm. A
+gain of the map multiplies all scores alike and moves no keypoint, as with norms.
+
+Other modules take the parameters and not the scores, because the maps of the first levels exist
+only strip by strip (`jaxsfm.core.blocks`).
 """
 
 from collections.abc import Sequence
@@ -26,15 +28,15 @@ from jaxsfm.core.numerics import HIGHEST, inverse_norm, squared_norm
 WALKED: dict[str, int] = {"conv1_2": 64, "pool1": 64, "pool2": 128}
 """Levels that keypoints walk through, fine to coarse, and their channels."""
 PLACES: dict[str, int] = {name: FINE_STRIDE >> k for k, name in enumerate(WALKED)}
-"""Cells of a level to the side of a fine cell."""
+"""How many cells of a level a fine cell is wide."""
 HIDDEN = 32
-"""Units of a level's perceptron."""
+"""Hidden units of the perceptron of a level."""
 MOST_EXPONENT = 30.0
-"""Of the factor: whatever was learned, scores stay finite."""
+"""Largest logarithm of the factor: scores stay finite, whatever was learned."""
 
 
 class Head(NamedTuple):
-    """What is learned of a level."""
+    """The learned parameters of a level."""
 
     kernel: Float[Array, "c k"]
     bias: Float[Array, " k"]
@@ -43,10 +45,10 @@ class Head(NamedTuple):
 
 
 def score(x: Float[Array, "*batch h w c"], head: Head | None) -> Float[Array, "*batch h w"]:
-    """Of every cell of a map, at least 0; without a head its squared norm.
+    """The score of every cell of a map, at least 0. Without a head it is the squared norm.
 
     Args:
-      x: the map, or a part of it that starts at the corner of a fine cell.
+      x: the map, or a part of it that starts at the first row and column of a fine cell.
     """
     square = squared_norm(x)
     if head is None:
@@ -77,7 +79,7 @@ class _Level(nn.Module):
 
 
 class Scores(nn.Module):
-    """`apply(params, maps)` -> a score map for each of conv1_2, pool1, pool2; pure."""
+    """A flax module: `apply(params, maps)` gives a score map each for conv1_2, pool1 and pool2."""
 
     hidden: int = HIDDEN
 
@@ -87,16 +89,17 @@ class Scores(nn.Module):
             setattr(self, name, _Level(channels, PLACES[name], self.hidden))
 
     def heads(self) -> tuple[Head, ...]:
-        """Fine to coarse."""
+        """The heads of all levels, fine to coarse."""
         return tuple(getattr(self, name)() for name in WALKED)
 
     def __call__(self, maps: Sequence[Float[Array, "*batch _h _w _c"]]) -> tuple[Array, ...]:
-        """Score maps, fine to coarse, of feature maps in the same order."""
+        """Score maps of feature maps, both fine to coarse."""
         return tuple(score(x, head) for x, head in zip(maps, self.heads(), strict=True))
 
 
 def heads_of(params: dict | None) -> tuple[Head | None, ...]:
-    """The heads in a `Scores`' parameters, fine to coarse; None stands for the norm rule."""
+    """The heads in the parameters of `Scores`, fine to coarse. `None` gives no heads: scores are
+    then squared norms."""
     if params is None:
         return (None,) * len(WALKED)
     return tuple(Head(**params["params"][name]) for name in WALKED)

@@ -6,7 +6,7 @@ so an item's result is that of one device, and a loop ends on each device when i
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +21,24 @@ from jaxsfm.core.pair import match_pairs, pair_key
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.types import DenseFeatures, JoinedFeatures, PairMatches, PRNGKey, Thresholds
 
+P = ParamSpec("P")
+T = TypeVar("T")
 AXIS = "items"
 _EACH, _SAME = PartitionSpec(AXIS), PartitionSpec()
 
 
-def device_mesh(devices: Sequence[Any]) -> Mesh:
+def device_mesh(devices: Sequence[object]) -> Mesh:
     """The devices in a row."""
     return Mesh(np.asarray(devices), (AXIS,))
 
 
-def _sharded(function: Callable[..., Any], mesh: Mesh, in_specs: tuple, out_specs: Any) -> Any:
-    # Without the check that values vary alike: loops start from constants.
+def _sharded(
+    function: Callable[P, T],
+    mesh: Mesh,
+    in_specs: tuple[PartitionSpec, ...],
+    out_specs: PartitionSpec,
+) -> Callable[P, T]:
+    # The check that values vary over the same axes is off, because loops start from constants.
     return jax.shard_map(
         function, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
     )

@@ -1,11 +1,12 @@
-"""From an epipolar or pose loss back to descriptors, scores and the network: matches as weights.
+"""Matching with gradients: a loss of the geometry reaches descriptors, scores and the network.
 
-The pipeline's mutual nearest neighbours and its walk are decisions, without a gradient. Here both
-are soft: every pair of cells has a weight, every cell a mean place. For small images or chosen
-cells: all pairs of fine cells are held at once.
+Mutual nearest neighbours and the walk of keypoints are decisions and have no gradient. Here both
+are soft: every pair of cells has a weight, and every cell has a mean place. All pairs of fine cells
+are held at once, so this is meant for small images or for chosen cells.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +21,30 @@ from jaxsfm.core.types import Levels
 from jaxsfm.core.vgg import VGG16
 
 
+class Softness(NamedTuple):
+    """How far decisions of the pipeline are softened in a loss."""
+
+    match_temperature: float = 0.05
+    """Temperature of `soft_mutual`."""
+    walk_temperature: float = 0.5
+    """Temperature of the soft walk of `jaxsfm.core.relocalize`."""
+    scale: float = 3.0
+    """Scale of `epipolar_loss`, pixels."""
+
+
 def soft_mutual(
     a: Float[Array, "n c"], b: Float[Array, "m c"], *, temperature: Float[Array, ""] | float
 ) -> Float[Array, "n m"]:
-    """Weight of every pair in [0, 1]: how much each is the other's nearest. As the temperature
-    falls it becomes 1 for mutual nearest neighbours and 0 for others.
+    """The weight of every pair in [0, 1]: how much each cell is the other's nearest neighbour.
+
+    As the temperature falls, the weight becomes 1 for mutual nearest neighbours and 0 for others.
 
     Source: the dual softmax of NCNet's and LoFTR's matching layers (Rocco et al. 2018, Sun et al.
     2021).
 
     Args:
       a, b: unit descriptors; all-zero rows match nothing.
-      temperature: of similarities, which lie in [-1, 1].
+      temperature: in units of the similarities, which lie in [-1, 1].
     """
     seen = jnp.any(a != 0, axis=1)[:, None] & jnp.any(b != 0, axis=1)
     logits = jnp.matmul(a, b.T, precision=HIGHEST) / temperature
@@ -45,8 +58,9 @@ def fundamental_matrix(
     rotation: Float[Array, "3 3"],
     translation: Float[Array, " 3"],
 ) -> Float[Array, "3 3"]:
-    """F with x1' F x0 = 0 of two cameras, X1 = rotation X0 + translation; differentiable in the
-    pose, so that a loss in it is a loss of the pose.
+    """The matrix F of two cameras with x1' F x0 = 0, where X1 = rotation X0 + translation.
+
+    It is differentiable in the pose, so a loss of F is a loss of the pose.
 
     Source: Hartley and Zisserman 2004, equation 9.2.
     """
@@ -69,11 +83,12 @@ def soft_features(
     temperature: Float[Array, ""] | float,
     children: int = 2,
 ) -> tuple[Float[Array, "m c"], Float[Array, "m 2"]]:
-    """Unit pool3 descriptors and mean places (pixels) of all fine cells, differentiable in both
-    sets of parameters.
+    """Unit pool3 descriptors and mean places (pixels) of all fine cells. Both are differentiable
+    in `params` and in `scores`.
 
     Args:
-      params, scores: of `VGG16` and of `jaxsfm.core.scores.Scores` (None: the norm rule).
+      params: parameters of `VGG16`.
+      scores: parameters of `jaxsfm.core.scores.Scores`; `None` scores by descriptor norms.
       image: network input, zero past `size`; its sides are multiples of 16.
       temperature, children: as in `relocalize`.
     """
@@ -100,12 +115,12 @@ def epipolar_loss(
     *,
     scale: float = 3.0,
 ) -> Float[Array, ""]:
-    """Mean robust Sampson error of weighted matches, in [0, 1]: of d^2 / (d^2 + scale^2).
+    """Weighted mean of d^2 / (d^2 + scale^2) over all pairs, in [0, 1], with Sampson distances d.
 
     Args:
       matches: weights of all pairs.
-      f: x1' F x0 = 0.
-      scale: distance, pixels, that counts half (Geman and McClure's loss).
+      f: fundamental matrix, x1' F x0 = 0.
+      scale: the distance, pixels, that costs one half (Geman and McClure's loss).
     """
     squared = sampson_distances(f, xy0[:, None], xy1[None])
     error = squared / (squared + scale**2)
@@ -119,19 +134,20 @@ def pair_loss(
     sizes: Sequence[Int[Array, " 2"]],
     f: Float[Array, "3 3"],
     *,
-    match_temperature: float = 0.05,
-    walk_temperature: float = 0.5,
-    scale: float = 3.0,
+    softness: Softness | None = None,
 ) -> Float[Array, ""]:
-    """`epipolar_loss` of two images, from their pixels: its gradient reaches the scores, every
-    layer of the network up to pool3, and the pose that `f` is made of.
+    """`epipolar_loss` of two images, computed from their pixels. Its gradient reaches the scores,
+    every layer of the network up to pool3, and the pose that `f` is made of.
 
     Args:
-      params, scores, images, sizes: as in `soft_features`, of both images.
+      params, scores: as in `soft_features`.
+      images, sizes: as in `soft_features`, one each per image.
+      softness: `None` takes the defaults.
     """
+    softness = softness or Softness()
     (a, xy0), (b, xy1) = (
-        soft_features(params, scores, image, size, temperature=walk_temperature)
+        soft_features(params, scores, image, size, temperature=softness.walk_temperature)
         for image, size in zip(images, sizes, strict=True)
     )
-    matches = soft_mutual(a, b, temperature=match_temperature)
-    return epipolar_loss(matches, xy0, xy1, f, scale=scale)
+    matches = soft_mutual(a, b, temperature=softness.match_temperature)
+    return epipolar_loss(matches, xy0, xy1, f, scale=softness.scale)

@@ -9,7 +9,7 @@ import enum
 from typing import NamedTuple
 
 import jax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 
 class Pyramid(NamedTuple):
@@ -83,6 +83,26 @@ class JoinedFeatures(NamedTuple):
     """(rows, columns) of the pool3 grid."""
     coarse_parts: tuple[OctavePart, ...] = ()
     """What the last channels of `coarse` are made of, octave after octave."""
+
+
+class DescriptorGrid(NamedTuple):
+    """Descriptors of a grid of cells; cell (row, column) is entry row * columns + column."""
+
+    descriptors: Float[Array, "n c"]
+    """Unit descriptors; rows past the grid are zero."""
+    size: Int[Array, " 2"]
+    """(rows, columns)."""
+    parts: tuple[OctavePart, ...] = ()
+    """What the last channels are made of, octave after octave; empty if that is not known."""
+
+
+class Correspondences(NamedTuple):
+    """Points of two images that may show the same place."""
+
+    xy0: Float[Array, "k 2"]
+    xy1: Float[Array, "k 2"]
+    valid: Bool[Array, " k"]
+    """Which rows are correspondences; the others are padding."""
 
 
 class Thresholds(NamedTuple):

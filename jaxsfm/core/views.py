@@ -1,7 +1,7 @@
-"""Pairs of views made from one photo, with the map between them: supervision without labels.
+"""Training pairs without labels: two views made from one photo, and the map between them.
 
-A crop of a photo is seen through two random homographies, and each view gets its own light, blur
-and noise, some a synthetic night. Everything is drawn from the key.
+A crop of a photo is seen through two random homographies. Each view gets its own light, blur and
+noise, and some second views a synthetic night. All of it is drawn from the key.
 """
 
 from typing import NamedTuple
@@ -16,11 +16,11 @@ from jaxsfm.core.numerics import HIGHEST
 from jaxsfm.core.types import PRNGKey
 
 SUPERSAMPLING = 2
-"""Samples per pixel and axis: views at half the photo's scale do not alias."""
+"""Samples per pixel and axis. With two, views at half the scale of the photo do not alias."""
 NIGHT_SHARE = 0.3
-"""Of second views."""
+"""Share of second views that are nights."""
 MOST_SEVERE = 2.5
-"""Of those nights."""
+"""Largest severity of these nights (`jaxsfm.core.night.night`)."""
 
 
 class ViewPair(NamedTuple):
@@ -30,21 +30,22 @@ class ViewPair(NamedTuple):
     """Whole numbers 0 .. 255, RGB."""
     view1: Float[Array, "v v 3"]
     h: Float[Array, "3 3"]
-    """View 0 to view 1, pixels."""
+    """Maps pixels of view 0 to pixels of view 1."""
 
 
 def warp_points(h: Float[Array, "3 3"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-    """Points through a homography, pixels."""
+    """Points (x, y) mapped by a homography."""
     moved = jnp.einsum("ij,...j->...i", h, homogeneous(xy), precision=HIGHEST)
     return moved[..., :2] / moved[..., 2:]
 
 
 def random_homography(key: PRNGKey, strength: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """About the origin, coordinates in half view sizes.
+    """A random homography about the origin, for coordinates in units of half a view's size.
 
     Args:
-      strength: 1: scale 0.55-1.8, turns up to 35 deg, aspect 0.7-1.4, shear 0.3, and a
-        perspective that changes the scale across the view by a third; 0: the identity.
+      strength: 0 gives the identity. 1 gives scales of 0.55-1.8, rotations of up to 35 deg,
+        aspect ratios of 0.7-1.4, a shear of up to 0.3, and a perspective that changes the scale
+        across the view by up to a third.
     """
     u = strength * jax.random.uniform(key, (6,), minval=-1.0, maxval=1.0)
     scale, aspect = jnp.exp(0.6 * u[0]), jnp.exp(0.35 * u[1])
@@ -62,11 +63,11 @@ def random_homography(key: PRNGKey, strength: Float[Array, ""]) -> Float[Array, 
 def sample_view(
     photo: Float[Array, "s s 3"], h: Float[Array, "3 3"], *, size: int
 ) -> Float[Array, "v v 3"]:
-    """What is seen through a homography: the mean of bilinear samples in every pixel.
+    """The view of a photo through a homography. A pixel is the mean of several bilinear samples.
 
     Args:
-      h: view to photo, pixels; beyond the photo its edge is seen.
-      size: of the view, pixels.
+      h: maps pixels of the view to pixels of the photo; the edge is repeated beyond the photo.
+      size: side of the view, pixels.
     """
     n, side = size * SUPERSAMPLING, photo.shape[0]
     at = (jnp.arange(n, dtype=jnp.float32) + 0.5) / SUPERSAMPLING - 0.5
@@ -84,12 +85,12 @@ def sample_view(
 def change_light(
     key: PRNGKey, rgb: Float[Array, "h w 3"], strength: Float[Array, ""]
 ) -> Float[Array, "h w 3"]:
-    """Another exposure, white balance, contrast, focus and sensor noise; 0 .. 255.
+    """An image, 0 .. 255, with another exposure, white balance, contrast, focus and sensor noise.
 
     Args:
-      rgb: 0 .. 255.
-      strength: 1: exposures e^-1 to e^0.4, gains of channels e^0.3, contrast e^0.4, a blur of up to
-        1.2 px, noise of up to 6 grey levels; 0: none of it.
+      rgb: the image, 0 .. 255.
+      strength: 0 changes nothing. 1 draws exposures of e^-1 to e^0.4, gains of channels of up to
+        e^0.3, contrasts of up to e^0.4, a blur of up to 1.2 px and noise of up to 6 grey levels.
     """
     exposure, gains, contrast, focus, noisy, noise = jax.random.split(key, 6)
 
@@ -105,12 +106,12 @@ def change_light(
 
 
 def view_pair(key: PRNGKey, photo: Float[Array, "s s 3"], *, size: int) -> ViewPair:
-    """Two views of a square crop of a photo: the first nearly as it is, the second through any
-    homography and under any light.
+    """Two views of a square photo. The first is changed little, the second by any homography and
+    any light.
 
     Args:
-      photo: 0 .. 255, RGB.
-      size: of the views, pixels; about half of the crop's, so that most views stay inside it.
+      photo: RGB, 0 .. 255.
+      size: side of the views, pixels. With about half of the photo's side most views stay inside.
     """
     keys = jax.random.split(key, 8)
     half, side = (size - 1) / 2, photo.shape[0]

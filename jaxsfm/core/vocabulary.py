@@ -1,5 +1,6 @@
-"""A vocabulary for VLAD, fitted on a sample of a collection's descriptors: principal directions,
-whitened, and k-means in them.
+"""A vocabulary for VLAD, fitted on a sample of the descriptors of a collection.
+
+Descriptors are projected onto principal directions and whitened; k-means gives the centres.
 
 Source: Jegou and Chum, ECCV 2012, section 3 (whitening before VLAD).
 """
@@ -15,11 +16,11 @@ from jaxsfm.core.numerics import HIGHEST, argmax_first, squared_norm, unit
 from jaxsfm.core.types import PRNGKey
 
 LEAST_VARIANCE = 1e-6
-"""Of a direction, relative to the largest, for it to be scaled up rather than dropped."""
+"""Directions whose variance, relative to the largest, is below this are dropped, not scaled up."""
 
 
 class Vocabulary(NamedTuple):
-    """What local descriptors are compared with."""
+    """A projection of local descriptors, and the centres that they are compared with."""
 
     mean: Float[Array, " c"]
     whitening: Float[Array, "c d"]
@@ -27,18 +28,18 @@ class Vocabulary(NamedTuple):
 
 
 def seen(x: Float[Array, "n c"]) -> Bool[Array, " n"]:
-    """Which rows are descriptors: zero rows are padding, or show nothing."""
+    """Which rows are descriptors: zero rows are padding, or cells that show nothing."""
     return jnp.any(x != 0, axis=-1)
 
 
 def whitened(x: Float[Array, "n c"], words: Vocabulary) -> Float[Array, "n d"]:
-    """Unit descriptors in the vocabulary's directions; zero rows stay zero."""
+    """Unit descriptors in the directions of the vocabulary; zero rows stay zero."""
     flat = jnp.matmul(x - words.mean, words.whitening, precision=HIGHEST)
     return jnp.where(seen(x)[:, None], unit(flat), 0.0)
 
 
 def nearest_centre(x: Float[Array, "n d"], centres: Float[Array, "k d"]) -> Int[Array, " n"]:
-    """The first of the nearest centres of every row."""
+    """The centre nearest to every row; the first one among equals."""
     products = jnp.matmul(x, centres.T, precision=HIGHEST)
     return argmax_first(products - 0.5 * squared_norm(centres), axis=1)[1]
 
@@ -46,7 +47,8 @@ def nearest_centre(x: Float[Array, "n d"], centres: Float[Array, "k d"]) -> Int[
 def lloyd(
     x: Float[Array, "n d"], centres: Float[Array, "k d"], *, iterations: int = 25
 ) -> Float[Array, "k d"]:
-    """k-means from given centres; zero rows of `x` do not count, empty centres stay."""
+    """k-means from given centres. Zero rows of `x` do not count, and a centre without rows stays
+    where it is."""
     live = seen(x)
 
     def step(_, centres):
@@ -65,12 +67,13 @@ def fit_vocabulary(
     """The vocabulary of a sample of unit descriptors.
 
     Args:
-      key: of the descriptors that k-means starts from.
-      sample: zero rows do not count; at least `words` rows with them.
-      directions: principal ones that are kept, at most c.
+      key: chooses the descriptors that k-means starts from.
+      sample: at least `words` rows; zero rows do not count as descriptors.
+      words: number of centres.
+      directions: number of principal directions that are kept, at most c.
 
     Raises:
-      ValueError: too few rows or channels.
+      ValueError: there are too few rows or channels.
     """
     rows, channels = sample.shape
     if rows < words or channels < directions:
@@ -88,6 +91,6 @@ def fit_vocabulary(
     scales = jnp.where(large, lax.rsqrt(jnp.where(large, variances, 1.0)), 0.0)
     made = Vocabulary(mean, axes * scales, jnp.zeros((words, directions), sample.dtype))
     flat = whitened(sample, made)
-    # Descriptors in random order, before the rows that are none.
+    # The descriptors come first, in random order, and the zero rows after them.
     order = jnp.argsort(jnp.where(live, jax.random.uniform(key, (rows,)), 1.0))
     return made._replace(centres=lloyd(flat, flat[order[:words]]))

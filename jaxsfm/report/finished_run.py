@@ -13,8 +13,9 @@ from jaxsfm.colmap.model import Model, point_colours
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
-from jaxsfm.config import Config, PairShape, Refinement
+from jaxsfm.config import Config
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, inspect_image, read_image
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.store import Store
@@ -109,7 +110,7 @@ class FinishedRun:
         """
         try:
             return _config(self.report.options.config)
-        except (KeyError, TypeError, ValueError) as error:
+        except ValueError as error:
             raise UserError(
                 f"{self.folder}: was made by jaxsfm {self.report.version}, whose options "
                 "this version does not know; run reconstruct again"
@@ -121,12 +122,23 @@ class FinishedRun:
 
 
 def _config(recorded: RecordedConfig) -> Config:
-    """TypeError, KeyError or ValueError for what is no config of this version."""
+    """The config of a run.
+
+    Raises:
+      ValueError: it is not one of this version.
+    """
     plain = to_json(recorded)
-    assert isinstance(plain, dict)
-    shape, refinement = plain.pop("pair"), plain.pop("refinement")
-    passes = Refinement(**refinement) if refinement else None
-    return Config(**plain, pair=PairShape(**shape), refinement=passes)
+    config = from_json(Config, plain)
+    if not _names(plain) <= _names(to_json(config)):
+        raise ValueError("the config has fields that this version does not know")
+    return config
+
+
+def _names(value: Json, place: str = "") -> set[str]:
+    """The places of all keys in plain JSON."""
+    if not isinstance(value, Mapping):
+        return {place}
+    return set().union(*(_names(each, f"{place}.{key}") for key, each in value.items()))
 
 
 def _model(folder: Path) -> tuple[FinishedModel, Poses] | None:
@@ -136,8 +148,8 @@ def _model(folder: Path) -> tuple[FinishedModel, Poses] | None:
     cameras = {model.image(i).name: model.camera(model.image(i).camera_id) for i in model.images}
     sizes = {name: ((c.width, c.height), (1.0, 1.0)) for name, c in cameras.items()}
     arrays = Model.from_colmap(model, sizes)
-    colours, errors = point_colours(model), arrays.errors_px()
-    return FinishedModel(arrays.views, arrays.tracks, colours, errors), model_poses(model)
+    shown = FinishedModel(arrays.views, arrays.tracks, point_colours(model), arrays.errors_px())
+    return shown, model_poses(model)
 
 
 def _with_reference(

@@ -4,6 +4,7 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated
 
+from jaxsfm.io.atomic import Json
 from jaxsfm.report.typed_json import OTHERS, Count, Range, to_json
 
 
@@ -23,7 +24,7 @@ class RunIdentity:
     images: dict[str, str]
     """The SHA-256 of every usable photo, by name."""
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, Json]:
         """The identity as `jaxsfm.io.store.Store` takes it."""
         plain = to_json(self)
         assert isinstance(plain, dict)

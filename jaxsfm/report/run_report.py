@@ -12,7 +12,7 @@ from typing import Annotated
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import read_json, write_atomic
+from jaxsfm.io.atomic import Json, read_json, write_atomic
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     RecordedOptions,
@@ -89,7 +89,7 @@ class RunReport:
     extended: list[Extension] | None = field(default=None, metadata=OMITTED)
     """Calls of `jaxsfm extend` since the run."""
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, Json]:
         """The report as plain JSON."""
         plain = to_json(self)
         assert isinstance(plain, dict)

@@ -15,6 +15,8 @@ import typing
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
+from jaxsfm.io.atomic import Json
+
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
@@ -60,10 +62,10 @@ class Misfit(ValueError):
         return f"{self.place or 'the whole'!r} must be {self.required}; got {self.got}"
 
 
-def to_json(value: object) -> object:
+def to_json(value: object) -> Json:
     """A dataclass, or lists and dicts of dataclasses, as plain JSON."""
     if dataclasses.is_dataclass(value):
-        plain: dict[str, object] = {}
+        plain: dict[str, Json] = {}
         for field in dataclasses.fields(value):
             each = getattr(value, field.name)
             if field.metadata == OTHERS:
@@ -77,7 +79,9 @@ def to_json(value: object) -> object:
         return {str(key): to_json(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [to_json(each) for each in value]
-    return value
+    if value is None or isinstance(value, str | int | float):
+        return value
+    raise TypeError(f"value must be plain or a dataclass; got {type(value).__name__}")
 
 
 def from_json(kind: type[T], value: object) -> T:

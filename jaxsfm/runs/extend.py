@@ -18,6 +18,7 @@ from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.models import colour_points, read_models, write_models
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
@@ -95,7 +96,7 @@ class PlannedExtension:
 
 def extend(
     run: Path, *, options: LocalizeOptions, shortlist: Shortlist | None = None
-) -> dict[str, object] | None:
+) -> dict[str, Json] | None:
     """Extend a finished run; returns the content of its new report.json, or None.
 
     See `extend_run`, which returns the report as an object.

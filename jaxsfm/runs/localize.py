@@ -16,6 +16,7 @@ from tqdm import tqdm
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import Photos, Reader
@@ -67,7 +68,7 @@ def localize(
     *,
     options: LocalizeOptions,
     shortlist: Shortlist | None = None,
-) -> dict[str, object]:
+) -> dict[str, Json]:
     """Localize photos in a finished run; returns plain JSON, with a row for each photo.
 
     See `localize_photos`, which returns the result as an object.

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.colmap.view import View
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.report.typed_json import OMITTED, to_json
@@ -115,7 +116,7 @@ class LocalizationReport:
     photos: list[LocalizedPhoto | UnusablePhoto]
     """Sorted by path."""
 
-    def to_json(self) -> dict[str, object]:
+    def to_json(self) -> dict[str, Json]:
         """The result as plain JSON."""
         plain = to_json(self)
         assert isinstance(plain, dict)

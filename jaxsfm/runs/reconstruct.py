@@ -16,6 +16,7 @@ from jaxsfm.colmap.models import write_models
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair, PairCounts, PairResult, best_pairs
@@ -39,9 +40,7 @@ from jaxsfm.sfm.stages import StageCache
 logger = logging.getLogger("jaxsfm")
 
 
-def run_folder(
-    images: Path, out: Path, *, config: Config, options: RunOptions
-) -> dict[str, object]:
+def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) -> dict[str, Json]:
     """Reconstruct a folder of photos; returns the content of `out`/report.json.
 
     See `reconstruct_folder`, which returns the report as an object.

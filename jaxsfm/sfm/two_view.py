@@ -2,7 +2,7 @@
 
 One estimator with one setting for every method compared, so that the rows differ in the matches
 alone. A fundamental matrix is the best of several after robust least squares over all matches:
-single ones of one pair differ more with the seed than methods do (docs/design.md).
+single ones of one pair differ more with the seed than methods do (docs/decisions/benchmarks.md).
 """
 
 from collections.abc import Callable

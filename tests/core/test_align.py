@@ -146,6 +146,54 @@ def test_the_stated_deviation_is_the_real_one():
     assert np.sqrt(np.max(every)) < 2  # measured: 1.73
 
 
+def test_what_looks_like_gain_or_offset_is_no_information():
+    """Templates' derivatives have no part along the patch itself (gain) or a constant (offset)."""
+    one, _, ref, _, _ = views(rng_of(11), channels=3)
+    at = jnp.asarray(np.stack([ref, ref + 3.5]), jnp.float32)
+    t = make_templates(jnp.asarray(one, jnp.float32), jnp.asarray(SIZE, jnp.int32), at, PATCH)
+    values, descent = np.asarray(t.values, np.float64), np.asarray(t.descent, np.float64)
+    w, size = np.asarray(PATCH.weights), np.abs(descent).max()
+    np.testing.assert_allclose(np.einsum("q,nqck->nck", w, descent) / size, 0, atol=1e-6)
+    along = np.einsum("q,nqc,nqck->nk", w, values, descent)
+    np.testing.assert_allclose(along / size, 0, atol=1e-6)
+    hessian = np.einsum("q,nqck,nqcl->nkl", w, descent, descent)
+    np.testing.assert_allclose(t.hessian, hessian, rtol=1e-4)
+
+
+def test_a_shift_that_is_only_a_change_of_gain_leaves_the_place_open():
+    """exp(x / 5) moved along x is itself times a number: nothing tells where it lies along x."""
+    x, y = grid()[..., 0], grid()[..., 1]
+    image = np.exp((x - 40) / 5) * (2 + np.cos(y / 2))
+    size, at = jnp.asarray(SIZE, jnp.int32), jnp.asarray([[40.0, 32.0]])
+    t = make_templates(jnp.asarray(image[..., None], jnp.float32), size, at, PATCH)
+    hessian = np.asarray(t.hessian[0])
+    assert hessian[0, 0] < 1e-3 * hessian[1, 1]
+
+
+def test_templates_descend_as_their_values_do():
+    """The derivative, from the texture's own: per pixel, before gain and offset are taken out."""
+    rng = rng_of(12)
+    f, ref = texture(rng), np.asarray([40.0, 32.0])
+    size = jnp.asarray(SIZE, jnp.int32)
+    at = jnp.asarray(ref, jnp.float32)[None]
+    t = make_templates(jnp.asarray(f(grid()), jnp.float32), size, at, PATCH)
+    places = ref + np.asarray(PATCH.offsets, np.float64)
+    w = np.asarray(PATCH.weights, np.float64)
+    values = f(places)
+    values -= w @ values
+    contrast = np.sqrt(w @ values**2)[0]
+    steps = np.eye(2) * 1e-4
+    slope = np.stack([(f(places + s) - f(places - s)) / 2e-4 for s in steps], -1) / contrast
+    values /= contrast
+    slope -= np.einsum("q,qck->ck", w, slope)
+    slope -= values[..., None] * np.einsum("q,qc,qck->k", w, values, slope)
+    np.testing.assert_allclose(t.contrast[0], contrast, rtol=1e-3)
+    np.testing.assert_allclose(t.values[0], values, atol=0.01)
+    # Differences over a pixel are the slope of a texture of periods of 8 pixels within a tenth.
+    apart = np.linalg.norm(np.asarray(t.descent[0]) - slope) / np.linalg.norm(slope)
+    assert apart < 0.1 and t.inside[0]
+
+
 def test_patches_that_leave_the_image_do_not_count():
     one, two, ref, a, truth = views(rng_of(2))
     assert not run(one, two, np.asarray([3.0, 30.0]), a, truth).converged[0]

@@ -127,6 +127,7 @@ def test_one_to_one_keeps_no_cell_twice_and_wastes_none(seed):
     assert not (ours & ~keep).any()
     for side in (0, 1):
         assert len(set(cells[ours, side])) == ours.sum()
+    np.testing.assert_array_equal(ours, oracles.one_to_one(cells, keep, score))
     # The best of a cell of image 0 loses only to one at least as good in image 1.
     for i in np.flatnonzero(keep & ~ours):
         rivals = keep & ((cells[:, 0] == cells[i, 0]) | (cells[:, 1] == cells[i, 1]))

@@ -12,13 +12,15 @@ from tolerances import NEAR_TIE
 from jaxsfm.core.consensus import consensus_nn, weights
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.types import DescriptorGrid
 
 join = jax.jit(join_octaves)
 _match = jax.jit(consensus_nn, static_argnames=("radius", "columns", "tile"))
 
 
-def match(*args, columns: int = 16, **kwargs):
-    return _match(*args, columns=columns, **kwargs)
+def match(a, b, grid0, grid1, *, parts=(), columns: int = 16, **kwargs):
+    cells = DescriptorGrid(a, grid0, parts), DescriptorGrid(b, grid1)
+    return _match(*cells, columns=columns, **kwargs)
 
 
 def padded(x: np.ndarray, rows: int) -> np.ndarray:
@@ -36,14 +38,31 @@ def grids(seed: int, shape0, shape1, *, room: int = 60):
     return [padded(np.float32(x), room) for x in flat], sizes
 
 
+KERNELS = {
+    1: [0.606531, 1.0, 0.606531],
+    2: [0.606531, 0.882497, 1.0, 0.882497, 0.606531],
+}
+"""exp(-d^2 / (2 r^2)): a Gaussian whose deviation is the radius."""
 SHAPES = [((5, 7), (6, 6)), ((1, 1), (3, 4)), ((7, 2), (2, 9)), ((4, 9), (4, 9))]
+
+
+@pytest.mark.parametrize("radius", [1, 2])
+def test_the_kernel_is_a_gaussian_as_wide_as_the_radius(radius):
+    np.testing.assert_allclose(weights(radius), KERNELS[radius], rtol=1e-5)
+
+
+@pytest.mark.parametrize("sizes", [{"radius": 0, "columns": 16}, {"radius": 1, "columns": 0}])
+def test_a_radius_or_a_width_of_nothing_is_refused(sizes):
+    (a, b), grids_ = grids(0, (5, 7), (6, 6))
+    with pytest.raises(ValueError, match="at least 1; got"):
+        match(a, b, *grids_, **sizes)
 
 
 @settings(max_examples=40, deadline=None)
 @given(seeds, st.sampled_from(SHAPES), st.sampled_from([1, 2]), st.sampled_from([7, 16, 60]))
 def test_tiled_consensus_equals_the_sum_over_shifts(seed, shapes, radius, tile):
     (a, b), (grid0, grid1) = grids(seed, *shapes)
-    expected, margin = oracles.consensus_nn(a, b, grid0, grid1, weights(radius))
+    expected, margin = oracles.consensus_nn(a, b, grid0, grid1, KERNELS[radius])
     decided = margin > NEAR_TIE
     got = np.asarray(match(a, b, grid0, grid1, radius=radius, tile=tile))
     np.testing.assert_array_equal(got[decided], expected[decided])
@@ -56,7 +75,7 @@ def test_products_of_octaves_are_blends_of_their_cells_products(seed, shapes, ti
     joined = [join(random_features(seed + k, shape, octaves)) for k, shape in enumerate(shapes)]
     a, b = (np.asarray(x.coarse) for x in joined)
     grid0, grid1 = (x.coarse_grid for x in joined)
-    expected, margin = oracles.consensus_nn(a, b, grid0, grid1, weights(1))
+    expected, margin = oracles.consensus_nn(a, b, grid0, grid1, KERNELS[1])
     decided = margin > NEAR_TIE
     parts = joined[0].coarse_parts
     got = match(a, b, grid0, grid1, parts=parts, radius=1, tile=tile)

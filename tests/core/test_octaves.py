@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from strategies import random_features, rng_of, seeds
 
 from jaxsfm.config import Config, preset
-from jaxsfm.core.octaves import OCTAVE_WEIGHT, halve, join_octaves
+from jaxsfm.core.octaves import halve, join_octaves, octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.io.features import pad_features
 from jaxsfm.io.images import WorkingImage
 
 join = jax.jit(join_octaves)
+HALF = 0.5
+"""An octave's products count half as much as those of the octave before."""
 SHAPES = [(8, 12), (5, 7), (9, 4), (1, 6), (3, 3)]
 
 
@@ -30,9 +32,7 @@ def test_joining_equals_interpolating_cell_by_cell(seed, shape, octaves):
         (joined.coarse, features.coarse, features.coarse_grid),
         (joined.fine, features.fine, features.fine_grid),
     ):
-        expected = oracles.join_octaves(
-            [np.asarray(x) for x in levels], np.asarray(grid), OCTAVE_WEIGHT
-        )
+        expected = oracles.join_octaves([np.asarray(x) for x in levels], np.asarray(grid), HALF)
         np.testing.assert_allclose(ours, expected, **tolerances.UNIT)
 
 
@@ -45,9 +45,14 @@ def test_products_are_weighted_means_over_the_octaves(seed, shape):
     alive = joined.any(1)
     parts = joined.reshape(n, 3, -1)[alive]
     norms = np.linalg.norm(parts, axis=2, keepdims=True)
-    weight = np.where(norms > 0, OCTAVE_WEIGHT ** np.arange(3.0)[None, :, None], 0)
+    weight = np.where(norms > 0, HALF ** np.arange(3.0)[None, :, None], 0)
     share = np.sqrt(weight / weight.sum(1, keepdims=True))
     np.testing.assert_allclose(norms, share, **tolerances.UNIT)
+
+
+def test_there_is_room_for_every_cell_of_an_octave():
+    assert [octave_capacity(n, 2) for n in (16, 17, 31, 32, 33)] == [1, 2, 2, 2, 3]
+    assert [octave_capacity(1200, k) for k in range(4)] == [1200, 300, 75, 19]
 
 
 def test_one_octave_is_left_as_it_is():

@@ -12,7 +12,7 @@ from strategies import random_homography, rng_of
 from jaxsfm.config import PairShape
 from jaxsfm.core.planes import nearest_plane, settle
 from jaxsfm.core.ransac import peel_planes
-from jaxsfm.core.types import Thresholds
+from jaxsfm.core.types import Correspondences, Thresholds
 
 peel = jax.jit(peel_planes, static_argnames=("shape",))
 LIMITS = Thresholds(np.float32(4), np.int32(20), np.float32(0.999))
@@ -83,9 +83,7 @@ def test_a_plane_without_points_of_its_own_is_given_up():
     homographies, num, plane = settle(
         planes,
         jnp.asarray([300, 300, 0], jnp.int32),
-        xy0,
-        xy1,
-        jnp.ones(len(xy0), bool),
+        Correspondences(xy0, xy1, jnp.ones(len(xy0), bool)),
         jnp.float32(4),
         jnp.int32(20),
         rounds=10,
@@ -99,14 +97,91 @@ def test_a_plane_without_points_of_its_own_is_given_up():
     )
 
 
+def alone(h, num, xy0, xy1, *, rounds, threshold=4.0, floor=20):
+    """`settle` of planes over all points."""
+    return settle(
+        jnp.asarray(h, jnp.float32),
+        jnp.asarray(num, jnp.int32),
+        Correspondences(
+            jnp.asarray(xy0, jnp.float32),
+            jnp.asarray(xy1, jnp.float32),
+            jnp.ones(len(xy0), bool),
+        ),
+        jnp.float32(threshold),
+        jnp.int32(floor),
+        rounds=rounds,
+    )
+
+
+def test_a_plane_is_fitted_again_to_its_own_points():
+    """It starts 3 px off and ends on points that are exact."""
+    rng = rng_of(3)
+    xy0 = rng.uniform(0, 1000, (200, 2))
+    truth = random_homography(rng, strength=0.3)
+    xy1 = oracles.transfer(truth, xy0)
+    shift = np.asarray([[1, 0, 3.0], [0, 1, 0], [0, 0, 1]])
+    found, num, plane = alone((shift @ truth)[None], [200], xy0, xy1, rounds=1)
+    assert num.tolist() == [200] and (np.asarray(plane) == 0).all()
+    ends = oracles.transfer(np.asarray(found[0], np.float64), xy0)
+    assert np.linalg.norm(ends - xy1, axis=1).max() < 0.1
+    left, num, _ = alone((shift @ truth)[None], [200], xy0, xy1, rounds=0)
+    np.testing.assert_array_equal(left[0], np.float32(shift @ truth))
+
+
+def test_a_member_is_nearer_than_the_threshold_and_no_further():
+    xy0 = rng_of(4).uniform(0, 1000, (60, 2))
+    off = np.repeat([0.5, 3.9, 4.1, 5.6, 7.9, 8.1], 10)
+    turn = np.linspace(0, 6, 60)
+    xy1 = xy0 + off[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    _, num, plane = alone(np.eye(3)[None], [60], xy0, xy1, rounds=0, floor=4)
+    np.testing.assert_array_equal(np.asarray(plane) == 0, off < 4)
+    assert num.tolist() == [20]
+
+
+def test_the_threshold_of_competing_planes_is_the_one_of_peeling():
+    """A plane keeps what lies within 4 px of it, between it and the 8 px of twice as much none."""
+    rng = rng_of(5)
+    xy0 = rng.uniform(0, 1000, (220, 2))
+    xy1 = xy0.copy()
+    turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    xy1[160:] += 6 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    valid = jnp.ones(len(xy0), bool)
+    points = jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32)
+    found = peel(jax.random.key(0), *points, valid, LIMITS, shape=FAIR)
+    np.testing.assert_array_equal(np.asarray(found.plane) >= 0, np.arange(220) < 160)
+
+
+@pytest.mark.parametrize("size", [19, 20])
+def test_a_plane_needs_as_many_members_as_are_asked_for(size):
+    xy0 = rng_of(6).uniform(0, 1000, (size, 2))
+    for rounds in (0, 1):
+        _, num, plane = alone(np.eye(3)[None], [size], xy0, xy0, rounds=rounds)
+        assert num.tolist() == [size if size >= 20 else 0]
+        assert (np.asarray(plane) == (0 if size >= 20 else -1)).all()
+
+
+def test_planes_end_in_order_of_their_members():
+    rng = rng_of(7)
+    xy0 = rng.uniform(0, 1000, (90, 2))
+    label = np.repeat([0, 1, 2], [30, 20, 40])
+    shifts = np.asarray([[0, 0], [100, 0], [0, 200]])
+    h = np.stack([np.eye(3)] * 3)
+    h[:, :2, 2] = shifts
+    # The fourth has no points, and no row says so but its count.
+    h = np.concatenate([h, np.full((1, 3, 3), np.nan)])
+    found, num, plane = alone(h, [30, 20, 40, 0], xy0, xy0 + shifts[label], rounds=2)
+    assert num.tolist() == [40, 30, 20, 0]
+    np.testing.assert_array_equal(plane, np.asarray([1, 2, 0])[label])
+    unit = np.asarray(found[:3]) / np.asarray(found[:3, 2:, 2:])
+    np.testing.assert_allclose(unit[:, :2, 2], shifts[[2, 0, 1]], atol=0.05)
+
+
 def test_without_planes_nothing_is_a_member():
     xy0, xy1, _ = two_walls(2, 0.1)
     none = nearest_plane(
         jnp.zeros((3, 3, 3)),
         jnp.zeros(3, bool),
-        xy0,
-        xy1,
-        jnp.ones(len(xy0), bool),
+        Correspondences(xy0, xy1, jnp.ones(len(xy0), bool)),
         jnp.float32(4),
     )
     assert (np.asarray(none) == -1).all()

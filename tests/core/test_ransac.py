@@ -118,6 +118,65 @@ def test_the_capacity_and_the_chunks_change_nothing(key):
     np.testing.assert_array_equal(chunked.plane, planes.plane)
 
 
+def problem_of(xy0, xy1, *, live: int, threshold: float) -> ransac._Problem:
+    points = jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32)
+    reach = jnp.float32(threshold)
+    return ransac._Problem(*points, jnp.int32(live), reach, reach)
+
+
+@pytest.mark.parametrize("live", [0, 1, 60, 64, 99, 100])
+@pytest.mark.parametrize("chunk", [30, 64, 100, 1000])
+def test_every_correspondence_is_counted_once(live, chunk):
+    """Also where the last chunk would reach past the end of the list."""
+    rng = rng_of(live)
+    xy0 = rng.uniform(-1, 1, (100, 2))
+    h = np.stack([np.eye(3), np.eye(3), np.diag([1.0, 1.0, 1.0])])
+    h[1, 0, 2] = 0.3
+    xy1 = xy0 + rng.uniform(-0.4, 0.4, (100, 2))
+    problem = problem_of(xy0, xy1, live=live, threshold=0.25)
+    shape = dataclasses.replace(SHAPE, score_chunk=chunk)
+    ours = ransac.count_inliers(jnp.asarray(h, jnp.float32), problem, shape=shape)
+    expected = [oracles.inliers(m, xy0[:live], xy1[:live], 0.25).sum() for m in h]
+    np.testing.assert_array_equal(ours, expected)
+
+
+def test_a_refit_is_kept_only_while_it_gains():
+    """What is returned has the inliers that are stated, whether or not the next fit would lose."""
+    lost = 0
+    refit = jax.jit(ransac._refit, static_argnums=3)
+    for seed in range(12):
+        rng = rng_of(seed)
+        xy0 = rng.uniform(-1, 1, (100, 2)).astype(np.float32)
+        xy1 = (xy0 + rng.normal(0, 0.15, xy0.shape)).astype(np.float32)
+        problem = problem_of(xy0, xy1, live=90, threshold=0.15)
+        start = np.eye(3, dtype=np.float32)
+        start[0, 2] = 0.05
+        before = int(oracles.inliers(start, xy0[:90], xy1[:90], 0.15).sum())
+        for refits in (1, 3):
+            shape = dataclasses.replace(SHAPE, local_refits=refits)
+            h, num = refit(jnp.asarray(start), jnp.int32(before), problem, shape)
+            member = oracles.inliers(h, xy0[:90], xy1[:90], 0.15)
+            assert int(num) == member.sum() >= before
+            if refits == 1:
+                assert np.array_equal(h, start) == (int(num) == before)
+        again = oracles.homography(xy0[:90][member], xy1[:90][member])
+        lost += oracles.inliers(again, xy0[:90], xy1[:90], 0.15).sum() < member.sum()
+    assert lost >= 3  # there were fits to refuse
+
+
+def test_a_two_way_inlier_is_near_in_both_images(key):
+    """Image 1 is ten times smaller: what is near there may be far apart in image 0."""
+    rng = rng_of(3)
+    xy0 = rng.uniform(0, 1000, (K, 2)).astype(np.float32)
+    xy1 = np.float32(xy0 / 10 + rng.normal(0, 1, xy0.shape))
+    both = dataclasses.replace(SHAPE, two_way=True)
+    one_way, two_way = (run(key, xy0, xy1, shape=s) for s in (SHAPE, both))
+    assert one_way.num_inliers[0] == K and 26 <= int(two_way.num_inliers[0]) < 0.6 * K
+    member = np.asarray(two_way.plane) == 0
+    back = np.linalg.inv(np.asarray(two_way.homographies[0], np.float64))
+    assert np.linalg.norm(oracles.transfer(back, xy1[member]) - xy0[member], axis=1).max() < 10.05
+
+
 def test_same_key_same_planes_and_another_key_other_draws(key):
     xy0, xy1, _, _ = scene(6, [60])
     a, b = run(key, xy0, xy1), run(key, xy0, xy1)

@@ -1,15 +1,25 @@
-"""The documentation builds without warnings, and its figures are what the notebooks show."""
+"""The documentation builds without warnings and agrees with the code and the notebooks."""
 
 import re
 import runpy
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
+from jaxsfm.cli import reference
+
 ROOT = Path(__file__).parents[2]
+PAGES = (
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "notebooks/README.md",
+    ROOT / "weights_conversion/README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+)
 
 
 @pytest.fixture
@@ -57,3 +67,45 @@ def test_figures_are_those_of_the_notebooks():
     for name, image in found.items():
         assert (ROOT / "docs/images" / name).read_bytes() == image, "python notebooks/figures.py"
         assert f"(images/{name})" in shown
+
+
+def headings(page: Path) -> set[str]:
+    """The anchors of a page's headings, as Python-Markdown makes them."""
+    found = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.MULTILINE)
+    kept = [re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in found]
+    return {re.sub(r"[-\s]+", "-", heading) for heading in kept}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings_that_exist(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), link
+        assert not anchor or anchor in headings(target), link
+
+
+def test_the_command_line_reference_is_what_the_commands_print():
+    page = (ROOT / "docs/reference/cli.md").read_text()
+    assert page == reference.page(), "python -m jaxsfm.cli.reference docs/reference/cli.md"
+
+
+def test_the_architecture_names_the_packages_and_only_modules_that_exist():
+    text = (ROOT / "docs/architecture.md").read_text()
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
+    packages = [name.strip() for layer in layers for name in layer.split("|")]
+    assert sorted(re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE)) == sorted(packages)
+    for path in re.findall(r"`([\w/]+(?:\.py|\.html|/))`", text):
+        assert (ROOT / "jaxsfm" / path).exists() or (ROOT / path).exists(), path
+
+
+def test_pages_that_the_code_names_exist():
+    sources = [
+        path for name in ("jaxsfm", "weights_conversion") for path in (ROOT / name).rglob("*.py")
+    ]
+    for path in sources:
+        for named in re.findall(r"docs/[\w/-]+\.md", path.read_text()):
+            assert (ROOT / named).is_file(), f"{path.relative_to(ROOT)}: {named}"

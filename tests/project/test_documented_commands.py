@@ -27,11 +27,11 @@ PAGES = (
     *sorted((ROOT / "docs").rglob("*.md")),
 )
 LONG = (
-    "jaxsfm.runs.reconstruct.run_folder",
+    "jaxsfm.runs.reconstruct.reconstruct_folder",
     "jaxsfm.bench.demo.run_demo",
     "jaxsfm.matching.retrieval.shortlist",
-    "jaxsfm.runs.localize.localize",
-    "jaxsfm.runs.extend.extend",
+    "jaxsfm.runs.localize.localize_photos",
+    "jaxsfm.runs.extend.extend_run",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.matching.extraction.image_features",
     "jaxsfm.bench.datasets.fetch",
@@ -43,8 +43,15 @@ LONG = (
         for name in ("strecha", "daynight", "wxbs", "homography", "planes", "warps")
     ),
 )
-LINE = re.compile(r"^(?: {4}|\$ |)(jaxsfm [a-z-].*)$", re.MULTILINE)
+FENCED = re.compile(r"^```(?:bash|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+IN_FENCE = re.compile(r"^(?: {4}\$ |\$ |)(jaxsfm [a-z-].*)$", re.MULTILINE)
+INDENTED = re.compile(r"^ {4}(?:\.venv/bin/)?(jaxsfm [a-z-].*)$", re.MULTILINE)
 INLINE = re.compile(r"`(jaxsfm [a-z]+ [^`]*--[^`]*)`")
+FOLDERS = (
+    *("PHOTOS", "OTHER_PHOTOS", "images", "FOLDER", "DIR", "SETS", "SCENES"),
+    *("OXFORD", "PAIRS", "SEQUENCES", "POINTS"),
+)
+"""Names of folders in the documentation."""
 SHELL = {
     '"$(jaxsfm data path wxbs)"': "DIR",
     '"out/$(basename "$scene")"': "NEW",
@@ -58,7 +65,8 @@ def commands() -> list[tuple[str, str]]:
     found: dict[str, str] = {}
     for page in PAGES:
         text = page.read_text()
-        for command in (*LINE.findall(text), *INLINE.findall(text)):
+        fenced = [command for block in FENCED.findall(text) for command in IN_FENCE.findall(block)]
+        for command in (*fenced, *INDENTED.findall(text), *INLINE.findall(text)):
             command = re.sub(r"\s+#.*", "", " ".join(command.split()))
             found.setdefault(command, str(page.relative_to(ROOT)))
     return [(page, command) for command, page in found.items()]
@@ -72,7 +80,7 @@ class Reached(Exception):
 def home(plain, scene, tmp_path, monkeypatch):
     """A folder in which all the names exist that the documentation uses."""
     photos = sorted((scene / "images").iterdir())
-    for name in ("PHOTOS", "OTHER_PHOTOS", "FOLDER", "SETS", "SCENES", "OXFORD", "DIR", "images"):
+    for name in FOLDERS:
         shutil.copytree(scene / "images", tmp_path / name)
     shutil.copytree(plain[0], tmp_path / "OUT")
     for name in ("POSES", "SET"):
@@ -90,7 +98,8 @@ def home(plain, scene, tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSFM_DATA", str(tmp_path / "data"))
     for each in pkgutil.walk_packages(jaxsfm.__path__, "jaxsfm."):
         # Before anything is replaced: a module that is imported later would keep the replacement.
-        if not each.name.endswith("__main__"):
+        # The measurements of speed import what they compare with; no command runs them.
+        if not each.name.startswith("jaxsfm.bench.speed") and not each.name.endswith("__main__"):
             importlib.import_module(each.name)
     for path in LONG:
         module, _, name = path.rpartition(".")

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -18,11 +19,15 @@ from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, inspect_image
 from jaxsfm.io.store import Store
+from jaxsfm.matching.engines import LocalEngine
 from jaxsfm.matching.execution import Execution
+from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
+from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs import localize as localize_module
 from jaxsfm.runs.finished_model import camera_prior, read_working_model
 from jaxsfm.runs.localize import localize
+from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import similar_photos
 
@@ -42,6 +47,21 @@ def contents(folder: Path) -> dict[str, str]:
 def write(path: Path, rgb: np.ndarray) -> Path:
     cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
     return path
+
+
+class RecordingEngine:
+    """Computes in this process, and records how many items each call has."""
+
+    def __init__(self, *, starts_workers: bool = False) -> None:
+        self.starts_workers, self.calls = starts_workers, []
+
+    def extract_images(self, weights, images, **options):
+        self.calls.append(("extract", len(images)))
+        return LocalEngine.extract_images(weights, images, **options)
+
+    def match_pairs(self, load, capacities, pairs, **options):
+        self.calls.append(("match", len(pairs)))
+        return LocalEngine.match_pairs(load, capacities, pairs, **options)
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +161,33 @@ def test_kept_features_spare_the_next_call_and_change_no_pose(
         assert row["cam_from_world"] == localized["new.png"]["cam_from_world"]
         assert len(list(run.glob("features/*/*.npz"))) == 3
     assert computed == [3, 1, 1]  # the run's photos once, the new one in each call
+
+
+def test_localize_asks_the_engine_that_was_chosen(localized, plain, photos, monkeypatch):
+    """Even one that takes all photos in one call gives every photo what it has alone."""
+    choices, engine = [], RecordingEngine(starts_workers=True)
+    monkeypatch.setattr(localize_module, "chosen_engine", lambda c: choices.append(c) or engine)
+    choice = EngineChoice(engine="ray", workers=3)
+    options = LocalizeOptions(engine=choice, reference=photos / "reference")
+    result = localize([photos / "photos"], plain[0], options=options)
+    assert choices == [choice]
+    assert engine.calls == [("extract", 3), ("extract", 4), ("match", 11)]
+    for row in result["photos"]:
+        assert row | {"photo": ""} == localized[Path(row["photo"]).name] | {"photo": ""}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
+def test_localize_on_ray_gives_what_this_process_gives(localized, plain, photos, tmp_path):
+    out, new = tmp_path / "poses.json", photos / "photos" / "new.png"
+    wide = photos / "photos" / "wide.png"
+    ray = ["--engine", "ray", "--workers", "2", "--ray-address", "local"]
+    command = ["localize", str(new), str(wide), "--model", str(plain[0]), "--out", str(out)]
+    assert main([*command, *ray]) == 0
+    for row in json.loads(out.read_text())["photos"]:
+        wanted = localized[Path(row["photo"]).name]
+        for key in wanted.keys() - {"photo", "error"}:
+            assert row[key] == wanted[key], key
 
 
 def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
@@ -261,8 +308,9 @@ def test_the_command_writes_poses_and_tells_them(plain, photos, tmp_path, capsys
 
 
 def test_nothing_localized_ends_with_1(localized, plain, photos, capsys, monkeypatch):
-    rows = [localized["elsewhere.png"]]
-    monkeypatch.setattr(localize_module, "localize", lambda *args, **kwargs: {"photos": rows})
+    rows = [from_json(LocalizedPhoto, localized["elsewhere.png"])]
+    result = LocalizationReport(version="1", model=str(plain[0]), photos=rows)
+    monkeypatch.setattr(localize_module, "localize_photos", lambda *args, **kwargs: result)
     lost = photos / "photos" / "elsewhere.png"
     assert main(["localize", str(lost), "--model", str(plain[0])]) == 1
     captured = capsys.readouterr()

@@ -28,7 +28,7 @@ STEPS = (
         ),
     ),
     (
-        "From own photos to a model in nerfstudio's format",
+        "From your own photos to a model in nerfstudio's format",
         (
             "ls photos | wc -l",
             "jaxsfm/.venv/bin/jaxsfm reconstruct photos --out model",
@@ -87,12 +87,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="first-steps-") as scratch:
         lines = run_steps(args.photos.resolve(), Path(scratch))
     head = [
-        "# First steps, as they went",
+        "# First steps",
         "",
-        "Written by `python -m jaxsfm.bench.speed.first_steps PHOTOS PAGE` on "
-        f"{os.cpu_count()} CPU cores, no GPU, "
-        f"Python {platform.python_version()}; the photos are those of "
-        f"{args.photos.resolve().parent.name}.",
+        "This page shows what somebody new types, what the commands print, and how long they take. "
+        "It was written by",
+        "`python -m jaxsfm.bench.speed.first_steps PHOTOS PAGE` on "
+        f"{os.cpu_count()} CPU cores, no GPU, Python {platform.python_version()}. "
+        f"The photos are those of {args.photos.resolve().parent.name}.",
         "",
     ]
     args.page.write_text("\n".join([*head, *lines]))

@@ -21,7 +21,8 @@ from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits, align_patches, ma
 
 DEFAULTS = Refinement()
 """The radius of patches, the iterations and the limits are those of the refinement. In unlike light
-and seasons, a lower score (0.6) lets in patches that only look alike (docs/design.md)."""
+and seasons, a lower score (0.6) lets in patches that only look alike
+(docs/decisions/refinement.md)."""
 
 
 class AlignedMatches(NamedTuple):
@@ -86,7 +87,7 @@ def align_matches(
             found = align_patches(
                 image1, templates, at1, affine[piece], patch, iterations=DEFAULTS.iterations
             )
-            moved = octave.to_original(found.xy).astype(np.float32)
+            moved = octave.to_original(np.asarray(found.xy)).astype(np.float32)
             off_plane = np.linalg.norm(moved - on_plane[piece], axis=1)
             good = (limits.accept(found, at1) & (off_plane < max_error_px))[:count]
             rows = piece[:count][good]

@@ -1,0 +1,153 @@
+"""The constants of the presets, as literals: others compare with them, so they are promises."""
+
+import dataclasses
+
+import pytest
+
+from jaxsfm.config import PRESETS, Config, PairShape, Refinement, preset
+from jaxsfm.core import coarse_to_fine, relocalize
+from jaxsfm.core.octaves import OCTAVE_WEIGHT
+
+PAPER = {
+    # What the paper and the authors' code say: section numbers are the paper's.
+    "max_size": 1600,  # longer side, pixels; section 4
+    "keypoints": "relocalized",  # section 3.2
+    "backbone": "vgg16",
+    "threshold_px": 10.0,  # section 3.3
+    "min_inliers": 26,  # the code stops at 25 and fewer
+    "confidence": 0.999,
+    # What was added since is off.
+    "enlarge": 1.0,
+    "octaves": 1,
+    "centred": False,
+    "convolutions": "float32",
+    "aligned_octaves": 0,
+    "view_graph": False,
+    "refinement": None,
+}
+PAPER_PAIR = {
+    "max_planes": 5,
+    "max_hypotheses": 10_000,
+    "local_refits": 1,
+    "two_way": False,
+    "plane_rounds": 0,
+    "one_to_one": "first",
+    "consensus": 0,
+    "hypotheses_per_step": 64,
+    "coarse_columns": 128,
+    "coarse_tile": 1024,
+    "fine_chunk": 16,
+    "score_chunk": 2048,
+    "correspondences_per_cell": 2.0,
+}
+REFINEMENT = {
+    "passes": 2,
+    "radius": 7,
+    "iterations": 10,
+    "min_score": 0.8,
+    "max_sigma_px": 0.25,
+    "max_shift_px": 4.0,
+    "max_error_px": 1.0,
+    "min_cosine": 0.25,
+    "max_stretch": 6.0,
+    "neighbours": 16,
+    "weak_octaves": 4,
+    "weak_min_score": 0.6,
+}
+DEFAULT = PAPER | {
+    "octaves": 4,
+    "centred": True,
+    "aligned_octaves": 4,
+    "view_graph": True,
+    "refinement": REFINEMENT,
+}
+DEFAULT_PAIR = PAPER_PAIR | {
+    "local_refits": 4,
+    "plane_rounds": 5,
+    "one_to_one": "similarity",
+    "consensus": 1,
+}
+EXPECTED = {
+    "paper": PAPER | {"pair": PAPER_PAIR},
+    "default": DEFAULT | {"pair": DEFAULT_PAIR},
+    "robust": DEFAULT | {"enlarge": 2.0, "pair": DEFAULT_PAIR | {"local_refits": 10}},
+}
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED))
+def test_a_preset_is_what_it_was(name):
+    assert dataclasses.asdict(preset(name)) == EXPECTED[name]
+
+
+def test_there_are_three_presets_and_others_are_refused_by_name():
+    assert sorted(PRESETS) == sorted(EXPECTED)
+    with pytest.raises(ValueError, match="default.*paper.*robust.*got 'best'"):
+        preset("best")
+
+
+def test_what_the_paper_fixes_for_all_presets():
+    """Windows of 3 x 3 coarse cells, K = 2 children per axis; octaves count half each."""
+    assert coarse_to_fine.RADIUS == 1 and coarse_to_fine.SIDE == 6
+    assert relocalize.FACTOR == 2 and OCTAVE_WEIGHT == 0.5
+
+
+@pytest.mark.parametrize(
+    "name, least, message",
+    [
+        *((name, 1, "at least 1; got 0") for name in ("max_planes", "max_hypotheses")),
+        *((name, 1, "at least 1; got 0") for name in ("hypotheses_per_step", "local_refits")),
+        *((name, 1, "at least 1; got 0") for name in ("coarse_columns", "coarse_tile")),
+        *((name, 1, "at least 1; got 0") for name in ("fine_chunk", "score_chunk")),
+        *((name, 0, "at least 0; got -1") for name in ("consensus", "plane_rounds")),
+    ],
+)
+def test_a_pair_shape_refuses_what_is_one_too_small(name, least, message):
+    PairShape(**{name: least})
+    with pytest.raises(ValueError, match=f"PairShape.{name} must be {message}"):
+        PairShape(**{name: least - 1})
+
+
+def test_a_pair_shape_needs_room_for_correspondences():
+    PairShape(correspondences_per_cell=0.01)
+    for size in (0.0, -1.0):
+        with pytest.raises(ValueError, match="correspondences_per_cell must be positive; got"):
+            PairShape(correspondences_per_cell=size)
+
+
+@pytest.mark.parametrize(
+    "field, allowed, refused",
+    [
+        ("max_size", 48, 47),
+        ("enlarge", 1.0, 0.99),
+        ("octaves", 1, 0),
+        ("octaves", 4, 5),
+        ("aligned_octaves", 0, -1),
+        ("aligned_octaves", 4, 5),
+        ("threshold_px", 0.01, 0.0),
+        ("min_inliers", 4, 3),
+        ("confidence", 0.001, 0.0),
+        ("confidence", 0.9999, 1.0),
+    ],
+)
+def test_a_config_refuses_what_lies_outside_its_range(field, allowed, refused):
+    Config(**{field: allowed})
+    with pytest.raises(ValueError, match=f"{field} must .*got {refused}"):
+        Config(**{field: refused})
+
+
+@pytest.mark.parametrize(
+    "field, allowed, refused",
+    [
+        *((name, 1, 0) for name in ("passes", "radius", "iterations", "neighbours")),
+        *((name, 0.01, 0.0) for name in ("max_sigma_px", "max_shift_px", "max_error_px")),
+        ("max_stretch", 0.01, 0.0),
+        ("weak_octaves", 0, -1),
+        ("weak_octaves", 4, 5),
+        *((name, 0.0, -0.01) for name in ("min_score", "min_cosine", "weak_min_score")),
+        *((name, 0.99, 1.0) for name in ("min_score", "min_cosine", "weak_min_score")),
+    ],
+)
+def test_a_refinement_refuses_what_lies_outside_its_range(field, allowed, refused):
+    Refinement(**{field: allowed})
+    with pytest.raises(ValueError, match=f"Refinement.{field} must .*got {refused}"):
+        Refinement(**{field: refused})
