@@ -9,14 +9,8 @@ import dataclasses
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from tqdm import tqdm
-
-from jaxsfm.colmap.database import VerificationOptions
-from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.models import colour_points, read_models, write_models
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
@@ -30,68 +24,17 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_report import RunReport, write_report
+from jaxsfm.runs.extended_model import PlannedExtension, write_extension
 from jaxsfm.runs.finished_model import (
-    CameraPrior,
-    WorkingModel,
     camera_prior,
     photos_of_run,
     read_working_model,
-    view_without_pose,
     weights_of_run,
 )
 from jaxsfm.runs.job import Job, images_of, pairs_without
-from jaxsfm.runs.report import NewPhotos, extended_report
+from jaxsfm.runs.report import NewPhotos
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
-from jaxsfm.sfm.register.grow import ExtendedModel, UnregisteredView, grow
-
-if TYPE_CHECKING:
-    import pycolmap
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PlannedExtension:
-    """A finished run, and the photos that are added to it."""
-
-    run: FinishedRun
-    model: WorkingModel
-    new: NewPhotos
-    cameras: Mapping[str, CameraPrior]
-    """The cameras that new photos start with, by name."""
-    photos: Photos
-    """The run's photos and the new ones."""
-    matches: SavedMatches
-    """The matches of the new photos with their shortlists."""
-    progress: bool
-
-    def unregistered(
-        self, added: "Mapping[str, tuple[int, pycolmap.Camera]]"
-    ) -> dict[str, UnregisteredView]:
-        """The new photos as views without poses.
-
-        Args:
-          added: the id and the camera of each new photo in the database.
-        """
-        views = {}
-        for name, image in self.new.images.items():
-            camera, (image_id, in_database) = self.cameras[name], added[name]
-            view = dataclasses.replace(
-                view_without_pose(image, camera, self.model.config),
-                image_id=image_id,
-                # The model has the run's camera refined; the database has it as it was before.
-                camera=camera.camera if camera.source == "run" else in_database,
-            )
-            others = {other for pair in self.matches if name in pair for other in pair} - {name}
-            views[name] = UnregisteredView(view, camera.estimated, sorted(others))
-        return views
-
-    def models(self, database: Path, grown: ExtendedModel) -> "list[pycolmap.Reconstruction]":
-        """The models of the run, of which the best one has grown."""
-        models = read_models(self.run.folder / "sparse", database)
-        if grown.placed:
-            models[0] = grown.model.to_colmap()
-            colour_points(models[0], self.photos.rgb)
-        return models
 
 
 def extend(
@@ -185,7 +128,7 @@ def _extend(
         progress=options.progress,
     )
     with folder.publish() as target:
-        report = _extended(extension, target)
+        report = write_extension(extension, target)
         took = report.seconds.get("extension", 0.0) + time.monotonic() - start
         seconds = report.seconds | {"extension": took}
         report = dataclasses.replace(report, identity=identity, seconds=seconds)
@@ -255,42 +198,3 @@ def _match_new(
         for _ in job.match_missing(files, pairs_without(missing, lost)):
             pass
     return SavedMatches(job.store, pairs_without(pairs, lost)), lost
-
-
-def _extended(extension: PlannedExtension, target: Path) -> RunReport:
-    """Write the database and the models into `target`; returns the report."""
-    run, model, new, photos = extension.run, extension.model, extension.new, extension.photos
-    matches, database = extension.matches, target / "database.db"
-    count = sum(result.num_inliers for result in matches.values())
-    copy_database(run.folder / "database.db", database, count)
-    cameras = {n: (image, extension.cameras[n].camera) for n, image in new.images.items()}
-    added = add_images(database, cameras)
-    verified = add_matches(
-        database,
-        matches,
-        VerificationOptions(
-            seed=model.seed,
-            threads=run.report.options.threads,
-            scale=photos.median_scale(),
-        ),
-    )
-    unregistered = extension.unregistered(added)
-    quiet = not extension.progress
-    with tqdm(total=len(unregistered), desc="placing", unit="photo", disable=quiet) as bar:
-
-        def on_view() -> None:
-            bar.update()
-
-        grown = grow(
-            model.model,
-            unregistered,
-            matches,
-            photos.gray,
-            refinement=model.config.refinement,
-            seed=model.seed,
-            on_view=on_view,
-        )
-    models = extension.models(database, grown)
-    write_models(models, target / "sparse")
-    sizes = {name: photos[name].size for name in photos.keys() - new.skipped.keys()}
-    return extended_report(run, models, grown, new, matches, verified, sizes)

@@ -5,10 +5,9 @@ Each photo is matched with photos of the run, and its pose is found in the model
 options. It does not depend on the photo's name, or on the other photos of the same call.
 """
 
-import dataclasses
 import importlib.metadata
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -17,8 +16,8 @@ from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
-from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.matching.engines import chosen_engine
@@ -40,26 +39,10 @@ from jaxsfm.runs.localize_report import (
     error_against,
     localized_photo,
 )
+from jaxsfm.runs.queries import Query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.sfm.register.locate_view import Localization, locate
-
-PHOTOS_TOGETHER = 64
-"""Photos whose features and matches are asked from workers in one call: workers take seconds to
-start, and the features of so many photos take 1.6 GB on the disk."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Query:
-    """A photo that is to be localized."""
-
-    path: str
-    """Its path, as it was given."""
-    image: ImageFile
-    """Its name is made of its content, so that it is no name of a photo of the run."""
-    camera: CameraPrior
-    shortlist: Sequence[str]
-    """Names of the photos of the run that it is matched with."""
 
 
 def localize(
@@ -102,7 +85,7 @@ def localize_photos(
     seed = finished.report.options.seed
     model = read_working_model(finished.folder / "sparse" / "0", finished.config, seed=seed)
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
-    usable, unusable = _open_photos(photos)
+    usable, unusable = open_queries(photos)
     cameras = {path: camera_prior(i, model.views, intrinsics) for path, i in usable.items()}
     weights = weights_of_run(finished, options.network)
     unknown = {image.name: image for image in usable.values()}
@@ -138,7 +121,7 @@ def localize_photos(
         read = Photos([*files.values(), *(q.image for q in queries)], model.config).gray
         bar = tqdm(total=len(queries), desc="localizing", unit="photo", disable=not job.progress)
         with bar:
-            for query, matches in _match_queries(job, queries, files):
+            for query, matches in match_queries(job, queries, files):
                 rows.append(_localize_query(query, matches, finished, model, read))
                 bar.update()
     return LocalizationReport(
@@ -167,70 +150,6 @@ def locate_photo(
         own_camera=camera.estimated,
         seed=model.seed,
     )
-
-
-def _open_photos(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str, str]]:
-    """Find photos, in folders too, and read their headers.
-
-    Returns:
-      The usable photos, and the reasons why others are not usable, both by path as given.
-    """
-    paths, usable, unusable = [], {}, {}
-    for path in photos:
-        try:
-            paths += [path / name for name in find_images(path)] if path.is_dir() else [path]
-        except UserError as error:
-            unusable[str(path)] = str(error)
-    for path in dict.fromkeys(paths):
-        try:
-            image = inspect_image(path, name=str(path))
-            usable[str(path)] = dataclasses.replace(image, name=f"photo {image.sha256}")
-        except ImageError as error:
-            unusable[str(path)] = str(error)
-    if not usable:
-        raise UserError(next(iter(unusable.values()), "no photos to localize were given"))
-    return usable, unusable
-
-
-def _match_queries(
-    job: Job, queries: Sequence[Query], files: Mapping[str, ImageFile]
-) -> Iterator[tuple[Query, dict[Pair, PairResult] | str]]:
-    """Yield every query with its matches, or with the reason why it has none.
-
-    The queries' features and matches lie in a temporary folder. Without workers the queries are
-    taken one by one, so that little lies there.
-
-    Args:
-      job: has the features of the run's photos.
-      files: the photos of the run that are on the shortlists.
-    """
-    together = PHOTOS_TOGETHER if job.engine.starts_workers else 1
-    for k in range(0, len(queries), together):
-        group = queries[k : k + together]
-        own = {query.image.name: query.image for query in group}
-        images = {**files, **own}
-        identity = {**job.store.identity, "images": {n: i.sha256 for n, i in images.items()}}
-        with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-            part = dataclasses.replace(
-                job,
-                store=Store(Path(scratch), identity),
-                earlier=(job.store, *job.earlier),
-                progress=False,
-            )
-            lost = part.extract_missing(own.values())
-            pairs = {
-                query.path: [make_pair(query.image.name, name) for name in query.shortlist]
-                for query in group
-                if query.image.name not in lost
-            }
-            todo = list(dict.fromkeys(pair for some in pairs.values() for pair in some))
-            try:
-                found = {result.pair: result for result in part.match_missing(images, todo)}
-            except ImageError as error:  # a photo of the run is gone, and so are its features
-                found, lost = {}, dict.fromkeys(own, str(error))
-        for query in group:
-            why = lost.get(query.image.name)
-            yield query, why or {pair: found[pair] for pair in pairs[query.path]}
 
 
 def _localize_query(
