@@ -1,34 +1,44 @@
-# Everything from a bare Python: each target makes its own environment first.
+# Every target makes its own environment first: nothing but a Python is needed.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 comma := ,
-# With an NVIDIA driver on the machine the same commands use the GPU.
+# On a machine with an NVIDIA driver the environment has JAX for the GPU.
 GPU := $(if $(shell command -v nvidia-smi 2>/dev/null),$(comma)cuda)
+# How many processes run the tests.
 WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: demo test mutants check lint docs clean
+.PHONY: help demo test test-all mutants lint check check-all docs clean
 
-demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare with the truth, in demo/
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
+
+demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare it with the exact cameras: demo/
 	rm -rf demo
 	$(BIN)/jaxsfm demo --out demo
 
-test: $(VENV)/.dev ## all tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+test: $(VENV)/.dev ## run the quick tests: at most 8 minutes on two cores
+	$(PYTEST) -m "not slow"
 
-mutants: $(VENV)/.dev ## deliberate mistakes in the core and the refinement: do tests fail?
+test-all: $(VENV)/.dev ## run all tests, the slow ones too: at most 20 minutes on two cores
+	$(PYTEST)
+
+mutants: $(VENV)/.dev ## make deliberate mistakes in the core and the refinement: do tests fail?
 	$(BIN)/python tests/mutants/run.py
 
-lint: $(VENV)/.dev ## format, style, layers, types
+lint: $(VENV)/.dev ## check format, style, layers and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-docs: $(VENV)/.dev ## the documentation's site, in build/site
-	$(BIN)/zensical build --strict
-
 check: lint test ## what must pass before a commit
+
+check-all: lint test-all demo ## what continuous integration runs (.ci/run)
+
+docs: $(VENV)/.dev ## build the documentation's site: build/site
+	$(BIN)/zensical build --strict
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "jaxsfm needs Python 3.11 or newer")'
@@ -42,5 +52,5 @@ $(VENV)/.dev: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev,demo$(GPU)]'
 	touch $@ $(VENV)/.demo
 
-clean:
+clean: ## remove the environment and all caches
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis

@@ -1,4 +1,4 @@
-"""Strict numerics for every test, and the inputs that several tests share."""
+"""Strict type promotion in every test, and the inputs that several packages' tests share."""
 
 import atexit
 import json
@@ -6,11 +6,12 @@ import os
 import shutil
 import tempfile
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # two workers, one GPU
-# Compiled programs are shared by the workers and the processes that tests start (a notebook's 72 s
-# become 30), but not with the user's own cache: it is new for every session.
+# Compiled programs are shared by the workers and the processes that tests start (a notebook takes
+# 30 s instead of 72 s). They are not shared with the user's own cache: each session has a new one.
 if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxsfm-compiled-")
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
@@ -19,6 +20,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 import jax
 import numpy as np
 import pytest
+from shared import once
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -47,7 +49,7 @@ def weights():
 
 @pytest.fixture(scope="session")
 def photos() -> list[np.ndarray]:
-    """Real photographs, uint8 RGB, from a package."""
+    """Real photographs from the scikit-image package, uint8 RGB."""
     from jaxsfm.bench.synthetic import photo_textures
 
     return photo_textures()
@@ -55,25 +57,27 @@ def photos() -> list[np.ndarray]:
 
 @pytest.fixture(scope="session")
 def rendered():
-    """See `room_scene.Room`."""
+    """A rendered room as a model with exact points (`room_scene.Room`)."""
     from room_scene import rendered_room
 
     return rendered_room()
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory) -> Path:
-    """Three small views of the room, the middle one at night; K.txt and reference beside them."""
-    folder = tmp_path_factory.mktemp("scene")
+def scene(tmp_path_factory) -> Iterator[Path]:
+    """Three small views of the room, the middle one at night; K.txt and reference/ beside them."""
     from jaxsfm.bench.synthetic import write_scene
 
-    write_scene(folder, num_views=3, size=(320, 240))
-    return folder
+    def make(folder: Path) -> None:
+        write_scene(folder, num_views=3, size=(320, 240))
+
+    with once(tmp_path_factory, "scene", make) as folder:
+        yield folder
 
 
 @pytest.fixture
 def server(monkeypatch):
-    """See `local_server`."""
+    """A web server on this machine (`local_server`)."""
     from local_server import CONTENT, Handler, Server
 
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -85,14 +89,17 @@ def server(monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def plain(scene, tmp_path_factory) -> tuple[Path, dict]:
-    """A run of the scene with known intrinsics and its report; tests do not write to it."""
+def plain(scene, tmp_path_factory) -> Iterator[tuple[Path, dict]]:
+    """A run of the scene with known intrinsics, and its report."""
     from jaxsfm.cli.main import main
 
-    out = tmp_path_factory.mktemp("plain") / "out"
-    args = [str(scene / "images"), "--out", str(out), "--intrinsics", str(scene / "K.txt")]
-    assert main(["reconstruct", *args, "--threads", "1"]) == 0
-    return out, json.loads((out / "report.json").read_text())
+    def make(folder: Path) -> None:
+        out, known = str(folder / "out"), str(scene / "K.txt")
+        args = [str(scene / "images"), "--out", out, "--intrinsics", known, "--threads", "1"]
+        assert main(["reconstruct", *args]) == 0
+
+    with once(tmp_path_factory, "plain", make) as folder:
+        yield folder / "out", json.loads((folder / "out" / "report.json").read_text())
 
 
 @pytest.fixture(scope="session")

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.database import VerificationOptions, verify
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions, verify
 
 
 def verified(path: Path, options: MapOptions):

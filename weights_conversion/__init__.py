@@ -1,5 +1,5 @@
-"""Converters from public VGG-16 weight files to jaxsfm's (`jaxsfm.io.weight_files`).
+"""Converts public files of VGG-16 weights to jaxsfm's format (`jaxsfm.io.weight_files`).
 
-`read_source` reads a file of any family into its own convention (`Source`), `convert` brings it
-into ours, `verify` compares the two by an independent forward pass.
+`read_source` reads a file of any family and keeps its own convention (`Source`). `write_converted`
+converts it to jaxsfm's convention. `verify` compares the two by an independent forward pass.
 """

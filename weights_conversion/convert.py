@@ -1,4 +1,4 @@
-"""Files of any family to one format; what a file is, its first bytes say."""
+"""Reads files of any family, recognized by their first bytes, and writes them in one format."""
 
 import importlib.metadata
 from collections.abc import Mapping
@@ -20,17 +20,17 @@ from weights_conversion.source import (
 from weights_conversion.torchvision import read_torchvision
 
 CONVERTER = 1
-"""To be counted up when a conversion gives other numbers than before."""
+"""The version of the converter. It changes when a conversion gives other numbers than before."""
 Kind = Literal["torch", "safetensors", "hdf5", "matlab"]
 LEGACY_TORCH = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
-"""The pickled magic number of PyTorch's files before 1.6."""
+"""The first bytes of the files that PyTorch before 1.6 wrote: a pickled magic number."""
 
 
 def file_kind(path: Path) -> Kind:
-    """What a file is, by its first bytes.
+    """Recognize a file by its first bytes.
 
     Raises:
-      UserError: nothing that is known, or not readable.
+      UserError: the file is none of the known kinds, or cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -62,19 +62,21 @@ def read_source(
     kernels: Kernels = "auto",
     shapes: Mapping[str, tuple[int, int]] = LAYERS,
 ) -> Source:
-    """The weights of a file, in its own convention.
+    """Read the weights of a file, in its own convention.
 
     Args:
-      family: which it must be of; auto: any.
-      kernels: of Keras' files: `weights_conversion.keras_files.read_keras`.
+      path: the file.
+      family: the family that it must belong to; auto accepts any.
+      kernels: whether the kernels of a Keras file are turned
+        (`weights_conversion.keras_files.read_keras`).
       shapes: input and output channels of each layer.
 
     Raises:
-      UserError: not readable, damaged, not a VGG-16, or of another family.
+      UserError: the file cannot be read, is damaged, is not a VGG-16, or is of another family.
     """
     kind = file_kind(path)
     if is_converted(path):
-        raise UserError(f"{path}: is converted already")
+        raise UserError(f"{path}: the file is converted already")
     sha256 = sha256_of(path)
     if kind == "hdf5":
         source = read_keras(path, sha256=sha256, kernels=kernels, shapes=shapes)
@@ -84,7 +86,7 @@ def read_source(
         safe = kind == "safetensors"
         source = read_torchvision(path, sha256=sha256, safe=safe, shapes=shapes)
     if kernels != "auto" and kind != "hdf5":
-        raise UserError(f"--kernels {kernels}: only of Keras' files; {path} is none")
+        raise UserError(f"--kernels {kernels}: only Keras' files need it; {path} is none of them")
     if family not in ("auto", source.family):
         raise UserError(f"--family {family}: {path} is of the family {source.family}")
     return source
@@ -94,10 +96,10 @@ def write_converted(source: Source, out: Path) -> None:
     """Write a source in jaxsfm's format (`jaxsfm.io.weight_files`).
 
     Raises:
-      UserError: it cannot be written, or is the source's own file.
+      UserError: the file cannot be written, or it is the source itself.
     """
     if out.exists() and out.samefile(source.path):
-        raise UserError(f"{out}: is the file to convert; name another for the result")
+        raise UserError(f"{out}: this is the file to convert; name another file for the result")
     save_weights(
         out,
         canonical_layers(source),

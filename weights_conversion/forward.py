@@ -1,8 +1,8 @@
-"""VGG-16 in numpy, float64, in the convention of the weights' own framework.
+"""VGG-16 in numpy and float64, in the convention of the weights' own framework.
 
-Independent of jaxsfm's network and of the conversion: images and kernels stay as the framework has
-them (channels first or last, BGR or RGB, convolution or correlation), and every tap of a kernel is
-added up by itself. Slow, and meant for small images.
+This network is independent of jaxsfm's network and of the conversion, so the two can be compared.
+Images and kernels stay as the framework has them: channels first or last, BGR or RGB, convolution
+or correlation. Each tap of a kernel is added separately, which is slow; images should be small.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from weights_conversion.source import Source
 
 
 def _input(source: Source, rgb: np.ndarray) -> np.ndarray:
-    """What the framework's own preprocessing makes of an image, in its order of axes."""
+    """Preprocess an image as the framework does, with the axes in its order."""
     image = rgb.astype(np.float64)
     if source.convention.bgr:
         image = np.stack([image[..., 2], image[..., 1], image[..., 0]], axis=-1)
@@ -24,9 +24,9 @@ def _input(source: Source, rgb: np.ndarray) -> np.ndarray:
 
 
 def _taps(size: int, tap: int, convolution: bool) -> tuple[slice, slice]:
-    """Along one axis: which outputs a kernel's tap 0, 1 or 2 adds to, from which inputs.
+    """Return, along one axis, the outputs to which a tap (0, 1 or 2) adds and the inputs it takes.
 
-    Correlation: y[n] = sum over t of w[t] x[n + t - 1]; convolution: .. x[n + 1 - t].
+    A correlation is y[n] = sum over t of w[t] x[n + t - 1]; a convolution has x[n + 1 - t] instead.
     """
     shift = 1 - tap if convolution else tap - 1
     inside = slice(max(0, -shift), size - max(0, shift))
@@ -34,7 +34,7 @@ def _taps(size: int, tap: int, convolution: bool) -> tuple[slice, slice]:
 
 
 def _layer(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray, source: Source) -> np.ndarray:
-    """One convolution with zero padding of one, plus bias."""
+    """Apply one layer: a convolution with zero padding of one pixel, plus the bias."""
     convolution = source.convention.convolution
     kernel, bias = kernel.astype(np.float64), bias.astype(np.float64)
     last = source.convention.layout == "HWIO"
@@ -53,7 +53,7 @@ def _layer(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray, source: Source) 
 
 
 def _pool(x: np.ndarray, last: bool) -> np.ndarray:
-    """The largest of 2 x 2; an odd last row or column is dropped."""
+    """Take the maximum of 2 x 2 values; an odd last row or column is dropped."""
     height, width = x.shape[:2] if last else x.shape[1:]
     height, width = height // 2 * 2, width // 2 * 2
     x = x[:height, :width] if last else x[:, :height, :width]
@@ -62,11 +62,13 @@ def _pool(x: np.ndarray, last: bool) -> np.ndarray:
 
 
 def layer_maps(source: Source, rgb: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """All maps of an image, float64 (h, w, channels): conv1_1 .. conv5_3 before their rectifiers,
-    and pool1 .. pool5.
+    """Compute all maps of an image: conv1_1 .. conv5_3 before their rectifiers, and pool1 .. pool5.
 
     Args:
+      source: the weights.
       rgb: (h, w, 3), 0 .. 255.
+
+    Yields: the name of each map and the map, float64 (h, w, channels).
     """
     last = source.convention.layout == "HWIO"
     x = _input(source, rgb)
@@ -75,6 +77,6 @@ def layer_maps(source: Source, rgb: np.ndarray) -> Iterator[tuple[str, np.ndarra
         x = _layer(x, kernel, bias, source)
         yield name, x if last else np.moveaxis(x, 0, -1)
         x = np.maximum(x, 0.0)
-        if following[:5] != name[:5]:  # the last of its block
+        if following[:5] != name[:5]:  # this layer is the last of its block
             x = _pool(x, last)
             yield f"pool{name[4]}", x if last else np.moveaxis(x, 0, -1)

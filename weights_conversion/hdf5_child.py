@@ -1,9 +1,9 @@
-"""The convolutions in an HDF5 file of Keras: a script for a process of its own.
+"""A script that reads the convolutions from an HDF5 file of Keras, in a process of its own.
 
-libhdf5 may loop for ever on a damaged file (2.0: an attribute among a thousand mutated files) or
-crash, and nothing in its process can end that. `weights_conversion.keras_files` runs this file with
-two arguments, the HDF5 file and an .npz for what is found, and imports nothing of ours here: a
-second instead of five.
+On a damaged file libhdf5 may crash or loop for ever (version 2.0 did, on one of a thousand mutated
+files), and nothing in the same process can end that. So `weights_conversion.keras_files` runs this
+file as a program. Its two arguments are the HDF5 file and an .npz file for the result. It imports
+nothing of jaxsfm, and so takes one second instead of five.
 """
 
 import math
@@ -14,18 +14,21 @@ import h5py
 import numpy as np
 
 MAX_VALUES = 1 << 22
-"""In a dataset that is read: the largest kernel has 2.4 million; the classifier's are left out."""
+"""The most values of a dataset that is read. The largest kernel has 2.4 million; the layers of the
+classifier are larger, and they are not needed."""
 _NAMED = re.compile(r"(?:^|/)(?:block)?(?:conv)?([1-5])_(?:conv)?([1-3])(?:/|$)")
 _COUNTED = re.compile(r"(?:^|/)layers/conv2d(?:_(\d{1,2}))?/vars/[01]$")
 
 
 class Refused(Exception):
-    """Why a file is none of Keras' VGG-16, in words."""
+    """The file is not a VGG-16 of Keras; the text says why."""
 
 
 def layer_of(name: str) -> str | None:
-    """conv1_1 of a dataset called after its layer, the number of one that is counted; None for
-    anything else, and for an optimizer's moments."""
+    """Return the layer of a dataset: its name (conv1_1), or its number if datasets are numbered.
+
+    The result is None for anything else, for example the moments of an optimizer.
+    """
     if name.startswith("optimizer"):
         return None
     if counted := _COUNTED.search(name):
@@ -35,10 +38,10 @@ def layer_of(name: str) -> str | None:
 
 
 def convolutions(file: h5py.File) -> dict[str, np.ndarray]:
-    """LAYER.kernel and LAYER.bias; soft and external links are not followed.
+    """Read the arrays LAYER.kernel and LAYER.bias. Soft and external links are not followed.
 
     Raises:
-      Refused: a layer is there twice, lies elsewhere, or is too large.
+      Refused: a layer is in the file twice, is in another file, or is too large.
     """
     found: dict[str, np.ndarray] = {}
 
@@ -47,12 +50,12 @@ def convolutions(file: h5py.File) -> dict[str, np.ndarray]:
         if layer is None or not isinstance(item, h5py.Dataset) or item.ndim not in (1, 4):
             return
         if item.is_virtual or item.external:
-            raise Refused(f"{name} lies in another file, which is not followed")
+            raise Refused(f"{name} is in another file, which is not read")
         if math.prod(item.shape) > MAX_VALUES or item.dtype.kind != "f":
-            raise Refused(f"{name} is no layer of VGG-16 ({item.dtype} {item.shape})")
+            raise Refused(f"{name} is not a layer of VGG-16 ({item.dtype} {item.shape})")
         key = f"{layer}.{'kernel' if item.ndim == 4 else 'bias'}"
         if key in found:
-            raise Refused(f"{key} is in it more than once ({name})")
+            raise Refused(f"{key} is in the file more than once ({name})")
         found[key] = item[()]
 
     file.visititems(visit)
@@ -60,7 +63,10 @@ def convolutions(file: h5py.File) -> dict[str, np.ndarray]:
 
 
 def backend(file: h5py.File) -> str:
-    """What the weights ran on, "" where the file does not say so (Keras 1.0, .weights.h5)."""
+    """Return the backend that the weights were used with.
+
+    It is "" if the file does not say (Keras 1.0, .weights.h5).
+    """
     for group in (file, file.get("model_weights")):
         if isinstance(group, h5py.Group) and "backend" in group.attrs:
             value = group.attrs["backend"]
@@ -69,7 +75,7 @@ def backend(file: h5py.File) -> str:
 
 
 def main(source: str, target: str) -> int:
-    """0, or 1 and the reason on standard error."""
+    """Read the file and write the arrays; return 0, or 1 with the reason on standard error."""
     try:
         with h5py.File(source, "r") as file:
             found = convolutions(file) | {"backend": np.asarray(backend(file))}

@@ -1,11 +1,14 @@
-"""Keras' VGG16 (.h5): Caffe's weights, whose input is BGR in 0 .. 255 minus a mean.
+"""Reads Keras' VGG16 (.h5). These are Caffe's weights; their input is BGR in 0 .. 255 minus a mean.
 
-Four layouts: datasets called after their layer, as Keras 1 (block1_conv1/block1_conv1_W_1:0),
-Keras 2 (block1_conv1/block1_conv1/kernel:0) and whole models (model_weights/..) have them; and
-Keras 3's .weights.h5, which only counts (layers/conv2d_1/vars/0). Kernels are HWIO. Keras 1 with
-`dim_ordering="th"` stored OIHW, and what ran on Theano is turned by 180 degrees, because Theano
-convolves where others correlate (`keras.utils.conv_utils.convert_kernel`,
-`preprocess_weights_for_loading`): the public file *_th_dim_ordering_th_kernels is both.
+There are four layouts. In three of them datasets are called after their layer: Keras 1
+(block1_conv1/block1_conv1_W_1:0), Keras 2 (block1_conv1/block1_conv1/kernel:0) and whole models
+(model_weights/..). In the fourth, Keras 3's .weights.h5, they are numbered:
+layers/conv2d_1/vars/0.
+
+Kernels are HWIO, or OIHW if Keras 1 wrote them with `dim_ordering="th"`. Kernels for Theano are
+turned by 180 degrees, because Theano convolves where the others correlate
+(`keras.utils.conv_utils.convert_kernel`, `preprocess_weights_for_loading`). The public file
+*_th_dim_ordering_th_kernels is OIHW and turned.
 """
 
 import subprocess
@@ -24,14 +27,14 @@ from weights_conversion.source import Convention, Source, check_layers
 Kernels = Literal["auto", "tensorflow", "theano"]
 
 CAFFE_BGR = Preprocessing(scale=1.0, mean=(103.939, 116.779, 123.68), std=(1.0, 1.0, 1.0))
-"""`preprocess_input` with mode="caffe": the channels of BGR."""
+"""`preprocess_input` with mode="caffe"; the channels are in the order BGR."""
 CHILD = Path(__file__).with_name("hdf5_child.py")
 PATIENCE_S = 120.0
-"""For reading 60 MB, of any disk."""
+"""How long the child may take, seconds: enough to read 60 MB from any disk."""
 
 
 def _read_apart(path: Path) -> dict[str, np.ndarray]:
-    """What `hdf5_child` finds in a file, in a process of its own."""
+    """Run `hdf5_child` in a process of its own and return what it finds in a file."""
     with tempfile.TemporaryDirectory() as scratch:
         found = Path(scratch) / "found.npz"
         command = [sys.executable, "-P", str(CHILD), str(path.absolute()), str(found)]
@@ -41,7 +44,7 @@ def _read_apart(path: Path) -> dict[str, np.ndarray]:
             )
         except subprocess.TimeoutExpired:
             raise UserError(
-                f"{path}: damaged (the HDF5 library was not done after {PATIENCE_S:g} s)"
+                f"{path}: damaged (the HDF5 library had not finished after {PATIENCE_S:g} s)"
             ) from None
         if child.returncode != 0:
             reason = child.stderr.strip().splitlines() if child.returncode == 1 else []
@@ -53,7 +56,7 @@ def _read_apart(path: Path) -> dict[str, np.ndarray]:
 
 
 def _by_layer(found: dict[str, np.ndarray]) -> dict[str, tuple[object, object]]:
-    """Kernel and bias of each layer; those that are only counted come in the network's order."""
+    """Return kernel and bias of each layer; numbered layers are in the order of the network."""
     counted = {str(k): layer for k, layer in enumerate(LAYERS)}
     keys = {layer: layer for layer in LAYERS}
     keys |= {layer: k for k, layer in counted.items() if f"{k}.kernel" in found}
@@ -61,7 +64,10 @@ def _by_layer(found: dict[str, np.ndarray]) -> dict[str, tuple[object, object]]:
 
 
 def _convolves(path: Path, layout: str, backend: str, kernels: Kernels) -> bool:
-    """Whether kernels are Theano's: as told, as the file says, as its public name says."""
+    """Whether the kernels are for Theano.
+
+    The option decides, else the file itself, else the name under which the file is public.
+    """
     if kernels != "auto":
         return kernels == "theano"
     if backend:
@@ -72,8 +78,8 @@ def _convolves(path: Path, layout: str, backend: str, kernels: Kernels) -> bool:
     if layout == "HWIO":
         return False
     raise UserError(
-        f"{path}: nothing in it says whether its kernels are Theano's, turned by 180 degrees; "
-        "say --kernels theano (the public file th_dim_ordering_th_kernels) or tensorflow"
+        f"{path}: the file does not say whether its kernels are turned by 180 degrees, for Theano; "
+        "give --kernels theano (the public file th_dim_ordering_th_kernels) or tensorflow"
     )
 
 
@@ -84,14 +90,17 @@ def read_keras(
     kernels: Kernels = "auto",
     shapes: Mapping[str, tuple[int, int]] = LAYERS,
 ) -> Source:
-    """Weights of keras.applications.VGG16, with or without its classifier.
+    """Read the weights of keras.applications.VGG16, with or without its classifier.
 
     Args:
-      kernels: theano: turned by 180 degrees; auto: what the file says (its attribute `backend`),
-        or its public name, or, of HWIO kernels, not turned.
+      path: the file.
+      sha256: its hash.
+      kernels: theano: the kernels are turned by 180 degrees; tensorflow: they are not; auto: the
+        file's attribute `backend` decides, else its public name; HWIO kernels are else not turned.
+      shapes: input and output channels of each layer.
 
     Raises:
-      UserError: it is damaged, not a VGG-16, or its kernels may be either.
+      UserError: the file is damaged or not a VGG-16, or nothing says whether kernels are turned.
     """
     found = _read_apart(path)
     arrays = _by_layer(found)

@@ -1,7 +1,7 @@
-"""MATLAB files of version 5: numbers, texts, cells and structs, and nothing else.
+"""Reads numbers, texts, cells and structs from MATLAB files of version 5.
 
-Of our own, because scipy.io.loadmat ends the process with a segmentation fault on damaged files
-(1.17: one of some hundred mutated bytes). Arrays are views of the file.
+scipy.io.loadmat is not used, because it ends the process with a segmentation fault on some damaged
+files (version 1.17, after one of some hundred mutations). The arrays are views of the mapped file.
 
 Source: MAT-File Format (The MathWorks, R2023b), level 5.
 """
@@ -12,14 +12,18 @@ import struct
 import zlib
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
+Value: TypeAlias = np.ndarray | str | list["Value"] | dict[str, "Value"] | None
+"""Numbers are arrays, texts str, cells lists (column by column) and structs dicts; an array of
+several structs is a list. None stands for anything else."""
+
 MAX_VARIABLE = 1 << 30
-"""Bytes of a compressed variable, unpacked; NetVLAD's network has 0.6 times as many."""
+"""The most bytes of a variable after decompression; NetVLAD's network has 0.6 times as many."""
 MAX_DEPTH = 16
-"""Of cells and structs within each other."""
+"""How deeply cells and structs may be nested."""
 HEADER = 128
 NUMBERS = {
     1: "i1",
@@ -52,21 +56,23 @@ COMPLEX = 0x0800
 
 
 class _Elements:
-    """Data elements one after the other, in a part of a file."""
+    """A sequence of data elements in a part of a file."""
 
     def __init__(self, data: memoryview, order: str, depth: int = 0) -> None:
         self.data, self.order, self.depth, self.at = data, order, depth, 0
         if depth > MAX_DEPTH:
-            raise ValueError(f"cells and structs within each other more than {MAX_DEPTH} times")
+            raise ValueError(f"cells and structs are nested more than {MAX_DEPTH} times")
 
     @property
     def left(self) -> int:
         return len(self.data) - self.at
 
     def next(self) -> tuple[int, memoryview]:
-        """Type and bytes of the next element."""
+        """Return the type and the bytes of the next element."""
         kind, size = struct.unpack_from(f"{self.order}II", self.data, self.at)
-        if kind >> 16:  # a small element: size, type and up to four bytes in eight
+        if (
+            kind >> 16
+        ):  # a small element: size, type and up to four data bytes, together eight bytes
             kind, size, start, padded = kind & 0xFFFF, kind >> 16, self.at + 4, 4
             if size > 4:
                 raise ValueError("a small element of more than four bytes")
@@ -79,22 +85,22 @@ class _Elements:
         return kind, self.data[start : start + size]
 
     def numbers(self) -> np.ndarray:
-        """The next element as numbers."""
+        """Read the next element as numbers."""
         kind, data = self.next()
         if kind not in NUMBERS:
             raise ValueError(f"numbers are expected; got an element of type {kind}")
         return np.frombuffer(data, self.order + NUMBERS[kind])
 
     def text(self) -> str:
-        """The next element as text."""
+        """Read the next element as text."""
         kind, data = self.next()
         if kind not in TEXTS:
             raise ValueError(f"text is expected; got an element of type {kind}")
         wide = {"<": "-le", ">": "-be"}[self.order] * TEXTS[kind].startswith(("utf-16", "utf-32"))
         return bytes(data).decode(TEXTS[kind] + wide, errors="replace")
 
-    def matrix(self) -> tuple[str, Any]:
-        """Name and value of the next array."""
+    def matrix(self) -> tuple[str, Value]:
+        """Read the next array; return its name and value."""
         kind, data = self.next()
         if kind != MATRIX:
             raise ValueError(f"an array is expected; got an element of type {kind}")
@@ -103,11 +109,11 @@ class _Elements:
         return _array(_Elements(data, self.order, self.depth + 1))
 
 
-def _array(part: _Elements) -> tuple[str, Any]:
+def _array(part: _Elements) -> tuple[str, Value]:
     flags = int(part.numbers()[0])
     kind = flags & 0xFF
     if kind not in (CELL, STRUCT, CHAR, *NUMERIC) or flags & COMPLEX:
-        return "", None  # objects, functions, sparse and complex numbers
+        return "", None  # the array holds objects, functions, or sparse or complex numbers
     shape = tuple(int(n) for n in part.numbers())
     count = math.prod(shape)
     if min(shape, default=0) < 0:
@@ -123,10 +129,12 @@ def _array(part: _Elements) -> tuple[str, Any]:
     fields = _field_names(part) if kind == STRUCT else [""]
     if count * len(fields) * 8 > part.left:
         raise ValueError(f"an array of shape {shape} with too few elements")
-    items = [{field: part.matrix()[1] for field in fields} for _ in range(count)]
+    items: list[dict[str, Value]] = [
+        {field: part.matrix()[1] for field in fields} for _ in range(count)
+    ]
     if kind == CELL:
         return name, [item[""] for item in items]
-    return name, items[0] if count == 1 else items
+    return name, items[0] if count == 1 else [*items]
 
 
 def _field_names(part: _Elements) -> list[str]:
@@ -138,17 +146,15 @@ def _field_names(part: _Elements) -> list[str]:
     return [name.partition(b"\0")[0].decode("latin-1") for name in names]
 
 
-def read_variables(path: Path, names: Collection[str]) -> dict[str, Any]:
-    """Those variables that are in a file.
-
-    Returns: numbers as arrays, texts as str, cells as lists (column by column), structs as dicts
-    (an array of several as a list); None for anything else.
+def read_variables(path: Path, names: Collection[str]) -> dict[str, Value]:
+    """Read those of the named variables that are in a file.
 
     Raises:
-      ValueError, struct.error, zlib.error, OSError: not such a file, or damaged.
+      ValueError, struct.error, zlib.error, OSError: the file is not a MATLAB file of version 5, or
+        it is damaged.
     """
     with path.open("rb") as file:
-        # Kept open by the arrays that see it.
+        # The mapping is not closed here, because the arrays are views of it.
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None or len(data) < HEADER:

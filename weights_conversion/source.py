@@ -1,4 +1,4 @@
-"""Weights as their own framework has them, and the way from there to jaxsfm's convention."""
+"""Weights in the convention of their own framework, and their conversion to jaxsfm's."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -17,16 +17,17 @@ class Convention(NamedTuple):
     """How a framework stores kernels and channels."""
 
     layout: Literal["HWIO", "OIHW"]
+    """The order of the axes of a kernel: height, width, input and output channels."""
     bgr: bool
-    """The network's input has the channels blue, green, red."""
+    """Whether the channels of the network's input are blue, green, red."""
     convolution: bool
-    """Kernels are applied as true convolutions, turned by 180 degrees (Theano), not as
-    correlations."""
+    """Whether kernels are applied as true convolutions (Theano) and not as correlations; they are
+    then turned by 180 degrees."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Source:
-    """A file's convolutions, as they are in it."""
+    """The convolutions of a file, in the convention of the file."""
 
     architecture: str = "vgg16"
     """One of `jaxsfm.io.weight_files.ARCHITECTURES`."""
@@ -34,14 +35,14 @@ class Source:
     path: Path
     sha256: str
     layers: Mapping[str, tuple[np.ndarray, np.ndarray]]
-    """Layer (conv1_1, ..) -> kernel in the convention's layout, bias (O,)."""
+    """Layer (conv1_1, ..) -> the kernel, in the layout of the convention, and the bias (O,)."""
     convention: Convention
     preprocessing: Preprocessing
-    """Mean and std in the order of the source's channels."""
+    """What the network expects of an image; the channels are in the order of the source."""
     extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """`jaxsfm.io.weight_files.EXTRAS`, already in their documented form."""
+    """Those of `jaxsfm.io.weight_files.EXTRAS` that the file has, in the form documented there."""
     notes: tuple[str, ...] = ()
-    """What the user should know, in sentences."""
+    """Sentences that tell the user what is unusual about the file."""
 
 
 def check_layers(
@@ -51,14 +52,16 @@ def check_layers(
     path: Path,
     shapes: Mapping[str, tuple[int, int]],
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """The layers as float32 arrays in canonical order.
+    """Check the layers and return them as float32 arrays, in the order of `shapes`.
 
     Args:
-      layers: kernel and bias of each layer; None: it is not in the file.
-      shapes: input and output channels of each.
+      layers: kernel and bias of each layer; None stands for an array that is not in the file.
+      convention: how kernels are stored.
+      path: the file, for messages.
+      shapes: input and output channels of each layer.
 
     Raises:
-      UserError: one is missing, of another shape, or not finite.
+      UserError: an array is missing, has another shape, or has values that are not finite.
     """
     checked = {}
     for name, (inputs, outputs) in shapes.items():
@@ -78,7 +81,7 @@ def _checked(array: object, shape: tuple[int, ...], what: str) -> np.ndarray:
     if not isinstance(array, np.ndarray) or array.dtype.kind != "f" or array.shape != shape:
         got = getattr(array, "dtype", type(array).__name__), getattr(array, "shape", "")
         raise UserError(f"{what} must be an array of floats {shape}; got {got[0]} {got[1]}")
-    # Overflow to infinity is found below, as what it is.
+    # A value that overflows to infinity is refused below.
     with np.errstate(over="ignore", invalid="ignore"):
         single = np.ascontiguousarray(array, np.float32)
     if not np.isfinite(single).all():
@@ -87,9 +90,11 @@ def _checked(array: object, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def canonical_layers(source: Source) -> dict[str, dict[str, np.ndarray]]:
-    """The layers in jaxsfm's convention: {layer: {'kernel': HWIO, 'bias': O}}, RGB, correlation.
+    """Convert the layers to jaxsfm's convention: kernels are HWIO, RGB, and correlate.
 
-    Exact: values are moved, never computed with.
+    The conversion is exact, because it moves values and does not compute with them.
+
+    Returns: {layer: {'kernel': HWIO, 'bias': O}}.
     """
     layers = {}
     for name, (kernel, bias) in source.layers.items():
@@ -104,7 +109,7 @@ def canonical_layers(source: Source) -> dict[str, dict[str, np.ndarray]]:
 
 
 def canonical_preprocessing(source: Source) -> Preprocessing:
-    """Mean and std in the order RGB."""
+    """Return the preprocessing with mean and deviation in the order RGB."""
     if not source.convention.bgr:
         return source.preprocessing
     scale, mean, std = source.preprocessing

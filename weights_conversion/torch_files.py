@@ -1,9 +1,9 @@
-"""PyTorch's files of tensors, read without PyTorch and without running anything in them.
+"""Reads PyTorch's files of tensors, without PyTorch and without running anything in them.
 
-Two formats. Since 1.6: a zip with `data.pkl` and one member `data/KEY` per storage. Before, and of
-torchvision's public file of 2017: five pickles after each other (magic number, protocol version,
-system, the object, keys of the storages), then each storage as its number of elements (int64) and
-its elements. Source: torch/serialization.py.
+There are two formats. Since PyTorch 1.6 a file is a zip with `data.pkl` and one member `data/KEY`
+for each storage. Older files, such as torchvision's public file of 2017, are a sequence of five
+pickles: magic number, protocol version, system, the object, and the keys of the storages. Each
+storage follows, as its number of elements (int64) and its elements. Source: torch/serialization.py.
 """
 
 import collections
@@ -13,7 +13,7 @@ import pickle
 import zipfile
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from jaxsfm.errors import UserError
 MAGIC = 0x1950A86A20F9469CFC6C
 PROTOCOL = 1001
 MAX_NAMES = 1 << 20
-"""Bytes of a pickle without its storages; VGG-16's has some thousand."""
+"""The most bytes of the pickle in a zip, without its storages; VGG-16's has some thousand."""
 DTYPES = {
     "FloatStorage": "<f4",
     "DoubleStorage": "<f8",
@@ -34,15 +34,17 @@ DTYPES = {
     "ByteStorage": "<u1",
     "BoolStorage": "?",
 }
-"""Of torch's storage classes; bfloat16, of which numpy has none, is refused."""
+"""The dtypes of torch's storage classes. bfloat16 is refused, because numpy does not have it."""
 
 
 class _StorageClass(NamedTuple):
+    """Stands for one of torch's storage classes."""
+
     dtype: np.dtype
 
 
 class _Storage(NamedTuple):
-    """Where a storage's elements will be."""
+    """A storage whose elements have not been read yet."""
 
     dtype: np.dtype
     key: str
@@ -50,44 +52,56 @@ class _Storage(NamedTuple):
 
 
 class _Tensor(NamedTuple):
-    """A view of a storage; offset, size and stride in elements."""
+    """A view of a storage. Offset, size and stride are counted in elements."""
 
     storage: _Storage
     offset: int
     size: tuple[int, ...]
     stride: tuple[int, ...]
 
-    def __setstate__(self, state: Any) -> None:
-        """Parameters of 2017 carry here whether they are trained; nothing to keep."""
+    def __setstate__(self, state: object) -> None:
+        """Ignore the state: in files of 2017 it says whether a parameter is trained."""
 
 
 class _Rebuild:
-    """What stands for torch's functions that make tensors.
+    """Stands for torch's functions that make tensors.
 
-    An instance without attributes, not a function: a pickle may set attributes of what it finds.
+    A pickle may set attributes of the objects that it finds. An instance without attributes does
+    not allow that; a function would.
     """
 
     __slots__ = ()
 
-    def __call__(self, storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> _Tensor:
+    def __call__(
+        self, storage: object, offset: object, size: object, stride: object, *_: object
+    ) -> _Tensor:
         if not isinstance(storage, _Storage):
             raise pickle.UnpicklingError("a tensor without a storage")
-        numbers = (offset, *size, *stride)
-        if len(size) != len(stride) or not all(type(v) is int and v >= 0 for v in numbers):
+        (start,), sizes, strides = _counts((offset,)), _counts(size), _counts(stride)
+        if len(sizes) != len(strides):
             raise pickle.UnpicklingError("a tensor of no possible shape")
-        return _Tensor(storage, offset, tuple(size), tuple(stride))
+        return _Tensor(storage, start, sizes, strides)
+
+
+def _counts(values: object) -> tuple[int, ...]:
+    """Whole numbers of at least 0, which a pickle has as a tuple or list."""
+    if not isinstance(values, tuple | list):
+        raise pickle.UnpicklingError("a tensor of no possible shape")
+    if not all(type(v) is int and v >= 0 for v in values):
+        raise pickle.UnpicklingError("a tensor of no possible shape")
+    return tuple(values)
 
 
 class _Parameter:
-    """What stands for torch's parameters: their tensor."""
+    """Stands for torch's parameters, which are their tensors here."""
 
     __slots__ = ()
 
-    def __call__(self, data: Any, *_: Any) -> Any:
+    def __call__(self, data: object, *_: object) -> object:
         return data
 
 
-ADMITTED: dict[tuple[str, str], Callable[..., Any]] = {
+ADMITTED: dict[tuple[str, str], Callable[..., object]] = {
     ("collections", "OrderedDict"): collections.OrderedDict,
     ("torch._utils", "_rebuild_tensor"): _Rebuild(),
     ("torch._utils", "_rebuild_tensor_v2"): _Rebuild(),
@@ -99,11 +113,11 @@ ADMITTED: dict[tuple[str, str], Callable[..., Any]] = {
 class _TensorUnpickler(pickle.Unpickler):
     """Admits dictionaries and tensors; any other name is refused before it is looked up."""
 
-    def __init__(self, file: Any) -> None:
+    def __init__(self, file: BinaryIO) -> None:
         super().__init__(file)
         self.storages: dict[str, _Storage] = {}
 
-    def find_class(self, module: str, name: str) -> Any:
+    def find_class(self, module: str, name: str) -> object:
         if module == "torch" and name in DTYPES:
             return _StorageClass(np.dtype(DTYPES[name]))
         try:
@@ -111,11 +125,13 @@ class _TensorUnpickler(pickle.Unpickler):
         except KeyError:
             raise pickle.UnpicklingError(f"{module}.{name} is not allowed") from None
 
-    def persistent_load(self, pid: Any) -> _Storage:
+    def persistent_load(self, pid: object) -> _Storage:
+        if not isinstance(pid, tuple):
+            raise pickle.UnpicklingError("a persistent id that is not a storage")
         kind, storage, key, _, elements, *view = pid
         sound = isinstance(storage, _StorageClass) and type(elements) is int and elements >= 0
         if kind != "storage" or not sound or any(view):
-            raise pickle.UnpicklingError("a persistent id that is no storage")
+            raise pickle.UnpicklingError("a persistent id that is not a storage")
         found = _Storage(storage.dtype, str(key), elements)
         if self.storages.setdefault(found.key, found) != found:
             raise pickle.UnpicklingError(f"storage {key} of two kinds")
@@ -123,10 +139,11 @@ class _TensorUnpickler(pickle.Unpickler):
 
 
 def read_tensors(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Those tensors of a state dict that are in it.
+    """Read those of the named tensors that are in the state dict of a file.
 
     Raises:
-      UserError: not such a file, damaged, or it names something that tensors do not need.
+      UserError: the file is not a PyTorch file, is damaged, or names something that tensors do not
+        need.
     """
     try:
         with path.open("rb") as file:
@@ -156,7 +173,8 @@ def _view(tensor: _Tensor, elements: np.ndarray) -> np.ndarray:
     )
 
 
-def _zipped(file: BinaryIO) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
+def _zipped(file: BinaryIO) -> tuple[object, Callable[[_Storage], np.ndarray]]:
+    """Read a file of PyTorch 1.6 or later: the object, and a reader of storages."""
     archive = zipfile.ZipFile(file)
     members = {name.partition("/")[2]: name for name in archive.namelist()}
 
@@ -179,7 +197,8 @@ def _zipped(file: BinaryIO) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
     return state, elements
 
 
-def _legacy(file: BinaryIO) -> tuple[Any, Callable[[_Storage], np.ndarray]]:
+def _legacy(file: BinaryIO) -> tuple[object, Callable[[_Storage], np.ndarray]]:
+    """Read a file of an older PyTorch: the object, and a reader of storages."""
     file.seek(0)
     if _TensorUnpickler(file).load() != MAGIC or _TensorUnpickler(file).load() != PROTOCOL:
         raise ValueError("not PyTorch's magic number and protocol")

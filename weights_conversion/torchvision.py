@@ -1,4 +1,4 @@
-"""torchvision's vgg16 and vgg19: RGB in [0, 1], ImageNet statistics, OIHW kernels."""
+"""Reads torchvision's vgg16 and vgg19: RGB in [0, 1], ImageNet statistics, OIHW kernels."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,8 +16,10 @@ CONVENTION = Convention(layout="OIHW", bgr=False, convolution=False)
 
 
 def numbered(blocks: Blocks) -> dict[str, str]:
-    """torchvision's modules -> layers: convolutions, rectifiers and poolings are numbered
-    together."""
+    """Map torchvision's modules to layers.
+
+    The modules are numbered; convolutions, rectifiers and poolings are counted together.
+    """
     modules, index = {}, 0
     for block, widths in enumerate(blocks, start=1):
         for conv in range(1, len(widths) + 1):
@@ -33,7 +35,7 @@ NAMES = [
     f"{module}.{part}" for module in {**NUMBERED, **NUMBERED_19} for part in ("weight", "bias")
 ]
 LAST_19 = f"{list(NUMBERED_19)[-1]}.weight"
-"""What only VGG-19 has."""
+"""A tensor that only VGG-19 has."""
 
 
 def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
@@ -47,13 +49,16 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
 def read_torchvision(
     path: Path, *, sha256: str, safe: bool, shapes: Mapping[str, tuple[int, int]] = LAYERS
 ) -> Source:
-    """A state dict of torchvision's names (features.0.weight, ..); the classifier is left out.
+    """Read a state dict with torchvision's names (features.0.weight, ..), without the classifier.
 
     Args:
-      safe: a safetensors file, not one of PyTorch's.
+      path: the file.
+      sha256: its hash.
+      safe: whether the file is a safetensors file and not one of PyTorch's.
+      shapes: input and output channels of each layer.
 
     Raises:
-      UserError: it is damaged, or neither a VGG-16 nor a VGG-19.
+      UserError: the file is damaged, or is neither a VGG-16 nor a VGG-19.
     """
     found = _read_safetensors(path) if safe else read_tensors(path, NAMES)
     deeper = LAST_19 in found

@@ -1,7 +1,7 @@
-"""A conversion against its source: every layer of an image, by two independent ways.
+"""Compares a conversion with its source: every layer of an image is computed in two ways.
 
-The one way is `weights_conversion.forward` on the source file in its own convention, float64; the
-other jaxsfm's network on the converted file, float32.
+One way is `weights_conversion.forward`, in float64, on the source file in its own convention. The
+other way is jaxsfm's network, in float32, on the converted file.
 """
 
 from collections.abc import Mapping
@@ -21,24 +21,25 @@ from weights_conversion.forward import layer_maps
 from weights_conversion.source import Source
 
 LIMIT = 1e-5
-"""Of a map's largest difference over its largest value; float32 ends near 1e-6."""
+"""The largest difference of a map that is accepted, relative to the map's largest value. Rounding
+to float32 leaves about 1e-6."""
 SIZE = (64, 80)
-"""Rows and columns of the image: not square, so that exchanged axes show."""
+"""Rows and columns of the image. It is not square, so that exchanged axes show."""
 
 
-class Compared(NamedTuple):
-    """One map."""
+class MapComparison(NamedTuple):
+    """How one map of the converted network differs from that of the source."""
 
     name: str
     shape: tuple[int, ...]
     largest: float
-    """Of the source's map, absolute."""
+    """The largest absolute value of the source's map."""
     difference: float
-    """Largest absolute difference over `largest`; infinite where the shapes differ."""
+    """The largest absolute difference over `largest`; infinite if the shapes differ."""
 
 
 def noise_image(size: tuple[int, int]) -> np.ndarray:
-    """Noise of every frequency, of other strength in every channel and corner, uint8 (h, w, 3)."""
+    """Make noise whose strength differs between channels and corners, uint8 (h, w, 3)."""
     rng = np.random.default_rng(0)
     colours = rng.uniform(0, 1, (*size, 3)) * (255.0, 160.0, 90.0)
     slope = np.linspace(0, 1, size[0])[:, None, None] * np.linspace(0, 1, size[1])[:, None]
@@ -46,7 +47,7 @@ def noise_image(size: tuple[int, int]) -> np.ndarray:
 
 
 def converted_maps(found: ConvertedWeights, rgb: np.ndarray) -> dict[str, np.ndarray]:
-    """The same maps as `layer_maps`, by jaxsfm's network."""
+    """Compute the maps of `layer_maps` with jaxsfm's network."""
     size = jnp.asarray([rgb.shape[:2]], jnp.int32)
     x = preprocess(jnp.asarray(rgb), found.preprocessing)[None]
     maps = {}
@@ -62,13 +63,13 @@ def converted_maps(found: ConvertedWeights, rgb: np.ndarray) -> dict[str, np.nda
     return {name: np.asarray(value[0]) for name, value in jax.device_get(maps).items()}
 
 
-def _compared(name: str, theirs: np.ndarray, ours: np.ndarray | None) -> Compared:
+def _compared(name: str, theirs: np.ndarray, ours: np.ndarray | None) -> MapComparison:
     largest = float(np.abs(theirs).max())
     if ours is None or ours.shape != theirs.shape:
-        return Compared(name, theirs.shape, largest, float("inf"))
-    # A map of zeros is compared by its absolute difference.
+        return MapComparison(name, theirs.shape, largest, float("inf"))
+    # For a map of zeros the difference is absolute.
     difference = float(np.abs(theirs - ours).max()) / (largest or 1.0)
-    return Compared(name, theirs.shape, largest, difference)
+    return MapComparison(name, theirs.shape, largest, difference)
 
 
 def compare(
@@ -77,16 +78,22 @@ def compare(
     *,
     size: tuple[int, int] = SIZE,
     shapes: Mapping[str, tuple[int, int]] | None = None,
-) -> list[Compared]:
-    """Every map of an image, and every extra array, of the source and of the converted file.
+) -> list[MapComparison]:
+    """Compare every map of an image, and every extra array, of the source and the converted file.
+
+    Args:
+      source: the weights of the source file.
+      converted: the converted file.
+      size: rows and columns of the image.
+      shapes: input and output channels of each layer; None takes those of the architecture.
 
     Raises:
-      UserError: the converted file cannot be read, or is of another network.
+      UserError: the converted file cannot be read, or holds another network.
     """
     rgb, found = noise_image(size), read_converted(converted, shapes=shapes)
     if found.architecture != source.architecture:
         raise UserError(
-            f"{converted}: of {found.architecture}, but {source.path} of {source.architecture}"
+            f"{converted}: holds a {found.architecture}, but {source.path} a {source.architecture}"
         )
     ours = converted_maps(found, rgb)
     rows = [_compared(name, theirs, ours[name]) for name, theirs in layer_maps(source, rgb)]
@@ -96,13 +103,13 @@ def compare(
     ]
 
 
-def agrees(rows: list[Compared]) -> bool:
+def agrees(rows: list[MapComparison]) -> bool:
     """Whether every difference is within `LIMIT`."""
     return all(row.difference <= LIMIT for row in rows)
 
 
-def table_lines(rows: list[Compared]) -> list[str]:
-    """One line a map."""
+def table_lines(rows: list[MapComparison]) -> list[str]:
+    """Return the comparison as a table with one line for each map."""
     head = f"{'map':24s} {'shape':>16s} {'largest value':>14s} {'difference / largest':>21s}"
     lines = [
         f"{row.name:24s} {' x '.join(map(str, row.shape)):>16s} {row.largest:14.6g} "

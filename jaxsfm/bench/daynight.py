@@ -1,28 +1,32 @@
 """`bench daynight`: the paper's night protocol (section 4.1).
 
-Each subset holds day photos and one night photo. It is reconstructed, the day cameras alone fix the
-similarity to the reference, and the night camera is judged: registered or not, and how far away.
+Each subset holds day photos and one night photo. It is reconstructed, and the model is aligned with
+the reference by a similarity from the day cameras alone. Then the night camera is judged: whether
+it is registered, and how far it is from its reference pose.
 """
 
 import functools
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.common import RUN_ABLATED, Keep, method_config
+from jaxsfm.bench.figures import collect
+from jaxsfm.bench.methods import RUN_ABLATED, method_config
 from jaxsfm.bench.night_matches import NightMatches, night_matches
+from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Scene, Subset
-from jaxsfm.colmap.database import VerificationOptions, drop_pairs
+from jaxsfm.colmap.database import drop_pairs
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures, image_capacity
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
@@ -30,33 +34,98 @@ from jaxsfm.io.versions import package_versions
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import match_pairs
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.reconstruction import reconstruct
 
 METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", "paper-learned", *RUN_ABLATED)
-"""paper-grid: the preset `paper` at cell centres. (The paper's own row without relocalization has
-corners of cells and 80 px.)"""
+"""paper-grid is the preset `paper` with keypoints at cell centres. (The paper's own row without
+relocalization has keypoints at the corners of cells and a threshold of 80 px.)"""
 FEATURES = 64
-"""Photos whose features are held, or as many as a subset has: 50 MB each at 1536 x 1024."""
+"""Photos whose features are held (at least all photos of a subset): 50 MB each at 1536 x 1024."""
 LIMITS = ((0.1, 1.0), (0.5, 10.0), (1.0, 10.0), (5.0, 10.0), (10.0, 10.0), (20.0, 10.0))
-"""Distance (the reference's units; metres for Strecha and Aachen) and degrees."""
+"""Limits of the position error (units of the reference, metres for Strecha and Aachen) and of the
+rotation error (degrees)."""
 PUBLISHED = (
     "published (Widya et al. 2018, Aachen, 98 subsets of 20 day + 1 night): registered night / day "
     "DoG + RootSIFT 48 / 1910, dense without relocalization 95 / 1924, with 96 / 1944"
 )
 
 
-class Made(NamedTuple):
-    """What a method made of one subset."""
+class SubsetModel(NamedTuple):
+    """A method's reconstruction of one subset."""
 
     poses: Poses
-    """Of the best model."""
+    """The poses of the largest model."""
     matches: NightMatches | None
 
 
-def _rootsift_models(scene: Scene, scratch: Path, seed: int, threads: int) -> list[Made]:
-    """Per subset: features and matches of all photos once, then what a subset has of them."""
+class SubsetRow(TypedDict):
+    """The figures of one subset."""
+
+    night: str
+    """The name of the night photo."""
+    registered: bool
+    has_truth: bool
+    """Whether the night photo has a reference pose."""
+    day_registered: int
+    day_images: int
+    matches: NotRequired[int]
+    correct: NotRequired[int]
+    not_evaluated: NotRequired[str]
+    position: NotRequired[float]
+    rotation_deg: NotRequired[float]
+
+
+class Summary(TypedDict):
+    """The figures of several subsets."""
+
+    nights: int
+    night_registered: int
+    day_images: int
+    day_registered: int
+    matches: int | None
+    correct: int | None
+    within: dict[str, float] | None
+    not_evaluated: int
+    sorted_positions: list[float]
+    median_rotation_deg: float | None
+
+
+class DayNightRow(Summary):
+    """The figures of one scene and one method."""
+
+    scene: str
+    synthetic: bool
+    severity: float | None
+    method: str
+    seconds: float
+    subsets: list[SubsetRow]
+
+
+class DayNightFigures(TypedDict):
+    """The figures of the benchmark, as JSON."""
+
+    benchmark: str
+    versions: dict[str, str]
+    seed: int
+    denoise: bool
+    jpeg: bool
+    rows: list[DayNightRow]
+    totals: dict[str, Summary]
+    published: str
+
+
+def _map_options(scene: Scene, options: DayNightOptions) -> MapOptions:
+    return MapOptions(
+        refine_intrinsics=scene.camera is None, seed=options.seed, threads=options.threads
+    )
+
+
+def _rootsift_models(scene: Scene, scratch: Path, options: DayNightOptions) -> list[SubsetModel]:
+    """A model of each subset from COLMAP's own features.
+
+    Features and matches of all photos are computed once; each subset takes its part of them.
+    """
     database = scratch / "all.db"
     images = [scene.images[name] for name in sorted(scene.images)]
     blanks = any(" " in name for name in scene.images)  # COLMAP's pair lists cannot hold them
@@ -66,11 +135,10 @@ def _rootsift_models(scene: Scene, scratch: Path, seed: int, threads: int) -> li
         scene.folder,
         images,
         scene.camera,
-        VerificationOptions(seed=seed, threads=threads),
+        VerificationOptions(seed=options.seed, threads=options.threads),
         pairs=None if blanks else sorted(pairs),
     )
     every = read_two_views(database)
-    options = MapOptions(refine_intrinsics=scene.camera is None, seed=seed, threads=threads)
     models = []
     for subset in scene.subsets:
         part = scratch / "part.db"
@@ -78,23 +146,21 @@ def _rootsift_models(scene: Scene, scratch: Path, seed: int, threads: int) -> li
         names = {*subset.day, subset.night}
         kept = {pair: view for pair, view in every.items() if names.issuperset(pair)}
         drop_pairs(part, every.keys() - kept.keys())
-        found, _ = build_models(part, kept, options)
+        found, _ = build_models(part, kept, _map_options(scene, options))
         poses = model_poses(found[0]) if found else {}
-        models.append(Made(poses, night_matches(part, scene, subset)))
+        models.append(SubsetModel(poses, night_matches(part, scene, subset)))
     return models
 
 
 def _dense_models(
-    scene: Scene,
-    scratch: Path,
-    method: str,
-    seed: int,
-    threads: int,
-    network: WeightsChoice = USUAL_WEIGHTS,
-) -> list[Made]:
-    """Per subset; a photo's features and a pair's matches are computed once."""
+    scene: Scene, scratch: Path, method: str, options: DayNightOptions
+) -> list[SubsetModel]:
+    """A model of each subset by one of our methods.
+
+    A photo's features and a pair's matches are computed once for all subsets.
+    """
     config = method_config(method)
-    weights = chosen_weights(network, config.backbone)
+    weights = chosen_weights(options.network, config.backbone)
     largest = max(len(subset.day) + 1 for subset in scene.subsets)
 
     @functools.lru_cache(maxsize=max(FEATURES, largest))
@@ -110,12 +176,11 @@ def _dense_models(
         for pair in exhaustive_pairs([*subset.day, subset.night])
     }
     results: dict[Pair, PairResult] = {}
-    options = MapOptions(refine_intrinsics=scene.camera is None, seed=seed, threads=threads)
     models = []
     for k, subset in enumerate(scene.subsets):
         pairs = exhaustive_pairs([*subset.day, subset.night])
         missing = [pair for pair in pairs if pair not in results]
-        for result in match_pairs(features, capacities, missing, config=config, seed=seed):
+        for result in match_pairs(features, capacities, missing, config=config, seed=options.seed):
             results[result.pair] = result
         made = reconstruct(
             [scene.images[name] for name in sorted({*subset.day, subset.night})],
@@ -123,20 +188,19 @@ def _dense_models(
             scratch / "part.db",
             config=config,
             intrinsics=scene.camera,
-            options=options,
+            options=_map_options(scene, options),
         )
         poses = model_poses(made.models[0]) if made.models else {}
-        models.append(Made(poses, night_matches(scratch / "part.db", scene, subset)))
+        models.append(SubsetModel(poses, night_matches(scratch / "part.db", scene, subset)))
         results = {pair: result for pair, result in results.items() if last_use[pair] > k}
     return models
 
 
-def judge(made: Made, subset: Subset, truth: Poses) -> dict[str, Any]:
-    """One subset's figures: day cameras registered, the night photo's matches, its camera's
-    errors or why there are none."""
+def judge(made: SubsetModel, subset: Subset, truth: Poses) -> SubsetRow:
+    """Count a subset's registered cameras and matches, and measure the night camera's errors."""
     poses = made.poses
     day = [name for name in subset.day if name in poses]
-    row: dict[str, Any] = {
+    row: SubsetRow = {
         "night": subset.night,
         "registered": subset.night in poses,
         "has_truth": subset.night in truth,
@@ -144,74 +208,57 @@ def judge(made: Made, subset: Subset, truth: Poses) -> dict[str, Any]:
         "day_images": len(subset.day),
     }
     if made.matches is not None:
-        row |= {"matches": made.matches.number, "correct": made.matches.correct}
+        row["matches"], row["correct"] = made.matches.number, made.matches.correct
     if not row["registered"] or subset.night not in truth:
         return row
     known = {name: truth[name] for name in (*subset.day, subset.night) if name in truth}
     try:
         errors = evaluate(poses, known, align_on=[name for name in day if name in known])
-    except UserError as error:  # too few day cameras, or on one line
-        return row | {"not_evaluated": str(error)}
+    except UserError as error:  # too few day cameras, or all on one line
+        row["not_evaluated"] = str(error)
+        return row
     night = errors.images[subset.night]
-    return row | {"position": night.position, "rotation_deg": night.rotation_deg}
+    row["position"], row["rotation_deg"] = night.position, night.rotation_deg
+    return row
 
 
-def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Registered nights and days, share of the nights within each limit, the cumulative curve, the
-    nights' verified matches and how many of them are correct.
+def summary(rows: Sequence[SubsetRow]) -> Summary:
+    """The figures of several subsets together.
 
-    The share is of all nights with a reference pose, registered or not; None without any.
+    The share of nights within a limit is that of all nights with a reference pose, registered or
+    not. It is None if no night has a reference pose.
     """
-    judged = [row for row in rows if "position" in row]
-    counted = [row for row in rows if "correct" in row]
+    judged = [
+        (row["position"], row["rotation_deg"])
+        for row in rows
+        if "position" in row and "rotation_deg" in row
+    ]
+    matches = [row["matches"] for row in rows if "matches" in row]
+    correct = [row["correct"] for row in rows if "correct" in row]
     known = sum(row["has_truth"] for row in rows)
+    within = {
+        f"{d:g}; {deg:g} deg": sum(p <= d and r <= deg for p, r in judged) / known
+        for d, deg in LIMITS
+        if known
+    }
     return {
         "nights": len(rows),
         "night_registered": sum(row["registered"] for row in rows),
         "day_images": sum(row["day_images"] for row in rows),
         "day_registered": sum(row["day_registered"] for row in rows),
-        "matches": sum(row["matches"] for row in counted) if counted else None,
-        "correct": sum(row["correct"] for row in counted) if counted else None,
-        "within": {
-            f"{d:g}; {deg:g} deg": sum(
-                row["position"] <= d and row["rotation_deg"] <= deg for row in judged
-            )
-            / known
-            for d, deg in LIMITS
-        }
-        if known
-        else None,
+        "matches": sum(matches) if matches else None,
+        "correct": sum(correct) if correct else None,
+        "within": within or None,
         "not_evaluated": sum("not_evaluated" in row for row in rows),
-        "sorted_positions": sorted(row["position"] for row in judged),
-        "median_rotation_deg": float(np.median([row["rotation_deg"] for row in judged]))
-        if judged
-        else None,
+        "sorted_positions": sorted(position for position, _ in judged),
+        "median_rotation_deg": float(np.median([r for _, r in judged])) if judged else None,
     }
 
 
-def bench_daynight(
-    root: Path,
-    *,
-    sets: Sequence[str] | None = None,
-    methods: Sequence[str] = METHODS[:5],
-    severity: float = 2.0,
-    denoise: bool = True,
-    jpeg: bool = True,
-    seed: int = 0,
-    threads: int = -1,
-    network: WeightsChoice = USUAL_WEIGHTS,
-    progress: bool = False,
-    keep: Keep = lambda _: None,
-) -> dict[str, Any]:
-    """All methods on all subsets of all scenes; plain JSON.
-
-    Args:
-      root: see `jaxsfm.bench.scenes`.
-      severity, denoise, jpeg: of the synthetic night, for Strecha sets.
-      network: the files of its parameters.
-    """
-    scenes.check_severity(severity)
-    folders = scenes.find_scenes(root, sets)
+def bench_daynight(options: DayNightOptions) -> DayNightFigures:
+    """Run all methods on all subsets of all scenes (`jaxsfm.bench.scenes`)."""
+    methods = options.chosen_methods(METHODS)
+    folders = scenes.find_scenes(options.root, options.chosen_sets())
     ready: dict[str, Scene] = {}
     for name, folder in folders.items():  # all inputs are read before the first long run
         if scenes.is_strecha(folder):
@@ -220,53 +267,55 @@ def bench_daynight(
             ready[name] = scenes.aachen_scene(folder)
         else:
             ready[name] = scenes.simple_scene(folder)
-    rows: list[dict[str, Any]] = []
-    setting = {"seed": seed, "denoise": denoise, "jpeg": jpeg}
-    for name, folder in folders.items():
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
-            scratch = Path(temporary)
-            scene = ready.get(name) or scenes.synthetic_scene(
-                folder, scratch / "photos", severity=severity, **setting
-            )
-            for method in methods:
-                start = time.monotonic()
-                if method == "rootsift":
-                    models = _rootsift_models(scene, scratch, seed, threads)
-                else:
-                    models = _dense_models(scene, scratch, method, seed, threads, network)
-                subsets = [
-                    judge(each, subset, scene.truth)
-                    for each, subset in zip(models, scene.subsets, strict=True)
-                ]
-                rows.append(
-                    {
-                        "scene": name,
-                        "synthetic": scene.synthetic,
-                        "severity": severity if scene.synthetic else None,
-                        "method": method,
-                        "seconds": time.monotonic() - start,
-                        "subsets": subsets,
-                        **summary(subsets),
-                    }
+
+    def rows() -> Iterator[DayNightRow]:
+        for name, folder in folders.items():
+            with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
+                scratch = Path(temporary)
+                scene = ready.get(name) or scenes.synthetic_scene(
+                    folder, scratch / "photos", options
                 )
-                if progress:
-                    print(row_line(rows[-1]), flush=True)
-                keep(_result(rows, setting))
-    return _result(rows, setting)
+                for method in methods:
+                    yield _row(name, scene, method, scratch, options)
+
+    def figures(measured: list[DayNightRow]) -> DayNightFigures:
+        totals = {
+            method: summary([s for r in measured if r["method"] == method for s in r["subsets"]])
+            for method in dict.fromkeys(row["method"] for row in measured)
+        }
+        return {
+            "benchmark": "daynight",
+            "versions": package_versions(),
+            "seed": options.seed,
+            "denoise": options.denoise,
+            "jpeg": options.jpeg,
+            "rows": measured,
+            "totals": totals,
+            "published": PUBLISHED,
+        }
+
+    return collect(rows(), figures, line=row_line, json_file=options.json)
 
 
-def _result(rows: list[dict[str, Any]], setting: dict[str, Any]) -> dict[str, Any]:
-    totals = {
-        method: summary([s for row in rows if row["method"] == method for s in row["subsets"]])
-        for method in dict.fromkeys(row["method"] for row in rows)
-    }
+def _row(
+    name: str, scene: Scene, method: str, scratch: Path, options: DayNightOptions
+) -> DayNightRow:
+    start = time.monotonic()
+    if method == "rootsift":
+        models = _rootsift_models(scene, scratch, options)
+    else:
+        models = _dense_models(scene, scratch, method, options)
+    subsets = [
+        judge(each, subset, scene.truth) for each, subset in zip(models, scene.subsets, strict=True)
+    ]
     return {
-        "benchmark": "daynight",
-        "versions": package_versions(),
-        **setting,
-        "rows": rows,
-        "totals": totals,
-        "published": PUBLISHED,
+        "scene": name,
+        "synthetic": scene.synthetic,
+        "severity": options.severity if scene.synthetic else None,
+        "method": method,
+        "seconds": time.monotonic() - start,
+        "subsets": subsets,
+        **summary(subsets),
     }
 
 
@@ -277,7 +326,7 @@ HEADER = (
 )
 
 
-def _figures(row: dict[str, Any]) -> str:
+def _figures(row: Summary) -> str:
     shares = row["within"].values() if row["within"] else [None] * len(LIMITS)
     within = " ".join(f"{'-':>8s}" if share is None else f"{share:8.0%}" for share in shares)
     counts = ("-" if row[key] is None else str(row[key]) for key in ("correct", "matches"))
@@ -288,15 +337,14 @@ def _figures(row: dict[str, Any]) -> str:
     )
 
 
-def row_line(row: dict[str, Any]) -> str:
+def row_line(row: DayNightRow) -> str:
     """One line of the table."""
     kind = f" synthetic {row['severity']:g}" if row["synthetic"] else ""
     return f"{row['scene'] + kind:24s} {row['method']:9s} {_figures(row)} {row['seconds']:8.1f}"
 
 
-def table_lines(result: dict[str, Any]) -> list[str]:
-    """Nights and days registered, share of the nights within (distance; deg), correct ones of the
-    nights' matches."""
+def table_lines(result: DayNightFigures) -> list[str]:
+    """The table: registered nights and days, shares of the nights within the limits, matches."""
     lines = [HEADER, *(row_line(row) for row in result["rows"])]
     lines += [f"{'all':24s} {m:9s} {_figures(row)}" for m, row in result["totals"].items()]
     for row in result["rows"]:

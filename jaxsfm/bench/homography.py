@@ -1,65 +1,82 @@
 """`bench homography`: sequences with known homographies (Oxford affine, HPatches).
 
-Matching accuracy: the share of a method's matches within 1, 3, 5, 10 px of where the true
-homography puts them. Corner error: how far a homography estimated from the matches moves image 1's
-corners (mean of four), as the area under its cumulative curve up to 3, 5, 10 px.
+Two figures are measured. Matching accuracy is the share of a method's matches whose second point
+lies within 1, 3, 5 or 10 pixels of the place where the true homography puts the first one. The
+corner error is the distance between the corners of image 1 under the true homography and under one
+estimated from the matches, averaged over the four corners; it is summed up as the area under its
+cumulative curve up to 3, 5 and 10 pixels.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import cv2
 import numpy as np
 
-from jaxsfm.bench.common import (
-    Keep,
-    check_root,
-    choose_sets,
-    read_rows,
-    spread,
-    usable_image,
-)
-from jaxsfm.bench.matches import Matcher, pair_figures
+from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.inputs import check_root, choose_sets, read_rows, usable_image
+from jaxsfm.bench.matches import PAIR_METHODS, Matcher, Matches, PairFigures, pair_figures
+from jaxsfm.bench.options import HomographyOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import SUFFIXES, ImageFile
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.sfm.two_view import homography
 
 ACCURACY_PX = (1, 3, 5, 10)
 CORNER_PX = (3, 5, 10)
 TRUTH_NAME = re.compile(r"H_?1(?:to|_)(\d+)p?(?:\.xml|\.txt)?")
-"""H1to2p, H1to2p.xml (Oxford), H_1_2 (HPatches)."""
+"""File names of homographies: H1to2p and H1to2p.xml (Oxford), H_1_2 (HPatches)."""
 
 
 class KnownPair(NamedTuple):
-    """The first image of a sequence against another one."""
+    """The first image of a sequence and another one."""
 
     name: str
     image0: ImageFile
     image1: ImageFile
     h: np.ndarray
-    """float64 (3, 3): first image to the other, pixels."""
+    """float64 (3, 3): maps pixels of the first image to pixels of the other one."""
+
+
+class HomographyRow(TypedDict):
+    """The figures of one pair and one method."""
+
+    set: str
+    pair: str
+    method: str
+    matches: Spread
+    correct: dict[str, Spread]
+    """The number of matches within each of `ACCURACY_PX`."""
+    accuracy: dict[str, Spread]
+    """The share of matches within each of `ACCURACY_PX`."""
+    corner_error_px: list[float | None]
+    """For each seed; None where no homography was found."""
+    seconds: float
+
+
+Means = dict[str, dict[str, dict[str, float]]]
+"""The mean of each figure, by method and set."""
 
 
 def warp(h: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Points (n, 2) through a homography; what goes to infinity is nan or inf."""
+    """Map points (n, 2) by a homography; points at infinity become nan or inf."""
     moved = np.c_[xy, np.ones(len(xy))] @ h.T
     with np.errstate(divide="ignore", invalid="ignore"):
         return moved[:, :2] / moved[:, 2:]
 
 
 def match_errors(h: np.ndarray, xy0: np.ndarray, xy1: np.ndarray) -> np.ndarray:
-    """Distance of each match's second point from the first one's true place, pixels."""
+    """Distance in pixels of each match's second point from the true place of its first point."""
     error = np.linalg.norm(warp(h, xy0) - xy1, axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
 
 def corner_error(found: np.ndarray | None, truth: np.ndarray, size: tuple[int, int]) -> float:
-    """Mean distance of the four corners under the two homographies, pixels; inf without one.
+    """Mean distance in pixels between the four corners under the two homographies.
 
     Args:
+      found: the estimated homography; without one (None) the error is infinite.
       size: (width, height) of the first image.
     """
     if found is None:
@@ -71,7 +88,7 @@ def corner_error(found: np.ndarray | None, truth: np.ndarray, size: tuple[int, i
 
 
 def _finite(value: float) -> float | None:
-    """For JSON, which has no infinity."""
+    """The value, or None if it is infinite: JSON has no infinity."""
     return value if np.isfinite(value) else None
 
 
@@ -80,19 +97,19 @@ def _with_inf(errors: Sequence[float | None]) -> list[float]:
 
 
 def area_under_curve(errors: Sequence[float | None], limit: float) -> float:
-    """Area under the cumulative curve of the errors up to `limit`, as a share of the best.
+    """Area under the cumulative curve of the errors up to `limit`, divided by `limit`.
 
     Args:
-      errors: None where there was no estimate.
+      errors: None stands for an infinite error.
     """
     return float(np.maximum(0.0, 1.0 - np.asarray(_with_inf(errors)) / limit).mean())
 
 
 def read_homography(path: Path) -> np.ndarray:
-    """A 3 x 3 matrix as text or in OpenCV's XML.
+    """Read a 3 x 3 matrix, float64, from a text file or from OpenCV's XML.
 
     Raises:
-      UserError: it is neither.
+      UserError: the file holds neither, or the matrix is singular.
     """
     h = None
     try:
@@ -109,7 +126,7 @@ def read_homography(path: Path) -> np.ndarray:
 
 
 def read_sequence(folder: Path) -> list[KnownPair]:
-    """The pairs of a sequence; images are imgK.* or K.*.
+    """The pairs of a sequence, whose images are called imgK.* or K.*.
 
     Raises:
       UserError: an image or a homography is missing or damaged.
@@ -137,78 +154,57 @@ def read_sequence(folder: Path) -> list[KnownPair]:
     return [pairs[other] for other in sorted(pairs)]
 
 
-def bench_homography(
-    root: Path,
-    *,
-    sets: Sequence[str] | None = None,
-    methods: Sequence[str],
-    seeds: int = 5,
-    max_size: int | None = None,
-    network: WeightsChoice = USUAL_WEIGHTS,
-    progress: bool = False,
-    keep: Keep = lambda _: None,
-) -> dict[str, Any]:
-    """All methods on all sequences; plain JSON.
-
-    Args:
-      root: folder of sequences (SEQUENCE/img1.png, H1to2p; or SEQUENCE/1.ppm, H_1_2).
-      seeds: runs of each method with seeds 0, 1, ...
-      max_size: longer side of our working images, pixels; None: the preset's.
-      network: the files of its parameters.
-    """
-    check_root(root)
+def bench_homography(options: HomographyOptions) -> PairFigures[HomographyRow, Means]:
+    """Run all methods on all sequences."""
+    methods = options.chosen_methods(PAIR_METHODS)
+    check_root(options.root)
     found = {
         path.name: path
-        for path in root.iterdir()
+        for path in options.root.iterdir()
         if path.is_dir() and any(TRUTH_NAME.fullmatch(file.name) for file in path.iterdir())
     }
     if not found:
-        raise UserError(f"--root {root}: no sequences (SEQUENCE/H1to2p or H_1_2) in it")
-    sequences = {f.name: read_sequence(f) for f in choose_sets(found, sets, root)}
-    matcher = Matcher(network)
-    rows = []
-    for set_name, pairs in sequences.items():
-        for pair in pairs:
-            size = pair.image0.size
-            for method in methods:
-                runs = matcher.match(
-                    pair.image0, pair.image1, method, range(seeds), max_size=max_size
-                )
-                errors = [match_errors(pair.h, run.xy0, run.xy1) for run in runs]
-                rows.append(
-                    {
-                        "set": set_name,
-                        "pair": pair.name,
-                        "method": method,
-                        "matches": spread(len(error) for error in errors),
-                        "correct": {
-                            str(t): spread((error <= t).sum() for error in errors)
-                            for t in ACCURACY_PX
-                        },
-                        "accuracy": {
-                            str(t): spread(
-                                (error <= t).mean() if len(error) else 0.0 for error in errors
-                            )
-                            for t in ACCURACY_PX
-                        },
-                        "corner_error_px": [
-                            _finite(
-                                corner_error(homography(run.xy0, run.xy1, seed=seed), pair.h, size)
-                            )
-                            for seed, run in enumerate(runs)
-                        ],
-                        "seconds": float(np.median([run.seconds for run in runs])),
-                    }
-                )
-                if progress:
-                    print(row_line(rows[-1]), flush=True)
-                keep(pair_figures("homography", rows, means(rows), seeds, max_size))
-    return pair_figures("homography", rows, means(rows), seeds, max_size)
+        raise UserError(f"--root {options.root}: no sequences (SEQUENCE/H1to2p or H_1_2) in it")
+    folders = choose_sets(found, options.chosen_sets(), options.root)
+    sequences = {folder.name: read_sequence(folder) for folder in folders}
+    matcher = Matcher(options)
+
+    def rows() -> Iterator[HomographyRow]:
+        for name, pairs in sequences.items():
+            for pair in pairs:
+                for method in methods:
+                    runs = matcher.match(pair.image0, pair.image1, method)
+                    yield _row(name, pair, method, runs)
+
+    return collect(
+        rows(),
+        lambda measured: pair_figures("homography", measured, means(measured), options),
+        line=row_line,
+        json_file=options.json,
+    )
 
 
-def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Per method and set: matches, correct ones (3 px), accuracies, corner AUC."""
-    result: dict[str, dict[str, dict[str, float]]] = {}
+def _row(name: str, pair: KnownPair, method: str, runs: Sequence[Matches]) -> HomographyRow:
+    errors = [match_errors(pair.h, run.xy0, run.xy1) for run in runs]
+    found = [homography(run.xy0, run.xy1, seed=seed) for seed, run in enumerate(runs)]
+    return {
+        "set": name,
+        "pair": pair.name,
+        "method": method,
+        "matches": spread(len(error) for error in errors),
+        "correct": {str(t): spread((error <= t).sum() for error in errors) for t in ACCURACY_PX},
+        "accuracy": {
+            str(t): spread((error <= t).mean() if len(error) else 0.0 for error in errors)
+            for t in ACCURACY_PX
+        },
+        "corner_error_px": [_finite(corner_error(h, pair.h, pair.image0.size)) for h in found],
+        "seconds": float(np.median([run.seconds for run in runs])),
+    }
+
+
+def means(rows: Sequence[HomographyRow]) -> Means:
+    """By method and set: matches, correct ones (3 px), accuracies and areas of corner errors."""
+    result: Means = {}
     for row in rows:
         result.setdefault(row["method"], {}).setdefault(row["set"], {})
     for method, sets in result.items():
@@ -234,8 +230,8 @@ HEADER = (
 )
 
 
-def row_line(row: dict[str, Any]) -> str:
-    """One line of the table; the corner error is the median over the seeds."""
+def row_line(row: HomographyRow) -> str:
+    """One line of the table, with the median corner error over the seeds."""
     accuracy = " ".join(f"{row['accuracy'][str(t)]['mean']:7.3f}" for t in ACCURACY_PX)
     return (
         f"{row['pair']:20s} {row['method']:9s} {row['matches']['mean']:8.0f} "
@@ -244,8 +240,8 @@ def row_line(row: dict[str, Any]) -> str:
     )
 
 
-def table_lines(result: dict[str, Any]) -> list[str]:
-    """Accuracy per pair, and means over each sequence with the corner errors' AUC."""
+def table_lines(result: PairFigures[HomographyRow, Means]) -> list[str]:
+    """The table: accuracy by pair, then the means of each sequence and its areas under curves."""
     lines = [HEADER, *(row_line(row) for row in result["rows"])]
     for method, sets in result["means"].items():
         for name, m in sets.items():

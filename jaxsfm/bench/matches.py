@@ -1,17 +1,18 @@
-"""Matches of pairs of images by each method, for the benchmarks of two views."""
+"""Matches of image pairs by each method, for the benchmarks of two views."""
 
 import functools
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Generic, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
 
-from jaxsfm.bench.common import KEYPOINTS, PAIR_ABLATED, method_config
-from jaxsfm.colmap.database import VerificationOptions, read_matches
+from jaxsfm.bench.methods import KEYPOINTS, PAIR_ABLATED, method_config
+from jaxsfm.bench.options import PairOptions
+from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.config import BackboneName, Config
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
@@ -19,7 +20,6 @@ from jaxsfm.io.versions import package_versions
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import match_features
-from jaxsfm.options import WeightsChoice
 from jaxsfm.sfm.refine.pair_alignment import align
 
 PAIR_METHODS = (
@@ -31,53 +31,64 @@ PAIR_METHODS = (
     "robust",
     *PAIR_ABLATED,
 )
+"""The methods that the benchmarks of pairs know (`jaxsfm.bench.methods.method_config`).
+
+`rootsift` is COLMAP's own features and matcher with the ratio test, before any geometry. The others
+are verified by homographies, and aligned where the method does so, as `jaxsfm match` does.
+"""
 FEATURES = 8
-"""Features held: of two images, as four methods want them."""
+"""How many images' features are held: those of two images for each of four methods."""
+Row = TypeVar("Row")
+Means = TypeVar("Means")
 
 
 class Matches(NamedTuple):
-    """Matches of one pair by one method and seed."""
+    """The matches of one pair by one method with one seed."""
 
     xy0: np.ndarray
     """float64 (n, 2): original pixels, centre of the top-left pixel (0, 0)."""
     xy1: np.ndarray
     seconds: float
-    """Extraction of both images and matching; with a new image size, compilation too."""
+    """Time of extracting both images and of matching; the first image of a size also compiles."""
+
+
+class PairFigures(TypedDict, Generic[Row, Means]):
+    """The figures of a benchmark of pairs, as JSON."""
+
+    benchmark: str
+    versions: dict[str, str]
+    seeds: int
+    max_size: int | None
+    rows: list[Row]
+    means: Means
 
 
 class Matcher:
-    """Matches pairs; an image's features are computed once for all pairs and methods that share
-    them."""
+    """Matches pairs of images.
 
-    def __init__(self, network: WeightsChoice) -> None:
-        self._network = network
+    The features of an image are computed once for all its pairs and all methods that use the same
+    features.
+    """
+
+    def __init__(self, options: PairOptions) -> None:
+        self._options = options
         self._weights: dict[BackboneName, Weights] = {}
         self._extract = functools.lru_cache(maxsize=FEATURES)(self._timed_features)
 
-    def match(
-        self,
-        image0: ImageFile,
-        image1: ImageFile,
-        method: str,
-        seeds: Sequence[int],
-        *,
-        max_size: int | None,
-    ) -> list[Matches]:
-        """One result per seed.
+    def match(self, image0: ImageFile, image1: ImageFile, method: str) -> list[Matches]:
+        """The matches of a pair for each seed.
 
         Args:
           image0, image1: two images of one folder, called by their files' names.
-          method: of PAIR_METHODS. rootsift: COLMAP's own features and its matcher with ratio test,
-            before any geometry; the others verified by homographies, and aligned where the method
-            does, as `jaxsfm match` gives them.
-          max_size: longer side of the working images, pixels; None: the preset's.
+          method: one of `PAIR_METHODS`.
         """
+        seeds = range(self._options.seeds)
         if method == "rootsift":
             start = time.monotonic()
             xy0, xy1 = _rootsift(image0, image1)
             taken = time.monotonic() - start
-            return [Matches(xy0, xy1, taken)] * len(seeds)  # nothing random in it
-        config = method_config(method, max_size=max_size)
+            return [Matches(xy0, xy1, taken)] * len(seeds)  # nothing is random
+        config = method_config(method, max_size=self._options.max_size)
         (features0, seconds0), (features1, seconds1) = (
             self._extract(image, config.extraction()) for image in (image0, image1)
         )
@@ -92,7 +103,7 @@ class Matcher:
 
     def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
         if config.backbone not in self._weights:
-            self._weights[config.backbone] = chosen_weights(self._network, config.backbone)
+            self._weights[config.backbone] = chosen_weights(self._options.network, config.backbone)
         start = time.monotonic()
         features = image_features(self._weights[config.backbone], image, config=config)
         return features, time.monotonic() - start
@@ -101,7 +112,7 @@ class Matcher:
 def _rootsift(image0: ImageFile, image1: ImageFile) -> tuple[np.ndarray, np.ndarray]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         database = Path(scratch) / "database.db"
-        # Below eight there is no fundamental matrix.
+        # A fundamental matrix needs eight matches.
         write_rootsift_database(
             database,
             image0.path.parent,
@@ -113,18 +124,14 @@ def _rootsift(image0: ImageFile, image1: ImageFile) -> tuple[np.ndarray, np.ndar
 
 
 def pair_figures(
-    benchmark: str,
-    rows: list[dict[str, Any]],
-    means: dict[str, Any],
-    seeds: int,
-    max_size: int | None,
-) -> dict[str, Any]:
-    """The plain JSON of a benchmark of pairs."""
+    benchmark: str, rows: list[Row], means: Means, options: PairOptions
+) -> PairFigures[Row, Means]:
+    """The figures of a benchmark of pairs, with what they were measured by."""
     return {
         "benchmark": benchmark,
         "versions": package_versions(),
-        "seeds": seeds,
-        "max_size": max_size,
+        "seeds": options.seeds,
+        "max_size": options.max_size,
         "rows": rows,
         "means": means,
     }

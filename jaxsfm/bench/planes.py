@@ -1,21 +1,24 @@
 """`bench planes`: several homographies fitted to given points (AdelaideRMF, Wong et al. 2011).
 
-Points are labelled by hand: outlier, or one of the scene's planes. Misclassification is the share
-of points with a wrong label under the best assignment of found planes to true ones.
+Each point is labelled by hand as an outlier or as a point of one of the scene's planes. The figure
+is the misclassification: the share of points with a wrong label when the planes that were found are
+assigned to the true planes in the best way.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxsfm.bench.common import Keep, check_root, choose_sets, read_rows, spread
-from jaxsfm.config import Config, preset
+from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.inputs import check_root, choose_sets, read_rows
+from jaxsfm.bench.options import PlanesOptions
+from jaxsfm.config import PRESETS, Config, preset
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.errors import UserError
 from jaxsfm.io.versions import package_versions
@@ -23,28 +26,52 @@ from jaxsfm.matching.pair_matching import thresholds
 
 SUFFIX = "_pts.txt"
 POINT_PX = 2.0
-"""Inlier radius: detected points lie within a pixel, cells of dense features within ten."""
-LEAST_POINTS = 20
-"""Of a plane: five minimal samples."""
+"""Inlier threshold. Detected points are exact to a pixel, cells of dense features to ten pixels."""
+MIN_POINTS = 20
+"""The smallest plane, in points: five minimal samples."""
 MAX_PLANES = 12
 ROUNDS = 20
 _peel = jax.jit(peel_planes, static_argnames=("shape",))
 
 
 class LabelledPoints(NamedTuple):
-    """One pair's points."""
+    """The labelled matches of one pair of images."""
 
     xy0: np.ndarray
+    """float64 (n, 2), pixels."""
     xy1: np.ndarray
+    """float64 (n, 2), pixels."""
     label: np.ndarray
-    """int (n,): -1 for outliers, planes from 0."""
+    """int (n,): the plane of each match, from 0; -1 for outliers."""
+
+
+class PlanesRow(TypedDict):
+    """The figures of one file and one method."""
+
+    set: str
+    method: str
+    points: int
+    planes: int
+    """The number of true planes."""
+    found: Spread
+    """The number of planes that were found."""
+    misclassified: Spread
+
+
+class PlanesFigures(TypedDict):
+    """The figures of the benchmark, as JSON."""
+
+    benchmark: str
+    versions: dict[str, str]
+    seeds: int
+    rows: list[PlanesRow]
 
 
 def read_points(path: Path) -> LabelledPoints:
-    """Rows of x1 y1 1 x2 y2 1 label (0: outlier).
+    """Read rows of x1 y1 1 x2 y2 1 label, where label 0 marks an outlier.
 
     Raises:
-      UserError: something else is in the file.
+      UserError: the file holds anything else.
     """
     rows = read_rows(path, 7, "rows of x1 y1 1 x2 y2 1 label")
     if (rows[:, 6] < 0).any():
@@ -53,10 +80,10 @@ def read_points(path: Path) -> LabelledPoints:
 
 
 def misclassification(found: np.ndarray, truth: np.ndarray) -> float:
-    """Share of points with a wrong label, under the best one-to-one assignment of the planes.
+    """The share of points with a wrong label, under the best one-to-one assignment of planes.
 
     Args:
-      found, truth: int (n,); -1 for outliers.
+      found, truth: int (n,), the plane of each point; -1 for outliers.
     """
     table = np.zeros((found.max(initial=-1) + 1, truth.max(initial=-1) + 1), int)
     both = (found >= 0) & (truth >= 0)
@@ -67,17 +94,20 @@ def misclassification(found: np.ndarray, truth: np.ndarray) -> float:
 
 
 def method_for_points(method: str) -> Config:
-    """A preset made for given points: `paper` keeps its five planes of 10 px, the others fit
-    points, as many planes as there are, and let them compete."""
+    """A preset, adapted to points instead of cells.
+
+    `paper` keeps its constants (five planes, 10 pixels). The others have the threshold of points,
+    find up to `MAX_PLANES` planes and let planes compete for points.
+    """
     config = preset(method)
     if method == "paper":
         return config
     shape = dataclasses.replace(config.pair, max_planes=MAX_PLANES, plane_rounds=ROUNDS)
-    return dataclasses.replace(config, threshold_px=POINT_PX, min_inliers=LEAST_POINTS, pair=shape)
+    return dataclasses.replace(config, threshold_px=POINT_PX, min_inliers=MIN_POINTS, pair=shape)
 
 
 def fit_planes(points: LabelledPoints, config: Config, *, seed: int) -> np.ndarray:
-    """The plane of each point, int (n,), -1 for none: our peeling on the given points."""
+    """Fit planes by sequential RANSAC; returns the plane of each point, int (n,), -1 for none."""
     found = _peel(
         jax.random.key(seed),
         jnp.asarray(points.xy0, jnp.float32),
@@ -89,36 +119,25 @@ def fit_planes(points: LabelledPoints, config: Config, *, seed: int) -> np.ndarr
     return np.asarray(found.plane)
 
 
-def bench_planes(
-    root: Path,
-    *,
-    sets: Sequence[str] | None = None,
-    methods: Sequence[str],
-    seeds: int = 5,
-    progress: bool = False,
-    keep: Keep = lambda _: None,
-) -> dict[str, Any]:
-    """Presets' plane fitting on all files NAME_pts.txt; plain JSON.
-
-    Args:
-      root: folder of the files.
-      methods: presets.
-      seeds: runs with seeds 0, 1, ...
-    """
+def bench_planes(options: PlanesOptions) -> PlanesFigures:
+    """Fit planes with all presets to all files NAME_pts.txt."""
+    methods = options.chosen_methods(tuple(PRESETS))
+    root = options.root
     check_root(root)
     found = {path.name.removesuffix(SUFFIX): path for path in root.glob(f"*{SUFFIX}")}
     if not found:
         raise UserError(f"--root {root}: no points (NAME{SUFFIX}) in it")
     inputs = {
-        path.name.removesuffix(SUFFIX): read_points(path) for path in choose_sets(found, sets, root)
+        path.name.removesuffix(SUFFIX): read_points(path)
+        for path in choose_sets(found, options.chosen_sets(), root)
     }
-    rows = []
-    for name, points in inputs.items():
-        for method in methods:
-            config = method_for_points(method)
-            labels = [fit_planes(points, config, seed=seed) for seed in range(seeds)]
-            rows.append(
-                {
+
+    def rows() -> Iterator[PlanesRow]:
+        for name, points in inputs.items():
+            for method in methods:
+                config = method_for_points(method)
+                labels = [fit_planes(points, config, seed=seed) for seed in range(options.seeds)]
+                yield {
                     "set": name,
                     "method": method,
                     "points": len(points.label),
@@ -126,18 +145,19 @@ def bench_planes(
                     "found": spread(len(set(label[label >= 0])) for label in labels),
                     "misclassified": spread(misclassification(x, points.label) for x in labels),
                 }
-            )
-            if progress:
-                print(row_line(rows[-1]), flush=True)
-            keep(_result(rows, seeds))
-    return _result(rows, seeds)
+
+    def figures(measured: list[PlanesRow]) -> PlanesFigures:
+        return {
+            "benchmark": "planes",
+            "versions": package_versions(),
+            "seeds": options.seeds,
+            "rows": measured,
+        }
+
+    return collect(rows(), figures, line=row_line, json_file=options.json)
 
 
-def _result(rows: list[dict[str, Any]], seeds: int) -> dict[str, Any]:
-    return {"benchmark": "planes", "versions": package_versions(), "seeds": seeds, "rows": rows}
-
-
-def row_line(row: dict[str, Any]) -> str:
+def row_line(row: PlanesRow) -> str:
     """One line of the table."""
     wrong = row["misclassified"]
     return (
@@ -146,8 +166,8 @@ def row_line(row: dict[str, Any]) -> str:
     )
 
 
-def table_lines(result: dict[str, Any]) -> list[str]:
-    """Misclassification per file: mean, least and largest over the seeds."""
+def table_lines(result: PlanesFigures) -> list[str]:
+    """The table: misclassification by file, as mean, smallest and largest over the seeds."""
     head = (
         f"{'points':20s} {'method':9s} {'number':>7s} {'planes':>7s} {'found':>7s} "
         f"{'wrong':>8s} {'min':>7s} {'max':>7s}"

@@ -1,11 +1,12 @@
 """Day and night scenes for `bench daynight`, from three layouts.
 
-* Strecha sets, each image turned to a synthetic night once: exact ground truth for any severity.
-* Simple: SCENE/day/*, SCENE/night/*, SCENE/reference (Strecha .camera files or a COLMAP model whose
-  image names, or their stems, are those of the photos), and, if all photos share a known camera,
-  SCENE/intrinsics.txt with MODEL:p1,p2,.. (COLMAP's pixels) or a 3 x 3 matrix
-* Aachen Day-Night: images_upright/, 3D-models/**/ (a COLMAP model), image_pairs_to_match.txt, whose
-  lines pair each night photo with its day photos.
+* Strecha sets: each image is turned to a synthetic night in its turn, so the ground truth is exact
+  for any severity.
+* Simple scenes: SCENE/day/*, SCENE/night/* and SCENE/reference (Strecha .camera files, or a COLMAP
+  model whose image names, or their stems, are those of the photos). If all photos share a known
+  camera, SCENE/intrinsics.txt holds it as MODEL:p1,p2,.. (COLMAP's pixels) or as a 3 x 3 matrix.
+* Aachen Day-Night: images_upright/, 3D-models/**/ (a COLMAP model) and image_pairs_to_match.txt,
+  whose lines pair each night photo with its day photos.
 """
 
 import shutil
@@ -15,10 +16,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import numpy as np
 
-from jaxsfm.bench.common import check_root, choose_sets, usable_image
+from jaxsfm.bench.inputs import check_root, choose_sets, usable_image
 from jaxsfm.bench.night import synthetic_night
+from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.strecha import strecha_intrinsics
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import Poses, read_poses
@@ -31,32 +32,30 @@ NIGHT = "night/"
 
 
 class Subset(NamedTuple):
-    """Day photos and one night photo: one reconstruction."""
+    """The photos of one reconstruction: day photos and one night photo."""
 
     day: list[str]
     night: str
 
 
 class Scene(NamedTuple):
-    """Subsets that share photos."""
+    """Photos of one place, and the subsets of them that are reconstructed."""
 
     folder: Path
-    """Photos' names are paths below it."""
+    """The photos' folder; their names are paths below it."""
     images: dict[str, ImageFile]
     subsets: list[Subset]
     truth: Poses
     """Reference poses by the photos' names; a photo without one is only counted as registered."""
     camera: Intrinsics | None
-    """Of all photos; None: guessed and refined."""
+    """The camera of all photos; None if it is guessed and refined."""
     synthetic: bool
 
 
-def synthetic_scene(
-    folder: Path, target: Path, *, severity: float, seed: int, denoise: bool, jpeg: bool
-) -> Scene:
-    """A Strecha set with every image also at night (`night/NAME.png`), written below `target`.
+def synthetic_scene(folder: Path, target: Path, options: DayNightOptions) -> Scene:
+    """Write a Strecha set below `target`, with each image also at night (`night/NAME.png`).
 
-    Subset k: image k at night, all others by day.
+    Subset k holds image k at night and all others by day.
     """
     poses = read_poses(folder, option="--root")
     day = [name for name in find_images(folder / "images") if "/" not in name]
@@ -67,9 +66,14 @@ def synthetic_scene(
         shutil.copyfile(folder / "images" / name, target / name)
         image = inspect_image(target / name, name=name)
         rgb = read_image(image, max_size=max(image.size)).rgb
-        # A scene's nights differ, and do not depend on which other sets are run.
-        own = (seed + zlib.crc32(f"{folder.name}/{name}".encode())) % 2**32
-        dark = synthetic_night(rgb, severity=severity, seed=own, denoise=denoise, jpeg=jpeg)
+        # The nights of a scene differ, and they do not depend on which other sets are run.
+        dark = synthetic_night(
+            rgb,
+            severity=options.severity,
+            seed=(options.seed + zlib.crc32(f"{folder.name}/{name}".encode())) % 2**32,
+            denoise=options.denoise,
+            jpeg=options.jpeg,
+        )
         night = f"{NIGHT}{Path(name).stem}.png"
         cv2.imwrite(str(target / night), cv2.cvtColor(dark, cv2.COLOR_RGB2BGR))
         images[name], images[night] = image, inspect_image(target / night, name=night)
@@ -81,7 +85,7 @@ def synthetic_scene(
 
 
 def _known_camera(path: Path, images: dict[str, ImageFile]) -> Intrinsics | None:
-    """From MODEL:p1,p2,.. or a 3 x 3 matrix in a file; None without the file."""
+    """Read a camera from a file with MODEL:p1,p2,.. or a 3 x 3 matrix; None without the file."""
     if not path.is_file():
         return None
     try:
@@ -95,7 +99,7 @@ def _known_camera(path: Path, images: dict[str, ImageFile]) -> Intrinsics | None
 
 
 def simple_scene(folder: Path) -> Scene:
-    """SCENE/{day,night,reference}: every night photo with all day photos."""
+    """Read a simple scene; each subset is one night photo with all day photos."""
     names = {
         part: [f"{part}/{name}" for name in find_images(folder / part)] for part in ("day", "night")
     }
@@ -122,7 +126,7 @@ def _reference(scene: str, images: dict[str, ImageFile], poses: Poses) -> Poses:
 
 
 def aachen_scene(root: Path) -> Scene:
-    """Aachen Day-Night in its public layout: each night photo with the day photos paired with it.
+    """Read Aachen Day-Night; each subset is one night photo with the day photos paired with it.
 
     Cameras are guessed from EXIF and refined.
     """
@@ -156,10 +160,13 @@ def aachen_scene(root: Path) -> Scene:
 
 
 def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
-    """Folders of the scenes below `root`, by name; one for Aachen.
+    """The folders of the scenes below `root` by name. Aachen Day-Night is one scene.
+
+    Args:
+      names: the names of the scenes; None stands for all.
 
     Raises:
-      UserError: none there, or one of `names` is not.
+      UserError: there is no scene, or none with one of the names.
     """
     check_root(root)
     root = root.resolve()  # so that it has a name
@@ -177,7 +184,7 @@ def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
 
 
 def check_strecha(folder: Path) -> None:
-    """Raises UserError, before the first long run, for what `synthetic_scene` cannot use."""
+    """Raise UserError if `synthetic_scene` cannot use the set."""
     strecha_intrinsics(folder)
     read_poses(folder, option="--root")
     for name in find_images(folder / "images"):
@@ -185,11 +192,5 @@ def check_strecha(folder: Path) -> None:
 
 
 def is_strecha(folder: Path) -> bool:
-    """Whether nights have to be made."""
+    """Whether the folder is a Strecha set, for which nights are made."""
     return (folder / "images" / "K.txt").is_file()
-
-
-def check_severity(severity: float) -> None:
-    """Raises UserError unless it is a finite number of at least 0."""
-    if not (np.isfinite(severity) and severity >= 0):
-        raise UserError(f"--severity must be at least 0; got {severity}")

@@ -5,53 +5,104 @@ import json
 import shutil
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 
-from jaxsfm.bench.common import (
-    RUN_ABLATED,
-    Keep,
-    check_root,
-    choose_sets,
-    method_config,
-    read_rows,
-)
-from jaxsfm.colmap.database import VerificationOptions
+from jaxsfm.bench.figures import collect
+from jaxsfm.bench.inputs import check_root, choose_sets, read_rows
+from jaxsfm.bench.methods import RUN_ABLATED, method_config
+from jaxsfm.bench.options import StrechaOptions
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.models import write_models
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.versions import package_versions
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
-from jaxsfm.report.run_results import ModelRow
-from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.reconstruct import reconstruct_folder
-from jaxsfm.runs.report import model_row
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.evaluation import evaluate
 
 METHODS = ("rootsift", "grid", "reloc", "learned", "default", "robust", *RUN_ABLATED)
-USUAL = ("rootsift", "grid", "reloc", "default")
+BASELINE = "rootsift"
+"""The method that the others are compared with."""
 PUBLISHED = (
     "published (Widya et al. 2018, mean over six full-size sets): "
     "DoG + RootSIFT 0.17 m, 0.90 deg; dense + relocalization 0.59 m, 2.27 deg"
 )
 
 
+class StrechaSet(NamedTuple):
+    """A set of photos with ground truth."""
+
+    folder: Path
+    camera: str
+    """The sets' camera as `MODEL:params`, in COLMAP's pixels."""
+    focal: float
+    """Its focal length, pixels."""
+    truth: Poses
+
+
+class StrechaRow(TypedDict):
+    """The figures of one set and one method."""
+
+    set: str
+    method: str
+    registered: int
+    points: NotRequired[int]
+    observations: NotRequired[int]
+    track_length: NotRequired[float]
+    reprojection_error_px: NotRequired[float]
+    stages: NotRequired[dict[str, float]]
+    """Seconds of each stage of one of our methods."""
+    seconds: float
+    images: int
+    """The number of reference poses."""
+    position: NotRequired[dict[str, float]]
+    """Mean, median and largest position error, units of the reference."""
+    rotation_deg: NotRequired[dict[str, float]]
+    focal_error_percent: NotRequired[float]
+    """The largest error of a focal length."""
+    not_evaluated: NotRequired[str]
+    """Why a model could not be compared with the reference."""
+
+
+class MethodRatios(TypedDict):
+    """Figures of a method divided by those of the baseline."""
+
+    sets: dict[str, dict[str, float]]
+    mean: dict[str, float]
+
+
+class StrechaFigures(TypedDict):
+    """The figures of the benchmark, as JSON."""
+
+    benchmark: str
+    versions: dict[str, str]
+    intrinsics: str
+    seed: int
+    rows: list[StrechaRow]
+    ratios: dict[str, MethodRatios]
+    published: str
+
+
 def strecha_intrinsics(folder: Path) -> tuple[str, float]:
     """A set's camera as `MODEL:params`, and its focal length in pixels.
 
-    The sets' K counts pixels from the image's corner, as COLMAP does: it was halved with the
-    images, which is exact only there, and rotations agree better that way (docs/results.md).
+    The sets' K counts pixels from the image's corner, as COLMAP does: K was halved together with
+    the images, which is exact only for that convention, and rotations agree better with it
+    (docs/results.md).
+
+    Raises:
+      UserError: images/K.txt is missing or not a camera matrix.
     """
     path = folder / "images" / "K.txt"
     k = read_rows(path, 3, "a camera matrix (3 x 3)")
@@ -62,10 +113,13 @@ def strecha_intrinsics(folder: Path) -> tuple[str, float]:
 
 
 def find_sets(root: Path, names: Sequence[str] | None) -> list[Path]:
-    """Strecha folders (images/K.txt inside) below `root`, by name.
+    """The folders of the sets in `root` (those with images/K.txt) that are called `names`.
+
+    Args:
+      names: None stands for all sets, sorted by name.
 
     Raises:
-      UserError: none there, or one of `names` is not.
+      UserError: there is no set, or none with one of the names.
     """
     check_root(root)
     found = {path.parent.parent.name: path.parent.parent for path in root.glob("*/images/K.txt")}
@@ -74,23 +128,62 @@ def find_sets(root: Path, names: Sequence[str] | None) -> list[Path]:
     return choose_sets(found, names, root)
 
 
-def _row(set_name: str, method: str, model: ModelRow | None) -> dict[str, Any]:
-    row: dict[str, Any] = {"set": set_name, "method": method, "registered": 0}
-    if model is not None:
-        plain = to_json(dataclasses.replace(model, images=[]))
-        assert isinstance(plain, dict)
-        row |= {key: value for key, value in plain.items() if key != "images"}
+def _run_rootsift(each: StrechaSet, work: Path, options: StrechaOptions) -> StrechaRow:
+    """Reconstruct a set with COLMAP's own features; the model goes to `work`/sparse."""
+    work.mkdir(parents=True, exist_ok=True)
+    photos, database = each.folder / "images", work / "database.db"
+    images, _ = open_images(photos)
+    start = time.monotonic()
+    known = options.intrinsics == "known"
+    camera = parse_intrinsics(each.camera) if known else None
+    seed, threads = options.seed, options.threads
+    verification = VerificationOptions(seed=seed, threads=threads)
+    write_rootsift_database(database, photos, images, camera, verification)
+    mapping = MapOptions(refine_intrinsics=not known, seed=seed, threads=threads)
+    models, _ = build_models(database, read_two_views(database), mapping)
+    write_models(models, work / "sparse")
+    row = _row(each, "rootsift", work if models else None)
+    row["seconds"] = time.monotonic() - start
     return row
 
 
-def _finish(row: dict[str, Any], model_folder: Path, truth: Poses, focal: float) -> dict[str, Any]:
-    """Errors of a row's model against the ground truth, and of its focal lengths."""
-    row["images"] = len(truth)
-    if not (model_folder / "images.bin").is_file():
+def _run_method(each: StrechaSet, method: str, work: Path, options: StrechaOptions) -> StrechaRow:
+    """Reconstruct a set with one of our methods, in the work folder `work`."""
+    run = RunOptions(
+        intrinsics=each.camera if options.intrinsics == "known" else None,
+        network=options.network,
+        seed=options.seed,
+        threads=options.threads,
+        progress=True,
+    )
+    photos, config = each.folder / "images", method_config(method)
+    report = reconstruct_folder(photos, work, config=config, options=run)
+    row = _row(each, method, work if report.models else None)
+    stages = report.seconds
+    row["stages"] = stages | _matching_seconds(work, stages)
+    row["seconds"] = sum(row["stages"].values())
+    return row
+
+
+def _row(each: StrechaSet, method: str, work: Path | None) -> StrechaRow:
+    """The figures of the largest model in a work folder; None stands for no model."""
+    row: StrechaRow = {
+        "set": each.folder.name,
+        "method": method,
+        "registered": 0,
+        "seconds": 0.0,
+        "images": len(each.truth),
+    }
+    if work is None:
         return row
-    model = read_model(model_folder)
+    model = read_model(work / "sparse" / "0")
+    row["registered"] = model.num_reg_images()
+    row["points"] = model.num_points3D()
+    row["observations"] = model.compute_num_observations()
+    row["track_length"] = model.compute_mean_track_length()
+    row["reprojection_error_px"] = model.compute_mean_reprojection_error()
     try:
-        errors = evaluate(model_poses(model), truth)
+        errors = evaluate(model_poses(model), each.truth)
     except UserError as error:
         row["not_evaluated"] = str(error)
         return row
@@ -98,58 +191,16 @@ def _finish(row: dict[str, Any], model_folder: Path, truth: Poses, focal: float)
     focals = [
         model.cameras[model.image(i).camera_id].mean_focal_length() for i in model.reg_image_ids()
     ]
-    row["focal_error_percent"] = 100 * float(np.max(np.abs(np.asarray(focals) / focal - 1)))
+    error_of_focal = np.max(np.abs(np.asarray(focals) / each.focal - 1))
+    row["focal_error_percent"] = 100 * float(error_of_focal)
     return row
 
 
-def run_rootsift(
-    folder: Path, out: Path, intrinsics: str | None, *, seed: int, threads: int
-) -> dict[str, Any]:
-    """COLMAP with its own features on one set; the model goes to `out`/sparse."""
-    out.mkdir(parents=True, exist_ok=True)
-    images, _ = open_images(folder / "images")
-    start = time.monotonic()
-    given = parse_intrinsics(intrinsics) if intrinsics else None
-    database = out / "database.db"
-    verification = VerificationOptions(seed=seed, threads=threads)
-    write_rootsift_database(database, folder / "images", images, given, verification)
-    options = MapOptions(refine_intrinsics=intrinsics is None, seed=seed, threads=threads)
-    models, _ = build_models(database, read_two_views(database), options)
-    write_models(models, out / "sparse")
-    row = _row(folder.name, "rootsift", model_row(models[0]) if models else None)
-    return row | {"seconds": time.monotonic() - start}
-
-
-def run_method(
-    folder: Path,
-    out: Path,
-    method: str,
-    intrinsics: str | None,
-    *,
-    seed: int,
-    threads: int,
-    progress: bool,
-    network: WeightsChoice = USUAL_WEIGHTS,
-) -> dict[str, Any]:
-    """One of our methods on one set, in the work folder `out`."""
-    options = RunOptions(
-        intrinsics=intrinsics,
-        network=network,
-        seed=seed,
-        threads=threads,
-        progress=progress,
-    )
-    report = reconstruct_folder(
-        folder / "images", out, config=method_config(method), options=options
-    )
-    row = _row(folder.name, method, report.models[0] if report.models else None)
-    return row | {"stages": report.seconds, "seconds": sum(report.seconds.values())}
-
-
 def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
-    """Seconds of extraction and matching in a work folder, also where they were done before.
+    """Seconds of extraction and matching in a work folder, also if an earlier run did them.
 
-    What is reused took its time once: the longest measured so far counts, and is kept beside it.
+    A stage that is reused took its time once. The longest time measured so far is what counts, and
+    it is stored in the work folder.
     """
     path = work / "bench_seconds.json"
     try:
@@ -165,7 +216,11 @@ def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
 
 
 def _work_name(method: str) -> str:
-    """Methods that differ after mapping only share a work folder: the default preset's matches."""
+    """The name of a method's work folder.
+
+    Methods that differ from the preset `default` only after mapping share its matches, and so its
+    work folder.
+    """
     if method == "rootsift":
         return method
     config = method_config(method)
@@ -173,101 +228,64 @@ def _work_name(method: str) -> str:
     return f"dense-{config.keypoints}" if config.matching() == usual.matching() else method
 
 
-def bench_strecha(
-    root: Path,
-    *,
-    sets: Sequence[str] | None = None,
-    methods: Sequence[str] = USUAL,
-    known_intrinsics: bool = True,
-    out: Path | None = None,
-    seed: int = 0,
-    threads: int = -1,
-    network: WeightsChoice = USUAL_WEIGHTS,
-    progress: bool = False,
-    keep: Keep = lambda _: None,
-) -> dict[str, Any]:
-    """All methods on all sets, same images, camera, verification and mapper; plain JSON.
+def bench_strecha(options: StrechaOptions) -> StrechaFigures:
+    """Run all methods on all sets, with the same images, camera, verification and mapper.
 
-    Methods that differ after mapping only (`default` and whichever of `reloc` and `learned` has its
-    keypoints) share extraction and matching, which count in the seconds of each.
-
-    Args:
-      root: folder of Strecha sets (SET/images/K.txt, SET/gt_dense_cameras/*.camera).
-      known_intrinsics: False: focal lengths are guessed and refined, one camera per image.
-      out: keeps the work folders here, the models of methods that share one beside them; runs in
-        it are gone on with.
-      network: the files of its parameters.
+    Methods that differ only after mapping (`default` and whichever of `reloc` and `learned` has its
+    keypoints) share extraction and matching. The time of these stages counts for each of them.
     """
-    folders = find_sets(root, sets)
-    # All inputs are read before the first long run.
-    cameras = {folder: strecha_intrinsics(folder) for folder in folders}
-    truths = {folder: read_poses(folder, option="--root") for folder in folders}
-    rows = []
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        for folder in folders:
-            camera, focal = cameras[folder]
-            given = camera if known_intrinsics else None
-            for method in methods:
-                work = (out or Path(scratch)) / folder.name
-                work = work / _work_name(method)
-                work.parent.mkdir(parents=True, exist_ok=True)
-                if method == "rootsift":
-                    row = run_rootsift(folder, work, given, seed=seed, threads=threads)
-                else:
-                    row = run_method(
-                        folder,
-                        work,
-                        method,
-                        given,
-                        seed=seed,
-                        threads=threads,
-                        progress=progress,
-                        network=network,
-                    )
-                if "stages" in row:
-                    row["stages"] |= _matching_seconds(work, row["stages"])
-                    row["seconds"] = sum(row["stages"].values())
-                rows.append(_finish(row, work / "sparse" / "0", truths[folder], focal))
-                if out is not None and work.name != method:
-                    kept = work.parent / f"{method}-sparse"
-                    shutil.rmtree(kept, ignore_errors=True)
-                    if (work / "sparse").is_dir():
-                        shutil.copytree(work / "sparse", kept)
-                if progress:
-                    print(row_line(rows[-1]), flush=True)
-                keep(_result(rows, known_intrinsics, seed))
-    return _result(rows, known_intrinsics, seed)
+    methods = options.chosen_methods(METHODS)
+    # All inputs are read before the first reconstruction, which takes minutes.
+    sets = [
+        StrechaSet(folder, *strecha_intrinsics(folder), read_poses(folder, option="--root"))
+        for folder in find_sets(options.root, options.chosen_sets())
+    ]
+
+    def rows() -> Iterator[StrechaRow]:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+            for each in sets:
+                folder = (options.out or Path(scratch)) / each.folder.name
+                folder.mkdir(parents=True, exist_ok=True)
+                for method in methods:
+                    work = folder / _work_name(method)
+                    if method == "rootsift":
+                        row = _run_rootsift(each, work, options)
+                    else:
+                        row = _run_method(each, method, work, options)
+                    if options.out is not None and work.name != method:
+                        _keep_model(work, folder / f"{method}-sparse")
+                    yield row
+
+    def figures(measured: list[StrechaRow]) -> StrechaFigures:
+        return {
+            "benchmark": "strecha",
+            "versions": package_versions(),
+            "intrinsics": "known" if options.intrinsics == "known" else "refined from a guess",
+            "seed": options.seed,
+            "rows": measured,
+            "ratios": ratios(measured),
+            "published": PUBLISHED,
+        }
+
+    return collect(rows(), figures, line=row_line, json_file=options.json)
 
 
-def _result(rows: list[dict[str, Any]], known_intrinsics: bool, seed: int) -> dict[str, Any]:
-    return {
-        "benchmark": "strecha",
-        "versions": package_versions(),
-        "intrinsics": "known" if known_intrinsics else "refined from a guess",
-        "seed": seed,
-        "rows": rows,
-        "ratios": ratios(rows),
-        "published": PUBLISHED,
-    }
+def _keep_model(work: Path, to: Path) -> None:
+    """Copy a model out of a work folder that several methods share."""
+    shutil.rmtree(to, ignore_errors=True)
+    if (work / "sparse").is_dir():
+        shutil.copytree(work / "sparse", to)
 
 
-def ratios(rows: Sequence[dict[str, Any]], *, baseline: str = "rootsift") -> dict[str, Any]:
-    """Every method's errors over the baseline's, per set and as the mean of the sets."""
-    base = {row["set"]: row for row in rows if row["method"] == baseline and "position" in row}
-    result: dict[str, Any] = {}
+def ratios(rows: Sequence[StrechaRow]) -> dict[str, MethodRatios]:
+    """Each method's figures divided by the baseline's, by set and as the mean of the sets."""
+    base = {row["set"]: row for row in rows if row["method"] == BASELINE and "position" in row}
+    result: dict[str, MethodRatios] = {}
     for method in dict.fromkeys(row["method"] for row in rows):
-        if method == baseline:
-            continue
         per_set = {
-            row["set"]: {
-                "position": row["position"]["mean"] / base[row["set"]]["position"]["mean"],
-                "rotation": row["rotation_deg"]["mean"] / base[row["set"]]["rotation_deg"]["mean"],
-                "points": row["points"] / base[row["set"]]["points"],
-                "reprojection_error": row["reprojection_error_px"]
-                / base[row["set"]]["reprojection_error_px"],
-            }
+            row["set"]: _ratios_of(row, base[row["set"]])
             for row in rows
-            if row["method"] == method and "position" in row and row["set"] in base
+            if row["method"] == method != BASELINE and "position" in row and row["set"] in base
         }
         if per_set:
             keys = next(iter(per_set.values()))
@@ -276,17 +294,35 @@ def ratios(rows: Sequence[dict[str, Any]], *, baseline: str = "rootsift") -> dic
     return result
 
 
+def _ratios_of(row: StrechaRow, base: StrechaRow) -> dict[str, float]:
+    def figures(of: StrechaRow) -> dict[str, float]:
+        assert "position" in of and "rotation_deg" in of
+        assert "points" in of and "reprojection_error_px" in of
+        return {
+            "position": of["position"]["mean"],
+            "rotation": of["rotation_deg"]["mean"],
+            "points": of["points"],
+            "reprojection_error": of["reprojection_error_px"],
+        }
+
+    below = figures(base)
+    return {name: value / below[name] for name, value in figures(row).items()}
+
+
 HEADER = (
     f"{'set':16s} {'method':9s} {'images':>7s} {'position':>9s} {'rotation':>9s} {'points':>7s} "
     f"{'observ.':>8s} {'track':>6s} {'reproj.':>8s} {'focal':>7s} {'seconds':>8s}"
 )
 
 
-def row_line(row: dict[str, Any]) -> str:
+def row_line(row: StrechaRow) -> str:
     """One line of the table."""
     head = f"{row['set']:16s} {row['method']:9s} {row['registered']:3d}/{row['images']:<3d}"
     if "position" not in row:
         return f"{head}   {row.get('not_evaluated', 'no model')}"
+    assert "rotation_deg" in row and "focal_error_percent" in row
+    assert "points" in row and "observations" in row
+    assert "track_length" in row and "reprojection_error_px" in row
     return (
         f"{head} {row['position']['mean']:9.4f} {row['rotation_deg']['mean']:9.4f} "
         f"{row['points']:7d} {row['observations']:8d} {row['track_length']:6.2f} "
@@ -295,8 +331,8 @@ def row_line(row: dict[str, Any]) -> str:
     )
 
 
-def table_lines(result: dict[str, Any]) -> list[str]:
-    """The paper's table: mean errors in the reference's units and degrees."""
+def table_lines(result: StrechaFigures) -> list[str]:
+    """The paper's table: mean errors in units of the reference and in degrees."""
     lines = [HEADER, *(row_line(row) for row in result["rows"]), ""]
     for method, figures in result["ratios"].items():
         mean = figures["mean"]

@@ -1,98 +1,99 @@
-"""`bench warps`: relocalization rules on views made of any photos, under known homographies.
+"""`bench warps`: relocalization rules on views of photos, under known homographies.
 
-Every photo is seen through pairs of random homographies and under other lights and synthetic nights
-(`jaxsfm.core.views`, as in training). Of the cells of the first view and the cells of the second
-that descriptors would match (within some pixels of the right place), the share whose keypoints are
-within 1 and 3 px of each other.
+Each photo is seen through pairs of random homographies, under other lights and at synthetic nights
+(`jaxsfm.core.views`, as in training). Cells of the two views are paired as descriptors would match
+them, that is, within some pixels of the right place. The figure is the share of these pairs whose
+keypoints lie within 1 and 3 pixels of each other.
 """
 
 import functools
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator
+from typing import TypedDict
 
 import jax
 
-from jaxsfm.bench.common import Keep, spread
+from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.options import WarpsOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.versions import package_versions
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.training.objective import mean_shares, shares, warped_examples
 from jaxsfm.training.photos import Crops
 
 METHODS = ("norm", "learned")
-VIEW, CROP, BATCH = 192, 400, 8
+VIEW, CROP, BATCH, BATCHES = 192, 400, 8, 8
+"""Sides of a view and of the crop that it is made of, pixels; pairs of views in a batch; batches of
+a seed."""
 
 
-def bench_warps(
-    root: Path,
-    *,
-    methods: Sequence[str] = METHODS,
-    seeds: int = 5,
-    batches: int = 8,
-    network: WeightsChoice = USUAL_WEIGHTS,
-    progress: bool = False,
-    keep: Keep = lambda _: None,
-) -> dict[str, Any]:
-    """Both rules on the same views; plain JSON.
+class WarpsFigures(TypedDict):
+    """The figures of the benchmark, as JSON."""
 
-    Args:
-      root: folder of photos.
-      seeds: sets of views.
-      batches: of eight pairs of views, in a set.
-      network: the files of its parameters.
-    """
-    images, _ = open_images(root)
+    benchmark: str
+    synthetic: bool
+    versions: dict[str, str]
+    photos: int
+    seeds: int
+    pairs_of_views: int
+    """The number of pairs for each seed."""
+    methods: dict[str, dict[str, Spread]]
+    """The spread of each share over the seeds, by method."""
+
+
+def bench_warps(options: WarpsOptions) -> WarpsFigures:
+    """Measure both rules on the same views."""
+    methods = options.chosen_methods(METHODS)
+    images, _ = open_images(options.root)
     if not images:
-        raise UserError(f"--root {root}: no usable images")
-    weights = chosen_weights(network)
+        raise UserError(f"--root {options.root}: no usable images")
+    weights = chosen_weights(options.network)
     learned = weights.learned.params if "learned" in methods else None
     warp = functools.partial(
         warped_examples, weights.params, preprocessing=weights.preprocessing, size=VIEW
     )
-    each: dict[str, list[dict[str, float]]] = {method: [] for method in methods}
-    for seed in range(seeds):
-        crops, found = Crops(images, side=CROP, seed=seed), {method: [] for method in methods}
-        for step in range(batches):
-            key = jax.random.fold_in(jax.random.key(seed), step)
-            examples = warp(key, crops.draw(step, BATCH))
-            for method in methods:
-                scores = learned if method == "learned" else None
-                found[method].append(jax.device_get(shares(scores, examples)))
-        for method in methods:
-            each[method].append(mean_shares(found[method]))
-        if progress:
-            print(f"seed {seed}: " + ", ".join(_line(m, each[m][-1]) for m in methods), flush=True)
-        keep(_result(each, len(images), seeds, batches))
-    return _result(each, len(images), seeds, batches)
+
+    def rows() -> Iterator[dict[str, dict[str, float]]]:
+        """For each seed, the shares of each method."""
+        for seed in range(options.seeds):
+            crops, found = Crops(images, side=CROP, seed=seed), {method: [] for method in methods}
+            for step in range(BATCHES):
+                key = jax.random.fold_in(jax.random.key(seed), step)
+                examples = warp(key, crops.draw(step, BATCH))
+                for method in methods:
+                    scores = learned if method == "learned" else None
+                    found[method].append(jax.device_get(shares(scores, examples)))
+            yield {method: mean_shares(found[method]) for method in methods}
+
+    def figures(measured: list[dict[str, dict[str, float]]]) -> WarpsFigures:
+        return {
+            "benchmark": "warps",
+            "synthetic": True,
+            "versions": package_versions(),
+            "photos": len(images),
+            "seeds": options.seeds,
+            "pairs_of_views": BATCHES * BATCH,
+            "methods": {
+                method: {
+                    name: spread(row[method][name] for row in measured)
+                    for name in measured[0][method]
+                }
+                for method in methods
+            },
+        }
+
+    return collect(rows(), figures, line=row_line, json_file=options.json)
 
 
-def _line(method: str, found: dict[str, float]) -> str:
-    return f"{method} {found['within_1']:.4f} {found['within_3']:.4f}"
+def row_line(row: dict[str, dict[str, float]]) -> str:
+    """The shares of one seed within 1 and 3 pixels."""
+    return ", ".join(
+        f"{method} {found['within_1']:.4f} {found['within_3']:.4f}" for method, found in row.items()
+    )
 
 
-def _result(
-    each: dict[str, list[dict[str, float]]], photos: int, seeds: int, batches: int
-) -> dict[str, Any]:
-    rows = {
-        method: {name: spread(one[name] for one in found) for name in found[0]}
-        for method, found in each.items()
-    }
-    return {
-        "benchmark": "warps",
-        "synthetic": True,
-        "versions": package_versions(),
-        "photos": photos,
-        "seeds": seeds,
-        "pairs_of_views": batches * BATCH,
-        "methods": rows,
-    }
-
-
-def table_lines(result: dict[str, Any]) -> list[str]:
-    """Shares within 1 and 3 px, and how much more than the norm rule."""
+def table_lines(result: WarpsFigures) -> list[str]:
+    """The table: shares within 1 and 3 pixels, and the learned rule's over the norm rule's."""
     lines = [
         f"synthetic: {result['pairs_of_views']} pairs of views of {result['photos']} photos, "
         f"{result['seeds']} seeds",

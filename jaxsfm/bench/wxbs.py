@@ -1,38 +1,51 @@
 """`bench wxbs`: pairs under changes of viewpoint, illumination, season (Mishkin et al., BMVC 2015).
 
-A fundamental matrix is estimated from a method's matches and judged on points marked by hand: the
-share of them within 1, 2, .., 20 px of their epipolar lines, averaged (mAA).
+A fundamental matrix is estimated from a method's matches and judged on points that were marked by
+hand. The figure is the mean average accuracy (mAA): the share of these points within t pixels of
+their epipolar lines, averaged over t = 1, 2, ..., 20.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
-from jaxsfm.bench.common import (
-    Keep,
-    check_root,
-    choose_sets,
-    read_rows,
-    spread,
-    usable_image,
-)
-from jaxsfm.bench.matches import Matcher, pair_figures
+from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.inputs import check_root, choose_sets, read_rows, usable_image
+from jaxsfm.bench.matches import PAIR_METHODS, Matcher, Matches, PairFigures, pair_figures
+from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import SUFFIXES, ImageFile
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.sfm.two_view import epipolar_residuals, fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)
+Means = dict[str, dict[str, Spread]]
+"""mAA by method and category."""
+
+
+class WxbsRow(TypedDict):
+    """The figures of one pair and one method."""
+
+    pair: str
+    category: str
+    method: str
+    maa: Spread
+    scores: list[float]
+    """mAA for each seed."""
+    matches: Spread
+    seconds: float
 
 
 def symmetric_epipolar_error(f: np.ndarray, xy0: np.ndarray, xy1: np.ndarray) -> np.ndarray:
-    """Root of the summed squared distances of either point to the other's epipolar line, pixels.
+    """Symmetric epipolar distance of matches in pixels, float64 (n,).
+
+    It is the root of the sum of the squared distances of the two points from the epipolar lines of
+    each other; where a line is not defined it is infinite.
 
     Args:
-      f: float64 (3, 3), x1' F x0 = 0.
-      xy0, xy1: float64 (n, 2).
+      f: float64 (3, 3), the fundamental matrix: x1' F x0 = 0.
+      xy0, xy1: float64 (n, 2), pixels.
 
     Source: Hartley and Zisserman, 2nd edition, equation 11.10.
     """
@@ -44,7 +57,7 @@ def symmetric_epipolar_error(f: np.ndarray, xy0: np.ndarray, xy1: np.ndarray) ->
 
 
 def mean_average_accuracy(errors: np.ndarray) -> float:
-    """Mean over 1 .. 20 px of the share of points within."""
+    """The share of errors (pixels) within t, averaged over the thresholds t = 1, 2, ..., 20."""
     return float((errors[None] <= THRESHOLDS_PX[:, None]).mean())
 
 
@@ -55,27 +68,35 @@ def _image(folder: Path, stem: str) -> ImageFile:
     return usable_image(found[0])
 
 
-def bench_wxbs(
-    root: Path,
-    *,
-    sets: Sequence[str] | None = None,
-    methods: Sequence[str],
-    seeds: int = 5,
-    max_size: int | None = None,
-    network: WeightsChoice = USUAL_WEIGHTS,
-    progress: bool = False,
-    keep: Keep = lambda _: None,
-) -> dict[str, Any]:
-    """All methods on all pairs (CATEGORY/NAME/{01,02}.png, corrs.txt); plain JSON.
+def bench_wxbs(options: WxbsOptions) -> PairFigures[WxbsRow, Means]:
+    """Run all methods on all pairs (CATEGORY/NAME/{01,02}.png, corrs.txt)."""
+    methods = options.chosen_methods(PAIR_METHODS)
+    inputs = {
+        folder: (
+            _image(folder, "01"),
+            _image(folder, "02"),
+            read_rows(folder / "corrs.txt", 4, "rows of x1 y1 x2 y2"),
+        )
+        for folder in _folders(options)
+    }
+    matcher = Matcher(options)
 
-    Args:
-      root: folder of the categories.
-      sets: CATEGORY/NAME, or CATEGORY for all of it; default: all.
-      seeds: runs of each method with seeds 0, 1, ..; of RANSAC in matching and of the fundamental
-        matrix.
-      max_size: longer side of our working images; None: the preset's.
-      network: the files of its parameters.
-    """
+    def rows() -> Iterator[WxbsRow]:
+        for folder, (image0, image1, marked) in inputs.items():
+            for method in methods:
+                yield _row(folder, method, matcher.match(image0, image1, method), marked)
+
+    return collect(
+        rows(),
+        lambda measured: pair_figures("wxbs", measured, means(measured), options),
+        line=row_line,
+        json_file=options.json,
+    )
+
+
+def _folders(options: WxbsOptions) -> list[Path]:
+    """The folders of the chosen pairs; the name of a category stands for all its pairs."""
+    root, sets = options.root, options.chosen_sets()
     check_root(root)
     found = {
         f"{path.parent.parent.name}/{path.parent.name}": path.parent
@@ -87,48 +108,35 @@ def bench_wxbs(
         whole = {name.split("/")[0] for name in found} & set(sets)
         named = [name for name in found if name.split("/")[0] in whole]
         sets = sorted({*named, *(name for name in sets if name not in whole)})
-    folders = choose_sets(found, sets, root)
-    inputs = {
-        folder: (
-            _image(folder, "01"),
-            _image(folder, "02"),
-            read_rows(folder / "corrs.txt", 4, "rows of x1 y1 x2 y2"),
-        )
-        for folder in folders
+    return choose_sets(found, sets, root)
+
+
+def _row(folder: Path, method: str, runs: Sequence[Matches], marked: np.ndarray) -> WxbsRow:
+    scores = []
+    for seed, run in enumerate(runs):
+        f = fundamental_matrix(run.xy0, run.xy1, seed=seed)
+        if f is None:
+            scores.append(0.0)
+        else:
+            error = symmetric_epipolar_error(f, marked[:, :2], marked[:, 2:])
+            scores.append(mean_average_accuracy(error))
+    return {
+        "pair": f"{folder.parent.name}/{folder.name}",
+        "category": folder.parent.name,
+        "method": method,
+        "maa": spread(scores),
+        "scores": scores,
+        "matches": spread(len(run.xy0) for run in runs),
+        "seconds": float(np.median([run.seconds for run in runs])),
     }
-    matcher = Matcher(network)
-    rows = []
-    for folder, (image0, image1, marked) in inputs.items():
-        for method in methods:
-            runs = matcher.match(image0, image1, method, range(seeds), max_size=max_size)
-            scores = []
-            for seed, run in enumerate(runs):
-                f = fundamental_matrix(run.xy0, run.xy1, seed=seed)
-                if f is None:
-                    scores.append(0.0)
-                else:
-                    error = symmetric_epipolar_error(f, marked[:, :2], marked[:, 2:])
-                    scores.append(mean_average_accuracy(error))
-            rows.append(
-                {
-                    "pair": f"{folder.parent.name}/{folder.name}",
-                    "category": folder.parent.name,
-                    "method": method,
-                    "maa": spread(scores),
-                    "scores": scores,
-                    "matches": spread(len(run.xy0) for run in runs),
-                    "seconds": float(np.median([run.seconds for run in runs])),
-                }
-            )
-            if progress:
-                print(row_line(rows[-1]), flush=True)
-            keep(pair_figures("wxbs", rows, means(rows), seeds, max_size))
-    return pair_figures("wxbs", rows, means(rows), seeds, max_size)
 
 
-def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Per method: mAA over the pairs of each category and over all, and its spread over seeds."""
-    result: dict[str, dict[str, dict[str, float]]] = {}
+def means(rows: Sequence[WxbsRow]) -> Means:
+    """The mAA of each method over the pairs of each category and over all pairs ("all").
+
+    Pairs are averaged first, so that the spread is that over the seeds.
+    """
+    result: Means = {}
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
         groups = {
@@ -143,7 +151,7 @@ def means(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, dict[str, float
     return result
 
 
-def row_line(row: dict[str, Any]) -> str:
+def row_line(row: WxbsRow) -> str:
     """One line of the table."""
     maa = row["maa"]
     return (
@@ -152,8 +160,8 @@ def row_line(row: dict[str, Any]) -> str:
     )
 
 
-def table_lines(result: dict[str, Any]) -> list[str]:
-    """mAA per pair and category: mean, least and largest over the seeds."""
+def table_lines(result: PairFigures[WxbsRow, Means]) -> list[str]:
+    """The table: mAA by pair and category, as mean, smallest and largest over the seeds."""
     figures = f"{'mAA':>6s} {'min':>6s} {'max':>6s} {'matches':>8s} {'seconds':>8s}"
     lines = [f"{'pair':28s} {'method':9s} {figures}"]
     lines += [row_line(row) for row in result["rows"]]

@@ -1,4 +1,4 @@
-"""`jaxsfm evaluate` and `jaxsfm demo`: models against the truth."""
+"""The commands that compare a model with known poses: `jaxsfm evaluate` and `jaxsfm demo`."""
 
 from json import dumps
 from pathlib import Path
@@ -17,16 +17,19 @@ def evaluate(
     align_on: Path | None = None,
     json: Path | None = None,
 ) -> int:
-    """Compare a model's cameras with reference poses.
+    """Compare the cameras of a model with reference poses.
+
+    The model is first moved, turned and scaled onto the reference.
 
     For example
         $ jaxsfm evaluate OUT --reference POSES
 
     Args:
-      out: A run's folder, or a COLMAP model's.
-      reference: Folder of Strecha .camera files or of a COLMAP model.
-      align_on: Text file: align on these images only (the paper's night protocol).
-      json: Write all figures here.
+      out: The folder of a run or of a COLMAP model.
+      reference: The folder of Strecha .camera files or of a COLMAP model.
+      align_on: A text file with names of images, one on each line: the model is aligned on these
+        images only (as in the paper's comparison of night images).
+      json: The .json file into which all errors are written.
     """
     check_writable(json, "--json", (".json",))
     from jaxsfm.colmap.poses import find_model, model_poses, read_model, read_poses
@@ -52,13 +55,13 @@ def evaluate(
 
 
 def demo(*, out: Path | None = None, seed: int = 0) -> int:
-    """Render a small scene with known cameras, reconstruct it, compare with the truth.
+    """Render a small scene with known cameras, reconstruct it, and compare the result with them.
 
-    Ends with 1 if a camera is missing or the mean errors exceed the stated ones.
+    The exit status is 1 if a camera is missing, or if the mean errors are larger than stated.
 
     Args:
-      out: Folder for the scene and the results; default: a new one under the temporary folder.
-      seed: Of the scene's noise and of the reconstruction.
+      out: The folder for the scene and the results; default: a new one in the temporary folder.
+      seed: The seed of the scene's noise and of the reconstruction.
     """
     from jaxsfm.bench.demo import run_demo
 

@@ -1,4 +1,4 @@
-"""The command `export`: a run's model and matches in other tools' formats."""
+"""The command `jaxsfm export`: the model and the matches of a run in the formats of other tools."""
 
 import contextlib
 import os
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Format = Literal["hloc", "colmap", "colmap-text", "ply", "bundler", "nvm", "openmvg", "nerfstudio"]
 FILES = {"ply": ".ply", "nvm": ".nvm"}
-"""Formats of one file, and how its name ends; the others are folders."""
+"""The formats that are a single file, and how its name ends. The others are folders."""
 
 
 def export(
@@ -32,22 +32,23 @@ def export(
     copy_images: bool = False,
     matches: Literal["all", "verified"] = "all",
 ) -> int:
-    """A run's model or matches in another tool's format (docs/formats.md).
+    """Write the model or the matches of a run in the format of another tool (docs/formats.md).
 
     For example
         $ jaxsfm export OUT --to nerfstudio --out NERF --copy-images
         $ jaxsfm export OUT --to hloc --out HLOC
 
     Args:
-      run: A run's folder; for formats of models also a COLMAP model's.
+      run: The folder of a run, or, for a format that holds a model, of a COLMAP model.
       to: hloc: features.h5, matches.h5 and pairs.txt. colmap, colmap-text: the model. ply: its
         points. bundler, nvm: cameras, points, observations. openmvg: sfm_data.json, features,
         matches. nerfstudio: transforms.json and points.
-      out: File (ply, nvm) or new folder to write.
-      images: The photos' folder, for nerfstudio and openmvg, which refer to them; default: the one
-        that the run was made of, if it is still there.
-      copy_images: Copy the photos beside nerfstudio's transforms.json (into images).
-      matches: Which of them hloc gets: all handed to COLMAP, or the verified ones of trusted pairs.
+      out: The file (ply, nvm) or the new folder to write.
+      images: The folder of the photos, to which nerfstudio and openmvg refer; default: where the
+        run found them, if they are still there.
+      copy_images: Copy the photos into the folder images next to nerfstudio's transforms.json.
+      matches: The matches that are written for hloc: all that were handed to COLMAP, or those of
+        trusted pairs that COLMAP verified.
     """
     if copy_images and to != "nerfstudio":
         raise UserError("--copy-images: goes with --to nerfstudio")
@@ -57,7 +58,9 @@ def export(
         raise UserError(f"{run}: no such folder")
     images = images or _recorded_photos(run)
     if copy_images and images is None:
-        raise UserError(f"--copy-images: {run} does not say where its photos are; --images does")
+        raise UserError(
+            f"--copy-images: {run} does not say where its photos are; name them with --images"
+        )
     if to in FILES:
         check_writable(out, "--out", (FILES[to],))
         _export_file(run, to, out)
@@ -70,10 +73,10 @@ def export(
 
 @contextlib.contextmanager
 def _new_folder(path: Path) -> Iterator[Path]:
-    """A folder to fill, that appears at `path` whole or not at all.
+    """A new folder to fill. It appears at `path` when it is complete, or not at all.
 
     Raises:
-      UserError: something is there already, or it cannot be written.
+      UserError: there is a file or a non-empty folder already, or the folder cannot be written.
     """
     try:
         if path.exists() and not path.is_dir():
@@ -92,7 +95,7 @@ def _new_folder(path: Path) -> Iterator[Path]:
 
 
 def _recorded_photos(run: Path) -> Path | None:
-    """The photos' folder of a run, if it says and they are still there."""
+    """The folder in which the run found its photos; None if it is not known or gone."""
     from jaxsfm.report.run_inputs import PhotoFolder
     from jaxsfm.report.run_report import read_part
 
@@ -110,7 +113,7 @@ def _model(run: Path) -> "pycolmap.Reconstruction":
 
 
 def _tables(run: Path) -> "Tables | None":
-    """Keypoints and matches of a run's database, if there is one."""
+    """Keypoints and matches of the database of a run; None if there is no database."""
     from jaxsfm.colmap.formats.database import read_database
 
     path = run / "database.db"
@@ -168,11 +171,11 @@ def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -
 
     tables = _tables(run)
     if tables is None:
-        raise UserError(f"{run}: no database.db here, whose matches hloc would get")
+        raise UserError(f"{run}: no database.db here, so there are no matches to write for hloc")
     try:
         config = read_part(run, RecordedConfig, "options", "config")
         limits = config.max_size, config.enlarge
-    except UserError:  # not a run of ours: the photos' own pixels
+    except UserError:  # no run of jaxsfm: keypoints are in original pixels
         limits = 2**31, 1.0
     scales = {s: max(s) / max(working_size(s, *limits)) for s in set(tables.sizes.values())}
     chosen = tables.matches if matches == "all" else tables.inliers
@@ -193,7 +196,7 @@ def _export_openmvg(run: Path, folder: Path, images: Path | None) -> None:
         }
     try:
         found = find_model(run)
-    except UserError:  # views and matches are enough for OpenMVG to start from
+    except UserError:  # OpenMVG can start from views and matches
         if tables is None:
             raise
     else:

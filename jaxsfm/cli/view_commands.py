@@ -13,13 +13,17 @@ def report(
     reference: Path | None = None,
     out: Path | None = None,
 ) -> int:
-    """Write a run's report as one page of HTML (reconstruct does so by itself).
+    """Write the report of a run as one page of HTML.
+
+    Reconstruct writes the page by itself. This command writes it again, for example after the
+    photos have been moved, or with other reference poses.
 
     Args:
-      run: A run's folder.
-      images: Folder with the photos; default: where the run found them.
-      reference: Reference poses (Strecha .camera files or a COLMAP model); default: the run's.
-      out: File.html; default: report.html in the run's folder.
+      run: The folder of a run.
+      images: The folder of the photos; default: where the run found them.
+      reference: Reference poses (Strecha .camera files or a COLMAP model); default: those of the
+        run.
+      out: The .html file to write; default: report.html in the folder of the run.
     """
     check_writable(out, "--out", (".html",))
     from jaxsfm.report.page.write import write_page
@@ -36,14 +40,17 @@ def view(
     port: int = 8080,
     host: str = "127.0.0.1",
 ) -> int:
-    """Show a run's model in the browser, however large, until Ctrl-C.
+    """Show the model of a run in the browser, until Ctrl-C.
+
+    Unlike the page of `jaxsfm report` it shows all points of large models.
 
     Args:
-      run: A run's folder.
-      images: Folder with the photos; default: where the run found them.
-      reference: Reference poses (Strecha .camera files or a COLMAP model); default: the run's.
-      port: Where the browser finds it; the next free one if it is taken.
-      host: Address to listen on; 0.0.0.0 lets other machines in.
+      run: The folder of a run.
+      images: The folder of the photos; default: where the run found them.
+      reference: Reference poses (Strecha .camera files or a COLMAP model); default: those of the
+        run.
+      port: The port of the server; if it is taken, the next free one.
+      host: The address to listen on; with 0.0.0.0 other machines can connect.
     """
     if not 1 <= port <= 65535:
         raise UserError(f"--port must lie in 1 .. 65535; got {port}")

@@ -1,14 +1,13 @@
-"""COLMAP's database and two-view verification (pycolmap 4.2); the mapper is in `mapping`.
+"""COLMAP's database (pycolmap 4.2).
 
-Everything is checked here first: a match index out of range ends the process in native code, and
-unset options fail silently. Pixels get their +0.5 here and nowhere else.
+Everything is checked before COLMAP sees it, because a match index out of range ends the process in
+native code, and some unset options fail silently.
 
-zlib and cv2 are imported before pycolmap on purpose: pycolmap 4.2.1 brings a zlib of its own, and
-where it is loaded first every later deflate (zlib.compress, PNG by OpenCV or Pillow) corrupts the
-heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so; it is not used.
+zlib and cv2 are imported before pycolmap on purpose. pycolmap 4.2.1 brings a zlib of its own. If
+that one is loaded first, every later deflate (zlib.compress, PNG by OpenCV or Pillow) corrupts the
+heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so, and is not used.
 """
 
-import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
@@ -17,7 +16,6 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.native import native
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile, shown_name
@@ -30,9 +28,12 @@ PIXEL_OFFSET = np.float32(0.5)
 
 
 def keypoint_tables(results: Iterable[PairResult]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Per image the cells used by any pair, ascending, and their (x, y).
+    """The keypoints of every image: those of the cells that any pair uses.
 
-    A cell is the same keypoint in every pair, so tracks join by index.
+    A cell is the same keypoint in every pair. So tracks can be joined by its index.
+
+    Returns:
+      by image name: int (n,) cells, ascending; float32 (n, 2), their (x, y) in original pixels.
     """
     parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for result in results:
@@ -45,18 +46,23 @@ def keypoint_tables(results: Iterable[PairResult]) -> dict[str, tuple[np.ndarray
 
 
 UNITED = 16
-"""Pairs of an image whose keypoints are held apart: all would be gigabytes for 500 images."""
+"""After so many pairs of an image, their keypoints are united. Held apart, the keypoints of all
+pairs would take gigabytes for 500 images."""
 
 
 def _united(rows: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Every cell once, ascending, with its first (x, y)."""
+    """Unite cells and their (x, y): every cell once, ascending, with the first (x, y) it has."""
     cells, xy = (np.concatenate(column) for column in zip(*rows, strict=True))
     cells, first = np.unique(cells, return_index=True)
     return cells, xy[first]
 
 
 def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
-    """The results; ValueError for what COLMAP dies of."""
+    """The results, one by one.
+
+    Raises:
+      ValueError: a result on which COLMAP would end the process.
+    """
     for pair, result in results.items():
         if pair != result.pair:
             raise ValueError(f"pair {describe(pair)} holds the result of {describe(result.pair)}")
@@ -69,13 +75,19 @@ def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
 
 
 def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Camera:
-    """The given camera, or one from the photo's EXIF focal length (else 1.2 x the longer side)."""
+    """The camera of a photo.
+
+    Without intrinsics, its focal length comes from EXIF, or is 1.2 x the longer side of the photo.
+
+    Raises:
+      UserError: COLMAP does not accept the camera.
+    """
     if intrinsics is not None:
         camera = intrinsics.camera(image.size)
     else:
         try:
             camera = pycolmap.infer_camera_from_image(image.path)
-        except Exception:  # COLMAP reads fewer formats than we do; it raises RuntimeError or more
+        except Exception:  # COLMAP reads fewer formats, and raises various errors
             camera = None
         if camera is None or (camera.width, camera.height) != image.size:
             width, height = image.size
@@ -99,14 +111,17 @@ def write_database(
     results: Mapping[Pair, PairResult],
     intrinsics: Intrinsics | None,
 ) -> None:
-    """A new COLMAP database with cameras, images, keypoints and matches.
+    """Write a new COLMAP database with cameras, images, keypoints and matches.
 
     Args:
-      results: the pairs handed on, each read twice and none held; images without any stay in the
-        database without keypoints.
+      path: a file there is replaced.
+      images: all images. Those without matches get no keypoints.
+      results: the matches. Each is read twice, and none is held in memory.
+      intrinsics: one camera for all images; None: one for each.
 
     Raises:
-      ValueError: inconsistent results (nothing is written).
+      ValueError: the results are inconsistent. Nothing is written then.
+      UserError: the disk is full, or COLMAP does not accept a camera.
     """
     matched = 0
 
@@ -126,7 +141,7 @@ def write_database(
         if (xy < -0.5).any() or (xy > np.asarray(names[name].size) - 0.5).any():
             raise ValueError(f"{name}: keypoints outside the image {names[name].size}")
     rows = sum(len(xy) for _, xy in tables.values()) + 2 * matched
-    check_disk_space(path.parent, SPARE_BYTES + 2 * 8 * rows)  # and as much for SQLite's journal
+    check_disk_space(path.parent, SPARE_BYTES + 2 * 8 * rows)  # twice, because of SQLite's journal
     empty = np.zeros((0, 2), np.float32)
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
@@ -146,61 +161,18 @@ def write_database(
                 db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VerificationOptions:
-    """Settings of COLMAP's two-view verification."""
-
-    seed: int = 0
-    """For RANSAC."""
-    threads: int = -1
-    """-1 takes all cores."""
-    scale: float = 1.0
-    """Original pixels per working pixel. COLMAP's 4 px are multiplied by it."""
-    relative_poses: bool = True
-    """Also find the relative pose of every pair, which the view graph needs."""
-    min_inliers: int | None = None
-    """A pair with fewer inliers has none; None: COLMAP's 15."""
-
-    def for_colmap(self) -> pycolmap.TwoViewGeometryOptions:
-        """As COLMAP takes them."""
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.random_seed = self.seed
-        options.ransac.max_error *= self.scale
-        options.compute_relative_pose = self.relative_poses
-        if self.min_inliers is not None:
-            options.min_num_inliers = self.min_inliers
-        return options
-
-
-def verify(path: Path, options: VerificationOptions) -> None:
-    """Run COLMAP's own two-view verification on all pairs of a database (paper, section 4).
-
-    Cameras with a known or prior focal length are verified as calibrated (essential matrices).
-
-    Raises:
-      UserError: COLMAP failed.
-    """
-    verifier = pycolmap.GeometricVerifierOptions()
-    verifier.num_threads = options.threads
-    native(
-        lambda token: pycolmap.geometric_verification(
-            path,
-            verifier_options=verifier,
-            two_view_geometry_options=options.for_colmap(),
-            cancellation_token=token,
-        ),
-        path,
-    )
-
-
 def read_matches(
     path: Path, names: tuple[str, str], *, verified: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A pair's matches, float64 (n, 2) each, centre of the top-left pixel (0, 0).
+    """Read the matches of a pair from a database.
 
     Args:
-      names: of the two images, in the order wanted.
-      verified: the two-view inliers; else the matches before verification.
+      names: of the two images.
+      verified: read the two-view inliers; otherwise the matches before verification.
+
+    Returns:
+      float64 (n, 2) for each image, in the order of `names`: original pixels, where the centre of
+      the top-left one is (0, 0).
     """
     with pycolmap.Database.open(path) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
@@ -217,14 +189,14 @@ def read_matches(
 
 
 def read_images(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:
-    """Id and camera of every image in a database, by name."""
+    """Read the id and the camera of every image in a database, by name."""
     with pycolmap.Database.open(path) as db:
         cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
         return {i.name: (i.image_id, cameras[i.camera_id]) for i in db.read_all_images()}
 
 
 def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
-    """Take pairs' verified geometries out of a database; their matches stay."""
+    """Delete the verified geometries of pairs from a database. Their matches stay."""
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
         ids = {image.name: image.image_id for image in db.read_all_images()}
         for a, b in pairs:

@@ -1,4 +1,4 @@
-"""A COLMAP database that gets more images; what is in it keeps its numbers."""
+"""Images and matches that are added to a COLMAP database. What is in it keeps its ids."""
 
 import shutil
 from collections.abc import Mapping
@@ -8,8 +8,9 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET, VerificationOptions, read_images, verify
+from jaxsfm.colmap.database import PIXEL_OFFSET, read_images
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions, verify
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
@@ -18,10 +19,13 @@ from jaxsfm.io.pairs import Pair, PairResult
 def add_images(
     path: Path, images: Mapping[str, tuple[ImageFile, pycolmap.Camera]]
 ) -> dict[str, tuple[int, pycolmap.Camera]]:
-    """Write images and their cameras; their ids and cameras, by name.
+    """Add images and their cameras to a database.
 
     Args:
-      images: by name. A camera whose id the database knows is that one; others are new.
+      images: by name. A camera whose id is in the database is taken from there; others are added.
+
+    Returns:
+      id and camera of each image, by name.
     """
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
         known = {camera.camera_id for camera in db.read_all_cameras()}
@@ -35,12 +39,16 @@ def add_images(
 
 
 def copy_database(source: Path, target: Path, matches: int) -> None:
-    """A copy of a database to which matches will be added.
+    """Copy a database to which matches will be added.
+
+    Args:
+      matches: how many will be added.
 
     Raises:
-      UserError: the copy, that of `add_matches` and SQLite's journal would not fit on the disk.
+      UserError: the copy, the copy that `add_matches` makes, and SQLite's journal do not fit on the
+        disk.
     """
-    # Each match: a keypoint in both images at most, itself and its verification; 8 bytes each.
+    # A match takes at most a keypoint in both images, itself and its verification: 8 bytes each.
     rows = 4 * matches
     size = source.stat().st_size
     check_disk_space(target.parent, SPARE_BYTES + 3 * size + 16 * rows)
@@ -48,26 +56,27 @@ def copy_database(source: Path, target: Path, matches: int) -> None:
 
 
 def _keys(xy: np.ndarray) -> np.ndarray:
-    """float32 pixels (n, 2 or more) as one number each, which tells them apart."""
+    """Turn pixels (n, 2 or more) into one number each, equal where the float32 (x, y) are equal."""
     return xy[:, :2].astype(np.float32, order="C").view(np.uint64)[:, 0]
 
 
 def _appended(known: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Keypoints, and behind them those of `xy` that are not among them.
+    """Add keypoints behind others, those that are not among them.
 
     Args:
-      known: float32 (n, 2 or more): (x, y) and what follows; kept as it is.
+      known: float32 (n, 2 or more): (x, y), and columns that are kept as they are.
+      xy: float32 (m, 2), the keypoints to add.
     """
     fresh = np.unique(xy, axis=0)
     fresh = fresh[~np.isin(_keys(fresh), _keys(known))]
     rest = np.zeros((len(fresh), known.shape[1] - 2), np.float32)
-    if rest.shape[1] >= 4:  # an affine shape; COLMAP's for a bare point
+    if rest.shape[1] >= 4:  # an affine shape: COLMAP writes the identity for a bare point
         rest[:, [0, 3]] = 1
     return np.concatenate([known, np.c_[fresh, rest]])
 
 
 def _rows_of(xy: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
-    """uint32: where each pixel stands among keypoints, which have it; of equal ones the first."""
+    """uint32 (n,): the (first) index of each pixel among keypoints, which include it."""
     keys = _keys(keypoints)
     order = np.argsort(keys, kind="stable")
     return order[np.searchsorted(keys, _keys(xy), sorter=order)].astype(np.uint32)
@@ -94,7 +103,7 @@ def add_matches(
     rows: dict[Pair, list[np.ndarray]] = {}
     matches: dict[Pair, np.ndarray] = {}
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        for name in sorted(own):  # the lesser name of a pair comes first
+        for name in sorted(own):  # so the first name of a pair comes first
             parts = [_side(results[pair], pair.index(name)) for pair in own[name]]
             there = db.exists_keypoints(ids[name])
             known = np.asarray(db.read_keypoints(ids[name]), np.float32) if there else _NONE
@@ -106,7 +115,7 @@ def add_matches(
                 rows.setdefault(pair, []).append(column)
         for pair in sorted(rows):
             both = np.stack(rows.pop(pair), axis=1)
-            # Two cells may lie at one pixel: one match each.
+            # Two cells may lie at one pixel. A keypoint keeps only its first match.
             for side in (0, 1):
                 both = both[np.sort(np.unique(both[:, side], return_index=True)[1])]
             if len(both):
@@ -119,7 +128,7 @@ _NONE = np.zeros((0, 2), np.float32)
 
 
 def _side(result: PairResult, side: int) -> np.ndarray:
-    """Keypoints in COLMAP's pixels, as the database holds them."""
+    """float32 (n, 2): the keypoints of one side, in COLMAP's pixels."""
     xy = (result.keypoints0, result.keypoints1)[side]
     return np.asarray(xy, np.float32) + PIXEL_OFFSET
 

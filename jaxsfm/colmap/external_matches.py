@@ -1,10 +1,10 @@
-"""Matches that somebody else made of the same photos, mapped beside ours in one model."""
+"""Matches of the same photos that another tool made, mapped together with ours in one model."""
 
 import dataclasses
 import logging
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
@@ -15,29 +15,59 @@ from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.io.hashes import sha256_of
 from jaxsfm.io.images import ImageFile, shown_name
-from jaxsfm.io.pairs import Pair, PairCounts, PairResult, describe
+from jaxsfm.io.pairs import LazyMatches, Pair, PairCounts, PairResult
 
 logger = logging.getLogger("jaxsfm")
 
 BORDER_PX = 1.0
-"""Keypoints this far outside are pulled in: float16 and detectors' half pixels put them there."""
+"""Keypoints this far outside an image are moved to its border. The rounding of float16, and
+detectors that count pixels from their corners, put them there."""
 FOCAL_RATIO = 1.1
-"""Focal lengths may differ as much: EXIF knows them to a few percent."""
+"""Focal lengths may differ by this factor, because EXIF knows them to a few percent."""
+
+
+class ExternalFiles(TypedDict):
+    """Where external matches came from, for the report of a run."""
+
+    files: list[str]
+    sha256: list[str]
+    verified: bool
+    """The files hold two-view inliers, and these are used."""
+    images: int
+    ignored: list[str]
+    """Images that are not among the photos."""
+    pairs: int
+    matches: int
 
 
 class ExternalMatches(NamedTuple):
-    """Matches beside ours."""
+    """Matches that another tool made."""
 
     keypoints: dict[str, np.ndarray]
-    """float32 (n, 2), original pixels, centre of the top-left pixel (0, 0)."""
+    """By image name float32 (n, 2), original pixels, centre of the top-left pixel (0, 0)."""
     matches: dict[Pair, np.ndarray]
     """int32 (m, 2): indices of keypoints, one to one."""
-    about: dict[str, Any] | None
-    """For the report; None where nothing was given."""
+    about: ExternalFiles | None
+    """None where there are no external matches."""
+
+    def result(self, pair: Pair) -> PairResult:
+        """The matches of a pair, in the form of ours. They are on no plane."""
+        rows = self.matches[pair]
+        return PairResult(
+            pair=pair,
+            cells=rows,
+            keypoints0=self.keypoints[pair[0]][rows[:, 0]],
+            keypoints1=self.keypoints[pair[1]][rows[:, 1]],
+            plane=np.full(len(rows), -1, np.int32),
+            homographies=np.zeros((0, 3, 3)),
+            num_tentative=len(rows),
+            num_dropped=0,
+            status=Status.VERIFIED,
+        )
 
     def counts(self, ours: Mapping[Pair, PairCounts]) -> dict[Pair, PairCounts]:
-        """What is known of every pair: ours where it has inliers, else what was given."""
-        theirs = {pair: _result(pair, rows, self).counts for pair, rows in self.matches.items()}
+        """The counts of every pair: ours where it has inliers, otherwise the external ones."""
+        theirs = {pair: self.result(pair).counts for pair in self.matches}
         return theirs | {p: c for p, c in ours.items() if c.num_inliers or p not in theirs}
 
 
@@ -50,21 +80,22 @@ def read_external_matches(
     images: Collection[ImageFile],
     intrinsics: Intrinsics | None,
 ) -> ExternalMatches:
-    """The matches of `--with-database` or `--with-hloc`, checked against the photos.
+    """Read the matches of `--with-database` or `--with-hloc`, and check them against the photos.
 
-    Of a verified database the two-view inliers count, of another one its matches. Cameras are
-    not taken over.
+    If the file holds two-view inliers, these are used; otherwise its matches. Cameras are not
+    taken over.
 
     Raises:
-      UserError: unreadable, inconsistent, of other photos, sizes or cameras.
+      UserError: the files cannot be read, are inconsistent, or are of other photos, sizes or
+        cameras.
     """
     if database is not None and hloc is not None:
-        raise UserError("--with-database and --with-hloc: one of them")
+        raise UserError("--with-database and --with-hloc: give only one of them")
     if database is not None:
         where, files = f"--with-database {database}", [database]
         tables = read_database(database, where=where)
     elif hloc is not None:
-        from jaxsfm.colmap.formats.hloc import read_hloc
+        from jaxsfm.colmap.formats.hloc import read_hloc  # loads h5py
 
         where, files = "--with-hloc", list(hloc)
         tables = read_hloc(*hloc, [image.name for image in images], where=where)
@@ -112,15 +143,15 @@ def _checked(
         for pair, rows in sorted((tables.inliers or tables.matches).items())
         if pair[0] in keypoints and pair[1] in keypoints
     }
-    about = {
-        "files": [str(path.absolute()) for path in files],
-        "sha256": [sha256_of(path) for path in files],
-        "verified": bool(tables.inliers),
-        "images": len(keypoints),
-        "ignored": ignored,
-        "pairs": len(matches),
-        "matches": sum(map(len, matches.values())),
-    }
+    about = ExternalFiles(
+        files=[str(path.absolute()) for path in files],
+        sha256=[sha256_of(path) for path in files],
+        verified=bool(tables.inliers),
+        images=len(keypoints),
+        ignored=ignored,
+        pairs=len(matches),
+        matches=sum(map(len, matches.values())),
+    )
     return ExternalMatches(keypoints, matches, about)
 
 
@@ -139,22 +170,8 @@ def _check_focal(camera: CameraRow, intrinsics: Intrinsics, where: str, name: st
         )
 
 
-def _result(pair: Pair, rows: np.ndarray, given: ExternalMatches) -> PairResult:
-    return PairResult(
-        pair=pair,
-        cells=rows,
-        keypoints0=given.keypoints[pair[0]][rows[:, 0]],
-        keypoints1=given.keypoints[pair[1]][rows[:, 1]],
-        plane=np.full(len(rows), -1, np.int32),
-        homographies=np.zeros((0, 3, 3)),
-        num_tentative=len(rows),
-        num_dropped=0,
-        status=Status.VERIFIED,
-    )
-
-
 def _joined(theirs: PairResult, ours: PairResult) -> PairResult:
-    """One list of matches; planes stay ours."""
+    """Both results of a pair as one. Its planes are ours."""
 
     def both(name: str) -> np.ndarray:
         return np.concatenate([getattr(theirs, name), getattr(ours, name)])
@@ -170,40 +187,32 @@ def _joined(theirs: PairResult, ours: PairResult) -> PairResult:
     )
 
 
-class JoinedMatches(Mapping[Pair, PairResult]):
-    """Our matches and those given, as one: theirs first in every image's list of keypoints, our
-    cells counted on from there. Pairs are joined when they are asked for.
+class JoinedMatches(LazyMatches):
+    """Our matches and external ones together. A pair is joined when it is asked for.
+
+    In every image, external keypoints come first, and our cells are numbered on from there.
 
     Args:
       names: the images that are mapped.
     """
 
     def __init__(
-        self, ours: Mapping[Pair, PairResult], given: ExternalMatches, names: Collection[str]
+        self,
+        ours: Mapping[Pair, PairResult],
+        external: ExternalMatches,
+        names: Collection[str],
     ) -> None:
-        self._ours, self._given = ours, given
-        theirs = (pair for pair in given.matches if pair[0] in names and pair[1] in names)
-        self._pairs = dict.fromkeys(sorted({*ours, *theirs}))
+        self._ours, self._external = ours, external
+        theirs = (pair for pair in external.matches if pair[0] in names and pair[1] in names)
+        super().__init__(sorted({*ours, *theirs}))
 
-    def __getitem__(self, pair: Pair) -> PairResult:
-        if pair not in self._pairs:
-            raise KeyError(describe(pair))
+    def _load(self, pair: Pair) -> PairResult:
         parts = []
-        if pair in self._given.matches:
-            parts.append(_result(pair, self._given.matches[pair], self._given))
+        if pair in self._external.matches:
+            parts.append(self._external.result(pair))
         if pair in self._ours:
-            first = np.asarray(
-                [len(self._given.keypoints.get(name, ())) for name in pair], np.int32
-            )
+            keypoints = self._external.keypoints
+            first = np.asarray([len(keypoints.get(name, ())) for name in pair], np.int32)
             ours = self._ours[pair]
             parts.append(dataclasses.replace(ours, cells=ours.cells + first))
         return parts[0] if len(parts) == 1 else _joined(*parts)
-
-    def __contains__(self, pair: object) -> bool:
-        return pair in self._pairs
-
-    def __iter__(self) -> Iterator[Pair]:
-        return iter(self._pairs)
-
-    def __len__(self) -> int:
-        return len(self._pairs)

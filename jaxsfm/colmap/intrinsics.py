@@ -1,7 +1,7 @@
-"""Camera intrinsics from a K.txt or from `MODEL:p1,p2,...`, checked before COLMAP sees them.
+"""Camera intrinsics, from a K.txt or from `MODEL:p1,p2,...`, checked before COLMAP sees them.
 
-A K matrix is in this package's pixels (centre of the top-left pixel (0, 0), as OpenCV calibrates);
-COLMAP parameters are taken as COLMAP means them (that centre at (0.5, 0.5)).
+A K matrix counts pixels from the centre of the top-left one, as OpenCV does. The parameters of a
+COLMAP model count them as COLMAP does, where that centre is (0.5, 0.5).
 """
 
 import dataclasses
@@ -20,14 +20,15 @@ class Intrinsics:
     """One camera for all images."""
 
     model: str
+    """Name of a COLMAP camera model."""
     params: tuple[float, ...]
-    """COLMAP's parameters, COLMAP's pixels."""
+    """Parameters of the COLMAP model, in COLMAP's pixels."""
 
     def camera(self, size: tuple[int, int]) -> pycolmap.Camera:
         """The COLMAP camera for images of `size` (width, height), marked as known.
 
-        Without `has_prior_focal_length` COLMAP verifies uncalibrated: entry-P10 then has 0.78 m
-        mean error instead of 0.018 m.
+        The mark (`has_prior_focal_length`) makes COLMAP verify pairs as calibrated. Without it,
+        entry-P10 has 0.78 m mean error instead of 0.018 m.
         """
         camera = pycolmap.Camera(
             model=self.model, width=size[0], height=size[1], params=list(self.params)
@@ -66,10 +67,10 @@ def _from_matrix(path: Path) -> Intrinsics:
 
 
 def parse_intrinsics(text: str) -> Intrinsics:
-    """Intrinsics from the path of a K.txt or `MODEL:p1,p2,...` (a COLMAP camera model).
+    """Read intrinsics from the path of a K.txt, or from `MODEL:p1,p2,...` (a COLMAP camera model).
 
     Raises:
-      UserError: what is wrong, naming the option.
+      UserError: the text is neither, or its numbers make no camera.
     """
     model, colon, params = text.partition(":")
     models = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
@@ -98,10 +99,13 @@ def parse_intrinsics(text: str) -> Intrinsics:
 
 
 def check_fits(intrinsics: Intrinsics, sizes: dict[str, tuple[int, int]]) -> None:
-    """One camera needs images of one size, with its principal point inside.
+    """Check that one camera fits images: they have one size, and hold its principal point.
 
     Args:
       sizes: image name -> (width, height).
+
+    Raises:
+      UserError: it does not fit.
     """
     by_size: dict[tuple[int, int], list[str]] = {}
     for name, size in sizes.items():

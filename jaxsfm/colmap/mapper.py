@@ -1,6 +1,6 @@
-"""COLMAP's mappers: from verified pairs to models, with second tries before giving up.
+"""COLMAP's mappers: from verified pairs to models, with further attempts if images are left out.
 
-Every model that the mapper makes is kept: the one with most images is the best, the others are the
+Every model that the mapper makes is kept. The one with most images is the best; the others are
 parts of the scene that nothing connects to it.
 """
 
@@ -18,24 +18,24 @@ from jaxsfm.io.pairs import Pair, component_of
 from jaxsfm.options import Mapper
 
 MISSING = 0.1
-"""Share of the connected images up to which an absence is no reason to start again: one of ten
-lacks matches, not another start, and further starts are two more runs of the mapper."""
+"""If at most this share of the connected images is left out, the mapper is not started again. One
+image of ten lacks matches rather than a better start, and new starts take two more runs."""
 MAX_RETRIES = 2
-"""Further initial pairs tried when the mapper's own choice leaves connected images out."""
+"""Number of further initial pairs that are tried if the mapper's own choice leaves out images."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """How verified matches become a model."""
+    """Settings of the mapper."""
 
     mapper: Mapper = "incremental"
     refine_intrinsics: bool = True
     seed: int = 0
     threads: int = -1
-    """Threads of verification and bundle adjustment; -1: all. One makes the model repeatable to
-    the last byte."""
+    """Threads of verification and bundle adjustment; -1 takes all cores. With one thread the model
+    is repeatable to the last byte."""
     scale: float = 1.0
-    """Original pixels per working pixel: COLMAP's pixel thresholds grow with it."""
+    """Original pixels per working pixel. COLMAP's pixel thresholds are multiplied by it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,9 +44,9 @@ class Attempt:
 
     mapper: Mapper
     initial_pair: Pair | None
-    """None: the mapper's own choice."""
+    """The pair that mapping started from; None: the mapper's own choice."""
     registered: list[int]
-    """Images of every model."""
+    """Number of images of every model, the largest first."""
 
 
 def _incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOptions:
@@ -56,7 +56,7 @@ def _incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOpt
     p.num_threads = p.mapper.num_threads = options.threads
     p.random_seed = p.mapper.random_seed = options.seed
     p.min_model_size = 2
-    p.extract_colors = False  # coloured by `colour_points`, from our own reader
+    p.extract_colors = False  # `colour_points` does it, with our own reader
     p.mapper.init_max_error *= options.scale
     p.mapper.abs_pose_max_error *= options.scale
     p.mapper.filter_max_reproj_error *= options.scale
@@ -78,10 +78,10 @@ def _global_options(options: MapOptions) -> pycolmap.GlobalPipelineOptions:
 
 
 def initial_pairs(two_views: Mapping[Pair, TwoView]) -> list[Pair]:
-    """Pairs to start from, best first: many inliers, a wide angle, not one plane.
+    """Pairs to start mapping from, the best first: with many inliers, a wide angle, several planes.
 
-    A plane leaves the relative pose two-fold ambiguous, a narrow angle leaves depth unknown: COLMAP
-    asks for 16 degrees at first.
+    One plane leaves the relative pose ambiguous, and a narrow angle leaves the depth uncertain:
+    COLMAP asks for 16 degrees at first.
     """
 
     def score(view: TwoView) -> float:
@@ -106,7 +106,7 @@ def registered(model: pycolmap.Reconstruction) -> set[str]:
 
 
 def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:
-    """Whether the best model holds (nearly) all images that a chain of pairs connects to it."""
+    """Whether the best model has (nearly) all images that a chain of pairs connects to it."""
     if not models:
         return not pairs
     names = registered(models[0])
@@ -121,17 +121,23 @@ def build_models(
     *,
     on_image: Callable[[], None] = lambda: None,
 ) -> tuple[list[pycolmap.Reconstruction], list[Attempt]]:
-    """Map a verified database; the models, the one with most registered images first.
+    """Map a verified database.
 
-    If the mapper leaves out more than `MISSING` of the images that verified pairs connect to its
-    best model, or finds no model, it is started again from other initial pairs (`initial_pairs`,
-    each image once, lower demands on them), and where there is still none, the global mapper is
-    tried. An attempt that registers more images takes the place of the former ones; their models of
-    other images stay.
+    The incremental mapper may find no model, or leave out more than `MISSING` of the images that
+    verified pairs connect to its best model. It is then started again from other initial pairs
+    (`initial_pairs`, each image once, with lower demands). If there is still no model, the global
+    mapper is tried. An attempt that registers more images replaces the former ones, except for
+    models of other images.
 
     Args:
-      two_views: the database's pairs.
-      on_image: called for every image registered (incremental mapper).
+      two_views: the pairs of the database.
+      on_image: called for every image that the incremental mapper registers.
+
+    Returns:
+      the models, the one with most registered images first; all runs of the mapper.
+
+    Raises:
+      UserError: COLMAP failed.
     """
     pairs = sorted(two_views)
     models = _run(database, options, None, on_image)
@@ -178,13 +184,15 @@ def _run(
                     database, scratch, scratch, _global_options(options)
                 ),
                 database,
-                grace_s=1,  # it takes no token
+                grace_s=1,  # it cannot be cancelled
             )
             return _order(list(found.values()))
         p = _incremental_options(options)
         if initial is not None:
             p.init_image_id1, p.init_image_id2 = _image_ids(database, initial)
-            p.multiple_models = False  # else COLMAP starts every model from this pair, 50 times
+            p.multiple_models = (
+                False  # otherwise COLMAP starts every model from this pair, 50 times
+            )
             p.mapper.init_min_num_inliers = 30
             p.mapper.init_min_tri_angle = 4.0
         found = native(

@@ -1,8 +1,9 @@
-"""COLMAP's binary model files, looked through before COLMAP reads them.
+"""A check of COLMAP's binary model files, done before COLMAP reads them.
 
-Its readers trust every count in a file and do not look at the file's end: 9 of 168 models with one
-damaged file made them allocate until memory ended or read for ever. None of 1500 that came past
-this check did. The readers of text files refuse what is wrong (none of 400 models did that).
+COLMAP's readers trust every count in a file and do not look at the file's end. With 9 of 168 models
+that had one damaged file, they allocated until memory ended, or read for ever. With 1500 models
+that passed this check, they never did. COLMAP's readers of text files need no check: they refused
+all of 400 damaged models.
 
 Layout: COLMAP 4, src/colmap/scene/reconstruction_io.cc; all little-endian.
 """
@@ -15,19 +16,17 @@ import numpy as np
 import pycolmap
 
 NO_POINT = 2**64 - 1
-"""Of a keypoint without a 3-D point."""
-
-
+"""Stands for the point of a keypoint that has none."""
 ABSURD = 1e100
-"""Squares of such numbers are still finite."""
+"""Larger numbers are refused. Squares of smaller ones are finite."""
 
 
 class DamagedModelError(ValueError):
-    """What is wrong with a file, in words."""
+    """A model file is damaged. The message says what is wrong, and in which file."""
 
 
 class _Reader:
-    """Values of a file, one after the other."""
+    """Reads the values of a file one after the other."""
 
     def __init__(self, path: Path) -> None:
         self.name, self.data, self.at = path.name, path.read_bytes(), 0
@@ -36,14 +35,14 @@ class _Reader:
         return DamagedModelError(f"{self.name}: {what}")
 
     def skip(self, size: int) -> int:
-        """Where a block of so many bytes begins."""
+        """Skip a block of bytes, and return where it begins."""
         start, self.at = self.at, self.at + size
         if self.at > len(self.data):
             raise self.bad("it ends too early")
         return start
 
     def values(self, layout: str) -> tuple:
-        """Values by `struct`'s letters."""
+        """Read values by their letters in `struct`."""
         found = struct.unpack_from(
             "<" + layout, self.data, self.skip(struct.calcsize("<" + layout))
         )
@@ -52,14 +51,14 @@ class _Reader:
         return found
 
     def number(self) -> int:
-        """A count of what follows, which is at least a byte each."""
+        """Read the number of entries that follow. Each takes at least one byte."""
         (found,) = self.values("Q")
         if found > len(self.data):
             raise self.bad(f"it cannot hold {found} entries")
         return found
 
     def name_bytes(self) -> None:
-        """Past a text that ends with a zero byte."""
+        """Skip a text that ends with a zero byte."""
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise self.bad("a name without an end")
@@ -70,23 +69,24 @@ class _Reader:
         self.at = end + 1
 
     def pose(self) -> None:
-        """Past a quaternion and a translation."""
+        """Skip a quaternion and a translation."""
         if not np.linalg.norm(self.values("7d")[:4]) > 1e-6:
-            raise self.bad("a rotation that is none")
+            raise self.bad("a rotation of length zero")
 
     def end(self, ids: list[int] | np.ndarray) -> None:
         if self.at != len(self.data):
-            raise self.bad("more in it than it says")
+            raise self.bad("it goes on after its last entry")
         if len(np.unique(np.asarray(ids, np.uint64))) != len(ids):
-            raise self.bad("a number is given twice")
+            raise self.bad("an id is given twice")
 
 
 def check_binary(folder: Path) -> None:
-    """Look through a binary model.
+    """Check a binary model.
 
     Raises:
-      DamagedModelError: a file that ends early, lies about a count, or names what is not there.
-      OSError: one is missing.
+      DamagedModelError: a file ends early, has a wrong count, or refers to something that the model
+        does not have.
+      OSError: a file is missing.
     """
     cameras = _cameras(_Reader(folder / "cameras.bin"))
     if (folder / "rigs.bin").exists():
@@ -128,7 +128,7 @@ def _rigs(file: _Reader, cameras: set[int]) -> None:
 
 
 def _images(file: _Reader, cameras: set[int]) -> tuple[dict[int, int], np.ndarray]:
-    """Number of keypoints by image, and the points of all keypoints."""
+    """Check the images; return the number of keypoints by image, and the keypoints' points."""
     images: list[tuple[int, int]] = []
     seen = []
     for _ in range(file.number()):
@@ -162,7 +162,7 @@ def _frames(file: _Reader, images: dict[int, int]) -> None:
 
 
 def _points(file: _Reader, images: dict[int, int]) -> np.ndarray:
-    """The points' numbers."""
+    """Check the points, and return their ids."""
     ids, tracks = [], []
     for _ in range(file.number()):
         point, *_xyz, _r, _g, _b, _error, length = file.values("Q3d3BdQ")

@@ -1,4 +1,4 @@
-"""COLMAP models on disk and their points' colours."""
+"""COLMAP models on disk, and the colours of their points."""
 
 import shutil
 from collections.abc import Callable
@@ -13,7 +13,11 @@ from jaxsfm.io.images import ImageError
 
 
 def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
-    """`folder`/0 the best model, 1, 2, ... the others; what was there before goes."""
+    """Write models into `folder`/0 (the best one), 1, 2, ... The folder is replaced.
+
+    Raises:
+      UserError: the disk is full.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     for index, model in enumerate(models):
         target = folder / str(index)
@@ -25,8 +29,12 @@ def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
 
 
 def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
-    """What `write_models` wrote, of a database's cameras: which focal lengths are known stands
-    there alone."""
+    """Read what `write_models` wrote.
+
+    Args:
+      database: of the same cameras. It says which focal lengths were known before mapping, which
+        COLMAP's model files do not.
+    """
     with pycolmap.Database.open(database) as db:
         known = {c.camera_id: c.has_prior_focal_length for c in db.read_all_cameras()}
     models = []
@@ -44,15 +52,17 @@ def colour_points(
 ) -> None:
     """Give every 3-D point the mean colour of its observations, in place.
 
+    A photo that cannot be read any more is left out.
+
     Args:
-      read_rgb: image name -> (uint8 (h, w, 3), (x, y) original pixels per pixel).
+      read_rgb: image name -> uint8 (h, w, 3), and original pixels per pixel, (x, y).
     """
     total: dict[int, np.ndarray] = {}
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
         try:
             rgb, scale = read_rgb(image.name)
-        except ImageError:  # the photo went away since; its points keep the others' colours
+        except ImageError:  # deleted since; other photos colour its points
             continue
         for point in image.points2D:
             if point.has_point3D():

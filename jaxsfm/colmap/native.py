@@ -1,4 +1,4 @@
-"""Long native calls beside the calling thread, which stays open to Ctrl-C."""
+"""Long native calls, in a thread of their own, so that Ctrl-C is noticed."""
 
 import threading
 from collections.abc import Callable
@@ -13,22 +13,22 @@ from jaxsfm.io import interrupt
 
 T = TypeVar("T")
 THREAD = "jaxsfm-colmap"
-"""Name of the thread COLMAP runs in."""
+"""Name of the thread that COLMAP runs in."""
 
 
 def native(
     work: Callable[[pycolmap.CancellationToken], T], what: Path | str, *, grace_s: float = 30
 ) -> T:
-    """The result of `work`, run in a thread of its own.
+    """Run native code in a thread of its own, and return its result.
 
     Args:
-      work: gets a token that tells it to stop.
-      what: named in messages.
-      grace_s: how long an interrupted call may take to stop.
+      work: the code. It gets a token that tells it to stop.
+      what: the file or the task, for messages.
+      grace_s: seconds that an interrupted call may take to stop.
 
     Raises:
       UserError: COLMAP failed.
-      KeyboardInterrupt: Ctrl-C; the native code was asked to stop.
+      KeyboardInterrupt: Ctrl-C was pressed. The native code was asked to stop.
     """
     token = pycolmap.CancellationToken()
     results: list[T] = []
@@ -45,8 +45,8 @@ def native(
 
     threading.Thread(target=run, name=THREAD, daemon=True).start()
     try:
-        # Not Thread.join: Ctrl-C inside it makes Python 3.11 take the thread for ended, and the
-        # process then aborts under the native code that still runs.
+        # Not Thread.join: after Ctrl-C inside it, Python 3.11 takes the thread for ended. The
+        # process then ends while the native code still runs, and aborts.
         while not done.wait(0.2):
             interrupt.check()
         interrupt.check()

@@ -12,7 +12,7 @@ from jaxsfm.errors import UserError
 
 
 class CameraPose(NamedTuple):
-    """Where a camera stands and looks."""
+    """The position and the direction of a camera."""
 
     rotation: np.ndarray
     """float64 (3, 3), world to camera."""
@@ -25,7 +25,7 @@ _SUBFOLDERS = ("", "gt_dense_cameras", "sparse/0", "sparse")
 
 
 def model_poses(model: pycolmap.Reconstruction) -> Poses:
-    """Poses of a model's registered images, by name."""
+    """The poses of a model's registered images, by name."""
     poses = {}
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
@@ -35,7 +35,7 @@ def model_poses(model: pycolmap.Reconstruction) -> Poses:
 
 
 def _read_strecha(path: Path) -> CameraPose:
-    """K (3 rows), a row of zeros, R camera-to-world (3 rows), centre, width and height."""
+    """Read a file with K (3 rows), a row of zeros, R camera-to-world (3 rows), centre, size."""
     try:
         values = [float(v) for v in path.read_text(encoding="utf-8").split()]
     except (OSError, ValueError) as error:
@@ -44,12 +44,16 @@ def _read_strecha(path: Path) -> CameraPose:
         raise UserError(f"{path}: not a Strecha camera file (expected at least 24 finite numbers)")
     rotation = np.asarray(values[12:21]).reshape(3, 3).T
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise UserError(f"{path}: its rotation is not one")
+        raise UserError(f"{path}: its rotation is not a rotation matrix")
     return CameraPose(rotation, np.asarray(values[21:24]))
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
-    """The COLMAP model (binary or text) in a folder."""
+    """Read the COLMAP model (binary or text) in a folder.
+
+    Raises:
+      UserError: no readable model.
+    """
     try:
         if (path / "images.bin").is_file():
             check_binary(path)
@@ -61,7 +65,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         return model
     except DamagedModelError as error:
         raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
-    except Exception as error:  # native errors of several kinds; the text is long and technical
+    except Exception as error:  # native errors of several kinds, whose texts are long
         raise UserError(f"{path}: not a readable COLMAP model") from error
 
 
@@ -70,7 +74,11 @@ def _has_model(path: Path) -> bool:
 
 
 def find_model(path: Path) -> Path:
-    """The model folder of a run's OUT, or of a folder that is a model itself."""
+    """Find the model in the results of a run, or in a folder that is a model itself.
+
+    Raises:
+      UserError: there is none.
+    """
     for sub in ("", "sparse/0", "sparse"):
         if _has_model(path / sub):
             return path / sub
@@ -78,10 +86,14 @@ def find_model(path: Path) -> Path:
 
 
 def read_poses(path: Path, *, option: str = "--reference") -> Poses:
-    """Reference poses: Strecha `.camera` files or a COLMAP model, in the folder or below it.
+    """Read reference poses: Strecha `.camera` files or a COLMAP model, in the folder or below it.
+
+    Args:
+      path: the folder.
+      option: the option that names it, for messages.
 
     Raises:
-      UserError: nothing of either kind, or damaged.
+      UserError: there is nothing of either kind, or it is damaged.
     """
     if not path.is_dir():
         raise UserError(f"{option} {path}: no such folder")

@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
 
-from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.native import native
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair
@@ -78,4 +78,4 @@ def write_rootsift_database(
     with pycolmap.Database.open(path) as db:
         there = {image.name for image in db.read_all_images()}
     if lost := sorted({image.name for image in images} - there):
-        raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, so not for RootSIFT")
+        raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, which RootSIFT needs")

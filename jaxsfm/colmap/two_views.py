@@ -1,4 +1,4 @@
-"""What COLMAP's two-view verification found, read from a database."""
+"""The results of COLMAP's two-view verification, read from a database."""
 
 import dataclasses
 from pathlib import Path
@@ -11,22 +11,22 @@ from jaxsfm.colmap.database import PIXEL_OFFSET
 from jaxsfm.io.pairs import Pair
 
 PLANAR = (4, 6)
-"""COLMAP's two-view configurations PLANAR and PLANAR_OR_PANORAMIC."""
+"""The numbers of COLMAP's two-view configurations PLANAR and PLANAR_OR_PANORAMIC."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairGeometry:
-    """What two-view verification says of a pair."""
+    """The geometry of a verified pair, as the view graph uses it."""
 
     num_inliers: int
     rotation: np.ndarray | None
-    """float64 (3, 3), camera of the first image to that of the second; None: not determined."""
+    """float64 (3, 3), from the camera of the first image to that of the second; None: unknown."""
     spread: float = 1.0
-    """Share of the image the inliers cover, 0 .. 1, the smaller of the two."""
+    """Share of the image that the inliers cover, 0 .. 1; the smaller of the two images' shares."""
 
 
 def spread(xy: np.ndarray, size: tuple[int, int], *, cells: int = 8) -> float:
-    """Share of a cells x cells grid over the image that holds at least one point.
+    """The share of a cells x cells grid over the image in which there is at least one point.
 
     Args:
       xy: float (n, 2), pixels of an image of `size` (width, height).
@@ -36,17 +36,18 @@ def spread(xy: np.ndarray, size: tuple[int, int], *, cells: int = 8) -> float:
 
 
 class TwoView(NamedTuple):
-    """What COLMAP's verification says of a pair."""
+    """The result of COLMAP's verification for a pair."""
 
     geometry: PairGeometry
     tri_angle_deg: float
-    """Median angle between the rays of a point; 0 if unknown. (COLMAP's own is not stored.)"""
+    """Median angle between the two rays of a point, degrees; 0 if unknown. The database does not
+    hold COLMAP's own."""
     planar: bool
     """A homography explains all inliers."""
 
 
 def rays_of(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
-    """Unit directions (n, 3) of pixels, in the camera's frame."""
+    """Unit directions (n, 3) of original pixels (n, 2), in the camera's frame."""
     flat = camera.cam_from_img(np.ascontiguousarray(xy + float(PIXEL_OFFSET)))
     assert flat is not None
     rays = np.c_[flat, np.ones(len(flat))]
@@ -54,9 +55,12 @@ def rays_of(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
 
 
 def read_two_views(path: Path) -> dict[Pair, TwoView]:
-    """Every pair with inliers, the lesser name first.
+    """Read every pair that has inliers.
 
-    Relative poses are there if `verify` was asked for them.
+    Relative poses are known if `verify` was asked for them.
+
+    Returns:
+      by pair of image names, in order.
     """
     with pycolmap.Database.open(path) as db:
         images = {image.image_id: image for image in db.read_all_images()}

@@ -1,1 +1,1 @@
-"""Our own files: images, weights, features and matches, the work folder."""
+"""Reads and writes jaxsfm's own files: images, weights, features, matches and the work folder."""

@@ -131,13 +131,13 @@ def download(
         )
     except requests.RequestException as error:
         raise UserError(
-            f"{url}: cannot be downloaded ({_reason(error)}); the same command goes on from what "
-            f"has come, or put the file there yourself: {path}"
+            f"{url}: cannot be downloaded ({_reason(error)}); give the same command again, or "
+            f"save the file yourself as {path}"
         ) from error
     except ValueError as error:
         raise UserError(
-            f"{url}: what came has another hash than {known_hash}; a damaged transfer, or the file "
-            "there has changed"
+            f"{url}: the downloaded file does not have the hash {known_hash}; the transfer was "
+            "damaged, or the file on the server has changed"
         ) from error
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror or error})") from error
@@ -160,9 +160,9 @@ def _reason(error: requests.RequestException) -> str:
     if isinstance(error, requests.HTTPError) and error.response is not None:
         return f"the server answers {error.response.status_code}"
     if isinstance(error, requests.Timeout):
-        return "no answer in time"
+        return "the server did not answer in time"
     if isinstance(error, requests.ConnectionError | requests.exceptions.ChunkedEncodingError):
-        return "no connection, or it broke off"
+        return "there is no connection, or it broke off"
     return type(error).__name__
 
 

@@ -101,7 +101,8 @@ def find_images(folder: Path) -> list[str]:
             if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
         ]
     if not names:
-        raise UserError(f"{folder}: no images here (looked for {', '.join(sorted(SUFFIXES))})")
+        suffixes = ", ".join(sorted(SUFFIXES))
+        raise UserError(f"{folder}: there are no images in this folder (looked for {suffixes})")
     return sorted(names)
 
 
@@ -126,7 +127,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     except OSError as error:
         raise ImageError(f"{shown}: cannot be read ({error.strerror})") from error
     except ValueError as error:  # the name contains what no path can
-        raise ImageError(f"{shown}: not a file's name") from error
+        raise ImageError(f"{shown}: no file can have this name") from error
     if not data:
         raise ImageError(f"{shown}: the file is empty")
     try:
@@ -209,7 +210,7 @@ def image_bytes(image: ImageFile) -> bytes:
     except OSError as error:
         raise ImageError(f"{shown_name(image.name)}: cannot be read ({error.strerror})") from error
     if hashlib.sha256(data).hexdigest() != image.sha256:
-        raise ImageError(f"{shown_name(image.name)}: the file was changed meanwhile")
+        raise ImageError(f"{shown_name(image.name)}: the file has changed since it was first read")
     return data
 
 
@@ -225,7 +226,9 @@ def _decode(image: ImageFile) -> np.ndarray:
                 f"{shown}: {width} x {height} pixels is more than can be decoded "
                 f"({MAX_DECODED_PIXELS} pixels); reduce it first"
             )
-        logger.warning("%s: %d x %d pixels, decoded at 1/%d", shown, width, height, factors[0])
+        logger.warning(
+            "%s: has %d x %d pixels, so it is decoded at 1/%d", shown, width, height, factors[0]
+        )
         flags = _REDUCED[factors[0]] | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         bgr = cv2.imdecode(np.frombuffer(image_bytes(image), np.uint8), flags)
@@ -234,7 +237,7 @@ def _decode(image: ImageFile) -> np.ndarray:
     except cv2.error as error:
         raise DamagedImage(f"{shown}: cannot be decoded") from error
     if bgr is None:
-        raise DamagedImage(f"{shown}: damaged, or a format that cannot be decoded")
+        raise DamagedImage(f"{shown}: the file is damaged, or its format cannot be decoded")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 

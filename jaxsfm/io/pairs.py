@@ -157,10 +157,10 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
             if name not in names:
                 raise UserError(f"--pairs {path} line {number}: no image named {name!r}")
         if cut[0] == cut[1]:
-            raise UserError(f"--pairs {path} line {number}: {cut[0]!r} paired with itself")
+            raise UserError(f"--pairs {path} line {number}: {cut[0]!r} is paired with itself")
         pairs.add(make_pair(*cut))
     if not pairs:
-        raise UserError(f"--pairs {path}: no pairs in it")
+        raise UserError(f"--pairs {path}: the file lists no pairs")
     return sorted(pairs)
 
 

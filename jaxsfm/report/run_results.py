@@ -7,7 +7,7 @@ from typing import Literal
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair
 from jaxsfm.report.typed_json import OMITTED, Count, Number
-from jaxsfm.sfm.evaluation import ImageError
+from jaxsfm.sfm.evaluation import PoseError
 from jaxsfm.sfm.view_graph import Verdict
 
 Stage = Literal[
@@ -169,6 +169,6 @@ class EvaluationReport:
     within_10deg: dict[str, Number]
     """Share of the reference's photos within a distance (the key, in units of the reference) and
     10 degrees."""
-    images: dict[str, ImageError]
+    images: dict[str, PoseError]
     missing: list[str] = field(default_factory=list)
     """Photos of the reference without a pose in the model."""

@@ -1,4 +1,7 @@
-"""A model as it is shown: upright, in the reference's units if there is one, without far points."""
+"""A model as it is shown: upright and without far points.
+
+If there are reference poses, the model is in their units.
+"""
 
 from typing import NamedTuple
 
@@ -10,7 +13,8 @@ from jaxsfm.report.finished_run import FinishedModel, FinishedRun
 from jaxsfm.sfm.evaluation import Similarity
 
 FAR = 0.5
-"""Points further outside the box of the middle 98 % than this share of it are left out."""
+"""How far a shown point may lie outside the box that holds the middle 98 % of the points, as a
+share of the size of the box."""
 
 
 class ShownCamera(NamedTuple):
@@ -19,16 +23,17 @@ class ShownCamera(NamedTuple):
     name: str
     pose: CameraPose
     corners: np.ndarray
-    """float64 (4, 3): the image's corners at depth 1 from the centre, clockwise from top left."""
+    """float64 (4, 3): the corners of the image at depth 1, relative to the centre of the camera,
+    clockwise from the top left."""
 
     def frustum(self, depth: float) -> np.ndarray:
-        """Ten points (10, 3) of one line along its edges, up to the image at `depth`."""
+        """The points (10, 3) of one line along the edges of a pyramid whose base is at `depth`."""
         tip, at = self.pose.centre, self.pose.centre + depth * self.corners
         return np.stack([at[0], at[1], tip, at[2], at[3], tip, at[0], at[3], at[2], at[1]])
 
 
 class Scene(NamedTuple):
-    """What there is to see; z is up, the origin amid the cameras."""
+    """The points and cameras that are shown. z is up, and the origin lies amid the cameras."""
 
     points: np.ndarray
     """float64 (n, 3)."""
@@ -36,13 +41,14 @@ class Scene(NamedTuple):
     """uint8 (n, 3)."""
     cameras: list[ShownCamera]
     reference: list[ShownCamera]
-    """Where the cameras ought to be; empty without a reference."""
+    """The reference poses; empty if there are none."""
     frustum_depth: float
+    """The height of the pyramids that stand for cameras."""
     far: int
-    """Points left out because they lie far outside."""
+    """The number of points that are left out because they lie far from the others."""
 
     def behind(self) -> np.ndarray:
-        """Direction (3,) from the model to a first look at it: behind the cameras, and above."""
+        """The direction (3,) from the model to the first viewpoint: behind and above cameras."""
         ahead = np.mean([c.pose.rotation[2] for c in self.cameras], axis=0)
         ahead[2] = 0.0
         length = np.linalg.norm(ahead)
@@ -51,7 +57,7 @@ class Scene(NamedTuple):
 
 
 def _corners(model: FinishedModel) -> dict[str, np.ndarray]:
-    """Corners of every view's image at depth 1, camera frame."""
+    """The corners float64 (4, 3) of every view's image at depth 1, in the frame of the camera."""
     found = {}
     for view in model.views:
         w, h = view.size
@@ -61,9 +67,9 @@ def _corners(model: FinishedModel) -> dict[str, np.ndarray]:
 
 
 def _upright(poses: list[CameraPose]) -> np.ndarray:
-    """The rotation (3, 3) that turns the cameras' mean upward direction to z."""
+    """The rotation (3, 3) that turns the mean upward direction of the cameras to z."""
     down = np.mean([pose.rotation[1] for pose in poses], axis=0)
-    if np.linalg.norm(down) < 0.1:  # they look from all around: any one is as good
+    if np.linalg.norm(down) < 0.1:  # the cameras are turned in all directions: take the first
         down = poses[0].rotation[1]
     up = -down / np.linalg.norm(down)
     right = np.mean([pose.rotation[0] for pose in poses], axis=0)
@@ -75,12 +81,13 @@ def _upright(poses: list[CameraPose]) -> np.ndarray:
 
 
 def _moved(pose: CameraPose, by: Similarity) -> CameraPose:
+    """A pose after a similarity of the world."""
     centre = by.scale * by.rotation @ pose.centre + by.translation
     return CameraPose(pose.rotation @ by.rotation.T, centre)
 
 
 def _depth(centres: np.ndarray, extent: float) -> float:
-    """A frustum's depth: cameras should neither touch each other nor vanish."""
+    """The depth of a frustum with which cameras neither touch each other nor vanish."""
     nearest = extent
     if len(centres) > 1:
         nearest = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
@@ -88,10 +95,10 @@ def _depth(centres: np.ndarray, extent: float) -> float:
 
 
 def shown_scene(run: FinishedRun) -> Scene:
-    """The run's best model.
+    """The best model of a run.
 
     Raises:
-      ValueError: the run has none.
+      ValueError: the run has no model.
     """
     if run.model is None:
         raise ValueError("run must have a model; got none")
@@ -99,7 +106,7 @@ def shown_scene(run: FinishedRun) -> Scene:
     own = Similarity(1.0, np.eye(3), np.zeros(3))
     to_reference = run.reference.similarity if run.reference else own
     poses = [_moved(CameraPose(v.rotation, v.centre), to_reference) for v in model.views]
-    # Coordinates of a reference may be of a whole country: too long for a browser's float32.
+    # The float32 of a browser has too few digits for geographic coordinates: move to the origin.
     upright = _upright(poses)
     turn = Similarity(1.0, upright, -upright @ np.mean([p.centre for p in poses], axis=0))
     corners = _corners(model)

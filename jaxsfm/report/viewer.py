@@ -1,4 +1,4 @@
-"""A model in the browser, served by viser: for models too large for the page."""
+"""A model in the browser, served by viser. It shows models that are too large for the page."""
 
 import socket
 import time
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import viser
 
 THUMBNAIL = 240
-"""Longer side of the photos in the frusta, pixels."""
+"""The longer side of the photos in the frusta, pixels."""
 MAX_THUMBNAILS = 500
-"""Cameras that carry their photo: reading a thousand takes minutes."""
+"""The most cameras that show their photo: to read a thousand photos takes minutes."""
 BLUE, ORANGE = (59, 130, 196), (224, 123, 57)
 
 
@@ -41,13 +41,13 @@ def _thumbnail(run: FinishedRun, name: str) -> np.ndarray | None:
 
 
 def fov_and_aspect(camera: ShownCamera) -> tuple[float, float]:
-    """Vertical field of view, radians, and width over height."""
+    """The vertical field of view in radians, and the width divided by the height."""
     x, y, _ = (camera.corners @ camera.pose.rotation.T).T
     return float(np.arctan(y.max()) - np.arctan(y.min())), float(np.ptp(x) / np.ptp(y))
 
 
 class Viewer:
-    """A scene on a server, with its controls."""
+    """A scene on a server, and its controls."""
 
     def __init__(self, server: "viser.ViserServer", run: FinishedRun) -> None:
         self.server, self.run, self.scene = server, run, shown_scene(run)
@@ -115,7 +115,7 @@ class Viewer:
         scale: float,
         image: np.ndarray | None,
     ) -> "viser.CameraFrustumHandle":
-        """A frustum; a click on it looks through the camera."""
+        """Add a frustum. A click on it shows the view through the camera."""
         from viser.transforms import SO3
 
         fov, aspect = fov_and_aspect(camera)
@@ -127,7 +127,7 @@ class Viewer:
             scale=scale,
             color=colour,
             image=image,
-            format="jpeg",  # Pillow's PNG encoder must not run beside pycolmap: host.colmap
+            format="jpeg",  # not PNG, which Pillow must not encode beside pycolmap
             wxyz=wxyz,
             position=camera.pose.centre,
         )
@@ -144,7 +144,7 @@ class Viewer:
 
 
 def _check_address(host: str) -> None:
-    """Viser would wait for ever for a server that cannot start."""
+    """Raises UserError for an address that viser could not listen on: it would wait for ever."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as trial:
@@ -154,10 +154,10 @@ def _check_address(host: str) -> None:
 
 
 def serve(run: FinishedRun, *, host: str, port: int) -> None:
-    """Show a run's model until Ctrl-C.
+    """Show the model of a run until Ctrl-C.
 
     Raises:
-      UserError: viser is missing, the run has no model, or the address cannot be used.
+      UserError: viser is not installed, the run has no model, or the address cannot be used.
     """
     viser = _viser()
     if run.model is None:
@@ -170,7 +170,7 @@ def serve(run: FinishedRun, *, host: str, port: int) -> None:
         while True:
             interrupt.check()
             time.sleep(0.2)
-    except KeyboardInterrupt:  # the way to end it, no failure
+    except KeyboardInterrupt:  # this is how a user ends it
         print()
     finally:
         server.stop()

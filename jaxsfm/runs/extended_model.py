@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.models import colour_points, read_models, write_models
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun

@@ -13,7 +13,7 @@ from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.report.typed_json import OMITTED, to_json
-from jaxsfm.sfm.evaluation import ImageError, evaluate, pair_names
+from jaxsfm.sfm.evaluation import PoseError, evaluate, pair_names
 from jaxsfm.sfm.register.locate_view import Localization
 
 Outcome = Literal["localized", "doubtful", "lost", "unusable"]
@@ -101,7 +101,7 @@ class LocalizedPhoto:
     centre: list[float] | None = field(default=None, metadata=OMITTED)
     """The camera centre, units of the model."""
     camera: PhotoCamera | None = field(default=None, metadata=OMITTED)
-    error: ImageError | None = field(default=None, metadata=OMITTED)
+    error: PoseError | None = field(default=None, metadata=OMITTED)
     """The error against the reference poses."""
 
 
@@ -154,7 +154,7 @@ def localized_photo(
     source: str,
     in_run: str | None,
     shortlist: Sequence[str],
-    error: ImageError | None = None,
+    error: PoseError | None = None,
 ) -> LocalizedPhoto:
     """The row of a usable photo.
 
@@ -191,7 +191,7 @@ def localized_photo(
 
 def error_against(
     name: str, view: View, views: Sequence[View], reference: Poses
-) -> ImageError | None:
+) -> PoseError | None:
     """The error of a photo's pose against reference poses.
 
     The model is first moved onto the reference by the similarity that fits its other photos best.

@@ -1,13 +1,13 @@
-"""How far a model's cameras are from reference poses, after the best similarity.
+"""How far the cameras of a model are from reference poses, after the best similarity.
 
-The similarity (Sim3) comes from the camera centres, of all common images or of the named ones only:
-the paper's night protocol aligns on day cameras and scores the night camera (section 4.1).
+The similarity (Sim3) is found from the camera centres of all common images, or of some of them: the
+paper's night protocol aligns on day cameras and scores the night camera (section 4.1).
 """
 
 import dataclasses
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
@@ -16,28 +16,47 @@ from jaxsfm.errors import UserError
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 DISTANCES = (0.5, 1.0, 5.0, 10.0, 20.0)
+"""Distances at which the share of good images is counted, units of the reference."""
 MAX_ROTATION_DEG = 10.0
+"""A good image's rotation is off by no more."""
 COLLINEAR = 1e-4
-"""Second over first singular value of the centres: below, the roll about the line is unknown."""
+"""Centres are on one line if their second singular value is less than this share of the first. The
+roll about the line is then unknown."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ImageError:
-    """One registered image's error."""
+class PoseError:
+    """How far the pose of one image is from its reference."""
 
     position: float
     """Units of the reference."""
     rotation_deg: float
 
 
+class EvaluationRecord(TypedDict):
+    """An `Evaluation` as plain JSON."""
+
+    registered: int
+    reference_images: int
+    aligned_on: int
+    position: dict[str, float]
+    """Mean, median and max, units of the reference."""
+    rotation_deg: dict[str, float]
+    within_10deg: dict[str, float]
+    """By distance, the share of the reference's images."""
+    images: dict[str, dict[str, float]]
+    missing: list[str]
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Errors of the registered images that the reference knows."""
+    """Errors of the registered images that have a reference pose."""
 
-    images: dict[str, ImageError]
+    images: dict[str, PoseError]
     missing: list[str]
-    """Reference images without a pose in the model; they count as failures in `within`."""
+    """Reference images without a pose in the model. They count as failures in `within`."""
     aligned_on: int
+    """Number of images whose centres determined the similarity."""
 
     def _stats(self, field: str) -> dict[str, float]:
         values = [getattr(error, field) for error in self.images.values()]
@@ -59,7 +78,7 @@ class Evaluation:
 
     @property
     def within(self) -> dict[float, float]:
-        """Share of the reference's images within (distance; 10 deg)."""
+        """By distance: the share of the reference's images within it and within 10 degrees."""
         total = len(self.images) + len(self.missing)
         return {
             d: sum(
@@ -69,22 +88,28 @@ class Evaluation:
             for d in DISTANCES
         }
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain JSON."""
-        return {
-            "registered": len(self.images),
-            "reference_images": len(self.images) + len(self.missing),
-            "aligned_on": self.aligned_on,
-            "position": self.position,
-            "rotation_deg": self.rotation_deg,
-            "within_10deg": {f"{d:g}": share for d, share in self.within.items()},
-            "images": {n: dataclasses.asdict(e) for n, e in sorted(self.images.items())},
-            "missing": self.missing,
-        }
+    def as_dict(self) -> EvaluationRecord:
+        """The evaluation as plain JSON."""
+        return EvaluationRecord(
+            registered=len(self.images),
+            reference_images=len(self.images) + len(self.missing),
+            aligned_on=self.aligned_on,
+            position=self.position,
+            rotation_deg=self.rotation_deg,
+            within_10deg={f"{d:g}": share for d, share in self.within.items()},
+            images={n: dataclasses.asdict(e) for n, e in sorted(self.images.items())},
+            missing=self.missing,
+        )
 
 
 def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, str]:
-    """Our name -> the reference's: equal names, else equal, unique stems (0000.jpg, 0000.png)."""
+    """Pair the names of a model with those of a reference.
+
+    Names are paired if they are equal, or if their stems are equal and unique (0000.jpg, 0000.png).
+
+    Returns:
+      our name -> the reference's name.
+    """
     pairs = {name: name for name in ours if name in reference}
     stems: dict[str, list[str]] = {}
     for name in reference:
@@ -101,7 +126,11 @@ def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, s
 
 
 def read_names(path: Path) -> list[str]:
-    """Image names, one a line; # starts a comment."""
+    """Read image names from a text file: one on each line. A line that starts with # is a comment.
+
+    Raises:
+      UserError: not text, or no names in it.
+    """
     try:
         lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -113,23 +142,25 @@ def read_names(path: Path) -> list[str]:
 
 
 class Similarity(NamedTuple):
-    """x -> scale * rotation @ x + translation."""
+    """The map x -> scale * rotation @ x + translation."""
 
     scale: float
     rotation: np.ndarray
+    """float64 (3, 3)."""
     translation: np.ndarray
+    """float64 (3,)."""
 
 
 def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
-    """The similarity that takes `source` to `target` with least squared error.
+    """The similarity that takes `source` to `target` with the least squared error.
 
-    pycolmap 4.2's `estimate_sim3d` gives nothing for points on one plane (measured: none of 200
-    random sets), and cameras carried at one height are such points.
+    It is computed here because `estimate_sim3d` of pycolmap 4.2 gives nothing for points on a plane
+    (measured: none of 200 random sets), and cameras carried at one height are such points.
+
+    Source: Umeyama 1991, equations 40-43.
 
     Args:
       source, target: float64 (n, 3), not on one line.
-
-    Source: Umeyama 1991, equations 40-43.
     """
     mean0, mean1 = source.mean(0), target.mean(0)
     a, b = source - mean0, target - mean1
@@ -167,8 +198,12 @@ def align(ours: np.ndarray, reference: np.ndarray) -> Similarity:
 def common_alignment(
     model: Poses, reference: Poses, *, align_on: Collection[str] | None = None
 ) -> tuple[dict[str, str], list[str], Similarity]:
-    """Our name -> the reference's of the common images, those aligned on, and the similarity that
-    takes the model to the reference; arguments and errors as `evaluate`."""
+    """Align a model to reference poses. Arguments and errors are those of `evaluate`.
+
+    Returns:
+      our name -> the reference's name, of the common images; our names of those aligned on; the
+      similarity that takes the model to the reference.
+    """
     names = pair_names(model, reference)
     if not names:
         raise UserError(
@@ -192,13 +227,13 @@ def common_alignment(
 def evaluate(
     model: Poses, reference: Poses, *, align_on: Collection[str] | None = None
 ) -> Evaluation:
-    """Errors of a model's poses against reference poses.
+    """Compare the poses of a model with reference poses.
 
     Args:
       model: poses by image name (`jaxsfm.model_poses`).
       reference: poses by image name (`jaxsfm.read_poses`).
-      align_on: names (the model's or the reference's) whose centres fix the similarity; default
-        all common ones.
+      align_on: names (the model's or the reference's) of the images whose centres determine the
+        similarity. By default these are all common images.
 
     Raises:
       UserError: no common images, unknown names, or centres that determine no similarity.
@@ -211,7 +246,7 @@ def evaluate(
             ours.rotation @ sim.rotation.T,
             sim.scale * sim.rotation @ ours.centre + sim.translation,
         )
-        errors[name] = ImageError(
+        errors[name] = PoseError(
             position=float(np.linalg.norm(moved.centre - truth.centre)),
             rotation_deg=float(rotation_angle_deg(moved.rotation, truth.rotation)),
         )

@@ -13,17 +13,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxsfm.colmap.database import (
-    VerificationOptions,
-    drop_pairs,
-    read_images,
-    verify,
-    write_database,
-)
+from jaxsfm.colmap.database import drop_pairs, read_images, write_database
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
 from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
 from jaxsfm.colmap.models import colour_points, read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
@@ -51,7 +46,7 @@ class Reconstructed:
     models: "list[pycolmap.Reconstruction]"
     """The model with most images first; empty if there is none."""
     verdicts: dict[Pair, Verdict]
-    """What the view graph says of each pair; empty where it is switched off."""
+    """The view graph's decision on each pair; empty if it is switched off."""
     verified: dict[Pair, int]
     """Number of COLMAP's two-view inliers, by pair that has any."""
     angles: dict[Pair, float]

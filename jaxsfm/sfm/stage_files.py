@@ -16,10 +16,10 @@ FIGURES = "figures.json"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VerificationFigures:
-    """What verification and the view graph say of the pairs."""
+    """The results of verification and of the view graph."""
 
     verdicts: dict[Pair, Verdict]
-    """Those of the view graph, by pair; empty where it is switched off."""
+    """The view graph's decisions, by pair; empty if it is switched off."""
     verified: dict[Pair, int]
     """Number of two-view inliers, by pair that has any."""
     angles: dict[Pair, float]

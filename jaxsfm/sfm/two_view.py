@@ -1,8 +1,9 @@
-"""Robust fundamental matrices and homographies for the benchmarks: OpenCV's MAGSAC++, seeded.
+"""Robust fundamental matrices and homographies for the benchmarks: OpenCV's MAGSAC++ with a seed.
 
-One estimator with one setting for every method compared, so that the rows differ in the matches
-alone. A fundamental matrix is the best of several after robust least squares over all matches:
-single ones of one pair differ more with the seed than methods do (docs/decisions/benchmarks.md).
+All methods that are compared have the same estimator with the same settings, so that only their
+matches differ. A fundamental matrix is the best of several, after robust least squares over all
+matches, because single ones differ more with the seed than methods do
+(docs/decisions/benchmarks.md).
 """
 
 from collections.abc import Callable
@@ -13,9 +14,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 THRESHOLD_PX = 1.0
-"""Of the estimator's inliers; MAGSAC++ marginalises over the noise below it."""
+"""Largest error of an inlier. MAGSAC++ marginalises over the noise below it."""
 STARTS = 5
-"""MAGSAC++ fundamental matrices that are refined, of which the best stays."""
+"""Number of fundamental matrices of MAGSAC++ that are refined. The best one is taken."""
 MAX_ITERATIONS = 20_000
 CONFIDENCE = 0.9999
 
@@ -54,8 +55,15 @@ def _estimate(
 def epipolar_residuals(
     f: np.ndarray, xy0: np.ndarray, xy1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x1' F x0 (n,) of matches (n, 2), and the squared norms (n,) of the normals of their epipolar
-    lines in image 0 and in image 1."""
+    """The epipolar residuals of matches, and the squared norms of their epipolar lines' normals.
+
+    Args:
+      f: (3, 3), with x1' F x0 = 0.
+      xy0, xy1: matches (n, 2), pixels.
+
+    Returns:
+      float64 (n,) x1' F x0; float64 (n,) squared norms in image 0; the same in image 1.
+    """
     x0, x1 = (np.column_stack([xy, np.ones(len(xy))]) for xy in (xy0, xy1))
     line1, line0 = x0 @ f.T, x1 @ f
     norm0, norm1 = (np.square(line[:, :2]).sum(1) for line in (line0, line1))
@@ -72,13 +80,13 @@ def sampson_error(f: np.ndarray, xy0: np.ndarray, xy1: np.ndarray) -> np.ndarray
 
 
 def _geman_mcclure(z: np.ndarray) -> np.ndarray:
-    """Loss z / (1 + z) of squared errors, and two derivatives, as `least_squares` wants them."""
+    """The loss z / (1 + z) of squared errors, and two derivatives, in `least_squares`' form."""
     w = 1 / (1 + z)
     return np.stack([z * w, w**2, -2 * w**3])
 
 
 def _to_pixels(xy: np.ndarray) -> np.ndarray:
-    """(3, 3): from coordinates of mean 0 and deviation 1."""
+    """The matrix (3, 3) from coordinates of mean 0 and deviation 1 to pixels."""
     scale, (x, y) = max(xy.std(), 1e-9), xy.mean(axis=0)
     return np.asarray([[scale, 0, x], [0, scale, y], [0, 0, 1]])
 
@@ -86,12 +94,16 @@ def _to_pixels(xy: np.ndarray) -> np.ndarray:
 def refine_fundamental_matrix(
     f: np.ndarray, xy0: np.ndarray, xy1: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """F where the Sampson errors want it, and what is left of them (Geman-McClure's loss of
-    THRESHOLD_PX, which far matches hardly move).
+    """Refine a fundamental matrix by robust least squares of Sampson errors.
 
-    Over the seven degrees of freedom: two orthogonal matrices and the ratio of the singular values
-    (Bartoli and Sturm 2004, "Nonlinear estimation of the fundamental matrix with minimal
-    parameters").
+    The loss is Geman-McClure's at THRESHOLD_PX, which wrong matches hardly change. F has seven
+    degrees of freedom: two orthogonal matrices and the ratio of the singular values.
+
+    Source: Bartoli and Sturm 2004, "Nonlinear estimation of the fundamental matrix with minimal
+    parameters".
+
+    Returns:
+      float64 (3, 3); the loss that is left.
     """
     to0, to1 = _to_pixels(xy0), _to_pixels(xy1)
     u, s, vt = np.linalg.svd(to1.T @ f @ to0)
@@ -113,7 +125,7 @@ def refine_fundamental_matrix(
 
 
 def fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.ndarray | None:
-    """F with x1' F x0 = 0 (float64 (3, 3)); None if there is none.
+    """Find the fundamental matrix F (float64 (3, 3)) with x1' F x0 = 0; None if there is none.
 
     Args:
       xy0, xy1: matches (n, 2), pixels.
@@ -126,7 +138,7 @@ def fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.nda
 
 
 def homography(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.ndarray | None:
-    """H with x1 ~ H x0 (float64 (3, 3)); None if there is none.
+    """Find the homography H (float64 (3, 3)) with x1 ~ H x0; None if there is none.
 
     Args:
       xy0, xy1: matches (n, 2), pixels.

@@ -1,11 +1,11 @@
-"""Which verified pairs to trust: a view graph whose rotations agree.
+"""The view graph: which verified pairs to trust, because their rotations agree.
 
-Scenes that repeat themselves (courtyards, rows of windows) verify pairs of images that show
-different walls. Each such pair looks sound by itself; together they contradict the rest. The
-evidence is compared, strongest first:
+In scenes that repeat themselves (courtyards, rows of windows), pairs of images that show different
+walls are verified. Each such pair looks sound by itself, but contradicts the other pairs. The pairs
+are compared, the strongest first:
 
-1. A pair's *strength* is its inliers relative to what its two images reach with their best partners
-   (geometric mean), times how far the inliers spread over the smaller of their two regions.
+1. A pair's *strength* is its number of inliers, times the root of the share of the image that they
+   cover, relative to the best pairs of its two images (geometric mean).
 2. Pairs are joined strongest first, as in a maximum spanning tree. Where two groups of images meet,
    the pairs between them vote, with their strengths, on the rotation between the groups; the
    largest group of agreeing votes decides.
@@ -13,9 +13,9 @@ evidence is compared, strongest first:
    whose own rotation is further than `tolerance_deg` from them is dropped, unless it is strong:
    then its rotation may be poor (a plane, a guessed focal length), but its matches are sound.
 
-So a false pair can survive only where nothing stronger speaks against it. Nothing depends on the
-order of images or pairs. On castle-P19 the false pairs are off by 75-180 deg and hold 0.01-0.09 of
-their images' best counts; true pairs are off by less than 10 deg with one exception in 90.
+So a false pair is trusted only where no stronger pair contradicts it. The order of images and pairs
+has no effect. On castle-P19 the rotations of false pairs are off by 75-180 deg, and their strength
+is 0.01-0.09. Those of true pairs are off by less than 10 deg, with one exception in 90.
 """
 
 import dataclasses
@@ -27,25 +27,25 @@ from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.io.pairs import Pair
 
 STRONG = 0.3
-"""Strength above which a pair is trusted whatever its rotation; false pairs reached 0.09."""
+"""A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09."""
 TOLERANCE_DEG = 15.0
-"""How far a trusted pair's rotation may be from the averaged ones. Two-view rotations of true pairs
-are good to 0.3 deg (median), of weak ones to 10."""
+"""Largest error of a trusted pair's rotation against the averaged ones. Two-view rotations of true
+pairs are off by 0.3 deg (median), those of weak pairs by 10."""
 MAX_VOTES = 500
-"""Strongest pairs between two groups that vote: the vote is quadratic in them."""
+"""At most so many pairs between two groups vote, the strongest ones: the cost is quadratic."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """Whether a pair is trusted, and why not."""
+    """Whether a pair is trusted, and if not, why."""
 
     trusted: bool
     strength: float
-    """0 .. 1; 1: as many inliers as the best pair of both images, all over the image."""
+    """0 .. 1, see the module. 1: it is the best pair of both its images."""
     rotation_error_deg: float | None
-    """Own rotation against the averaged ones."""
+    """The pair's own rotation against the averaged ones; None: it has none."""
     reason: str = ""
-    """Empty for trusted pairs."""
+    """Why it is not trusted; empty for trusted pairs."""
 
 
 def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -55,7 +55,7 @@ def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
-    """Every pair's strength, see the module."""
+    """The strength of every pair, 0 .. 1 (see the module)."""
     weight = {p: g.num_inliers * np.sqrt(g.spread) for p, g in geometries.items()}
     best: dict[str, float] = {}
     for pair, w in weight.items():
@@ -70,11 +70,14 @@ def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
 def trusted_pairs(
     geometries: Mapping[Pair, PairGeometry], *, tolerance_deg: float = TOLERANCE_DEG
 ) -> dict[Pair, Verdict]:
-    """A verdict for every pair.
+    """Decide for every pair whether it is trusted.
 
     Args:
-      geometries: by pair of image names (the lesser first).
+      geometries: by pair of image names, in order.
       tolerance_deg: see `TOLERANCE_DEG`.
+
+    Raises:
+      ValueError: `tolerance_deg` is not between 0 and 180.
     """
     if not 0 < tolerance_deg < 180:
         raise ValueError(f"tolerance_deg must lie in (0, 180); got {tolerance_deg}")
@@ -126,7 +129,7 @@ def _grow(
     strength: Mapping[Pair, float],
     tolerance_deg: float,
 ) -> Rotations:
-    """Camera rotations (world to camera), each connected group of images in a frame of its own."""
+    """Camera rotations (world to camera). Each connected group of images has a world of its own."""
     names = sorted({image for pair in ranked for image in pair})
     index = {name: k for k, name in enumerate(names)}
     ends = np.asarray([[index[a], index[b]] for a, b in ranked]).reshape(-1, 2)
@@ -145,10 +148,12 @@ def _grow(
         in_a = np.where(swap, ends[rows, 1], ends[rows, 0])
         in_b = np.where(swap, ends[rows, 0], ends[rows, 1])
         turned = np.where(swap[:, None, None], relative[rows].transpose(0, 2, 1), relative[rows])
-        # World of b -> world of a, as each pair has it.
+        # From the world of b to the world of a, as each pair determines it.
         moves = rotations[in_a].transpose(0, 2, 1) @ turned.transpose(0, 2, 1) @ rotations[in_b]
         close = rotation_angle_deg(moves[:, None], moves[None]) < tolerance_deg
-        winner = int(np.argmax(close @ votes[rows]))  # the first of equals is the strongest
+        winner = int(
+            np.argmax(close @ votes[rows])
+        )  # among equals the first, which is the strongest
         move = mean_rotation(moves[close[winner]], votes[rows][close[winner]])
         members = group == b
         rotations[members] = rotations[members] @ move.T
@@ -157,7 +162,7 @@ def _grow(
 
 
 def mean_rotation(rotations: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The rotation nearest to the weighted mean of (n, 3, 3) (chordal L2 mean)."""
+    """The chordal L2 mean of rotations (n, 3, 3): the rotation nearest to their weighted mean."""
     u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, rotations))
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
@@ -165,8 +170,11 @@ def mean_rotation(rotations: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def _average(
     rotations: Rotations, pairs: Iterable[Pair], geometries: Mapping[Pair, PairGeometry]
 ) -> Rotations:
-    """Robust rotation averaging: every image in turn takes the mean of what its pairs imply,
-    weighted by inliers over (1 + (error / 2 deg)^2)^2, until nothing moves."""
+    """Average rotations robustly.
+
+    Every image in turn takes the mean of the rotations that its pairs imply, until nothing moves.
+    The weights are inliers / (1 + (error / 2 deg)^2)^2.
+    """
     around: dict[str, list[tuple[str, np.ndarray, int]]] = {}
     for pair in sorted(pairs):
         relative, count = _rotation(pair, geometries), geometries[pair].num_inliers

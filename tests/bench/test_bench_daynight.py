@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.daynight import Made, judge, summary
+from jaxsfm.bench.daynight import SubsetModel, judge, summary
 from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
+from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Subset
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose, read_poses
@@ -37,15 +38,15 @@ def simple(tmp_path_factory):
 
 
 def test_every_image_of_a_strecha_set_is_the_night_once(strecha, tmp_path):
-    options = {"seed": 0, "denoise": True, "jpeg": True}
-    made = scenes.synthetic_scene(strecha / "room", tmp_path / "a", severity=1, **options)
+    options = DayNightOptions(root=strecha, severity=1)
+    made = scenes.synthetic_scene(strecha / "room", tmp_path / "a", options)
     day = sorted(name for name in made.images if not name.startswith("night/"))
     assert len(made.subsets) == len(day) == 3 and len(made.images) == 6 and made.synthetic
     for subset in made.subsets:
         own = next(n for n in day if subset.night == f"night/{n.rpartition('.')[0]}.png")
         assert subset.day == [name for name in day if name != own]
         assert made.truth[subset.night] is made.truth[own]
-    again = scenes.synthetic_scene(strecha / "room", tmp_path / "b", severity=1, **options)
+    again = scenes.synthetic_scene(strecha / "room", tmp_path / "b", options)
     assert {n: i.sha256 for n, i in made.images.items()} == {
         n: i.sha256 for n, i in again.images.items()
     }
@@ -109,6 +110,7 @@ def test_damaged_scenes_are_named_before_the_first_run(simple, tmp_path, capsys,
     assert word in said.err and "Traceback" not in said.err and "rootsift" not in said.out
 
 
+@pytest.mark.slow
 def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monkeypatch):
     """Two nights: neither reconstruction may hold the other's night photo."""
     from jaxsfm.bench import daynight
@@ -119,9 +121,10 @@ def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monke
     shutil.copy(night, room / "night" / "again.png")
     made = scenes.simple_scene(room)
     assert len(made.subsets) == 2
+    options = DayNightOptions(root=tmp_path, threads=1)
     for runs in (
-        daynight._rootsift_models(made, tmp_path, 0, 1),
-        daynight._dense_models(made, tmp_path, "paper", 0, 1),
+        daynight._rootsift_models(made, tmp_path, options),
+        daynight._dense_models(made, tmp_path, "paper", options),
     ):
         for (poses, matches), subset in zip(runs, made.subsets, strict=True):
             assert subset.night in poses and set(poses) <= {*subset.day, subset.night}
@@ -176,15 +179,15 @@ def test_the_night_camera_is_judged_after_a_similarity_from_the_day():
     moved = {name: CameraPose(pose.rotation, 3 * pose.centre + 5) for name, pose in truth.items()}
     moved["n"] = CameraPose(moved["n"].rotation, moved["n"].centre + [0.6, 0, 0])
     subset = Subset(names[:4], "n")
-    row = judge(Made(moved, None), subset, truth)
+    row = judge(SubsetModel(moved, None), subset, truth)
     assert row["registered"] and row["day_registered"] == 4
     assert row["position"] == pytest.approx(0.2) and row["rotation_deg"] < 1e-6
     del moved["n"]
-    assert "position" not in judge(Made(moved, None), subset, truth)
+    assert "position" not in judge(SubsetModel(moved, None), subset, truth)
     lonely = {name: truth[name] for name in ("a", "n")}
-    row = judge(Made(lonely, None), subset, truth)
+    row = judge(SubsetModel(lonely, None), subset, truth)
     assert row["registered"] and "not_evaluated" in row and row["day_registered"] == 1
-    assert judge(Made({}, NightMatches(9, 4)), subset, truth) == {
+    assert judge(SubsetModel({}, NightMatches(9, 4)), subset, truth) == {
         "night": "n",
         "registered": False,
         "has_truth": True,
@@ -236,6 +239,7 @@ def test_unregistered_nights_count_in_the_shares():
     assert summary([unknown])["within"] is None and summary([])["within"] is None
 
 
+@pytest.mark.slow
 def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
     out = tmp_path / "figures.json"
     args = ["bench", "daynight", "--root", str(simple), "--json", str(out), "--threads", "1"]

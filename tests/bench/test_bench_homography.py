@@ -113,6 +113,7 @@ def test_area_under_the_curve_is_that_of_the_steps():
     assert area_under_curve([0, 0], 3) == 1 and area_under_curve([None, 3], 3) == 0
 
 
+@pytest.mark.slow
 def test_a_warped_photograph_is_matched(root, tmp_path, capsys):
     out = tmp_path / "f.json"
     args = ["bench", "homography", "--root", str(root), "--json", str(out), "--seeds", "2"]

@@ -19,6 +19,7 @@ def root(tmp_path, photos):
     return folder
 
 
+@pytest.mark.slow
 def test_untrained_scores_measure_as_the_norm_rule_does(root, tmp_path, capsys):
     relocalizer, out = tmp_path / "a.safetensors", tmp_path / "figures.json"
     save_relocalizer(relocalizer, jax.device_get(init_scores(jax.random.key(0), hidden=2)), {})

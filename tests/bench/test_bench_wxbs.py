@@ -10,7 +10,7 @@ import pytest
 from epipolar import two_views
 from strategies import rng_of
 
-from jaxsfm.bench.common import ABLATED, method_config
+from jaxsfm.bench.methods import ABLATED, method_config
 from jaxsfm.bench.wxbs import mean_average_accuracy, means, symmetric_epipolar_error
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
@@ -82,6 +82,7 @@ def root(scene, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_rendered_pair_scores_well_and_repeats(root, tmp_path, capsys):
     out = tmp_path / "figures.json"
     args = ["bench", "wxbs", "--root", str(root), "--json", str(out), "--seeds", "2"]

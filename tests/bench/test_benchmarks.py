@@ -21,6 +21,7 @@ def test_ratios_are_taken_turn_by_turn():
     assert metric.value == 2.0
 
 
+@pytest.mark.slow
 def test_homographies_are_measured_with_their_accuracy(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(benchmarks, "BASELINE", tmp_path / "baseline.json")
     assert benchmarks.main(only=("homographies",), update=True) == 0

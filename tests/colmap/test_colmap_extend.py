@@ -6,13 +6,13 @@ import pytest
 from PIL import Image
 
 from jaxsfm.colmap.database import (
-    VerificationOptions,
     camera_for,
     read_images,
     read_matches,
     write_database,
 )
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.io import atomic

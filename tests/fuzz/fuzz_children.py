@@ -1,7 +1,8 @@
-"""Fuzz cases in a process of their own: native code that crashes or loops does not end the tests.
+"""Fuzz cases in a process of their own, so that native code may crash or loop there.
 
-As a script: MODULE FUNCTION FIRST-CASE NUMBER SCRATCH. The function gets a case's generator and the
-scratch folder, and returns in a word what became of the case. To repeat case 7 alone:
+As a script it takes MODULE FUNCTION FIRST-CASE NUMBER SCRATCH. The function gets a case's random
+generator and the scratch folder, and returns what became of the case in a word. To repeat case 7
+alone:
 `JAXSFM_FUZZ_SEED=0 python tests/fuzz/fuzz_children.py test_fuzz_images image 7 1 /some/folder`.
 """
 
@@ -15,21 +16,21 @@ from collections import Counter
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-sys.path[:0] = [str(TESTS), str(TESTS / "conversion"), str(TESTS.parent)]
+sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
 from mutations import SEED, rng_of  # noqa: E402
 
 ROOM = 2 << 30
-"""Bytes of address space a child may take beyond its imports: what a header claims is not
-allocated."""
+"""Bytes of address space that a child may take beyond its imports, so that the size that a damaged
+header claims cannot be allocated."""
 
 
 def run_cases(
     module: str, function: str, count: int, scratch: Path, *, patience_s: float = 100
 ) -> Counter:
-    """How many cases ended how.
+    """Run cases; returns how many of them ended how.
 
-    One that raises, ends its process or takes too long fails the test, which names it.
+    A case that raises, ends its process or takes too long fails the test, and the failure names it.
     """
     command = [sys.executable, __file__, module, function, "0", str(count), str(scratch)]
     known = {"JAX_PLATFORMS": "cpu", "JAXSFM_FUZZ_SEED": str(SEED)}

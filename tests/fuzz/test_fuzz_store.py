@@ -188,19 +188,19 @@ def stage(rng, folder) -> str:
 
 
 @pytest.mark.parametrize("kind, count", [("file_bytes", 500), ("arrays", 300)])
-def test_damaged_features_and_matches_are_none_or_right(tmp_path, kind, count):
-    found = run_cases("test_fuzz_store", kind, count, tmp_path)
-    assert found["none"] > count / 2 and found.total() == count
+def test_damaged_features_and_matches_are_none_or_right(tmp_path, share, kind, count):
+    found = run_cases("test_fuzz_store", kind, round(count * share), tmp_path)
+    assert found["none"] > share * count / 2 and found.total() == round(share * count)
 
 
-def test_damaged_records_of_a_folder_are_ignored_or_refused(tmp_path):
-    found = run_cases("test_fuzz_store", "record", 300, tmp_path)
-    assert found["read"] > 50 and found["refused"] > 20
+def test_damaged_records_of_a_folder_are_ignored_or_refused(tmp_path, share):
+    found = run_cases("test_fuzz_store", "record", round(300 * share), tmp_path)
+    assert found["read"] > 50 * share and found["refused"] > 20 * share
 
 
-def test_a_damaged_stage_is_made_again(tmp_path):
-    found = run_cases("test_fuzz_store", "stage", 100, tmp_path)
-    assert found["none"] > 90
+def test_a_damaged_stage_is_made_again(tmp_path, share):
+    found = run_cases("test_fuzz_store", "stage", round(100 * share), tmp_path)
+    assert found["none"] > 90 * share
 
 
 class _Attack:

@@ -56,7 +56,7 @@ def test_what_a_kill_or_a_full_disk_cut_short_is_dropped_once_and_the_rest_stays
         entries[name].write_bytes(program[:size])
     assert drop_cut_short(tmp_path) == 3
     assert [name for name, entry in entries.items() if entry.exists()] == ["whole"]
-    # Found whole once, it is not read again: starting must not cost more with every program.
+    # A whole entry is not read again, so that the start does not get slower with each program.
     entries["whole"].write_bytes(b"")
     os.utime(entries["whole"], (0, 0))
     assert drop_cut_short(tmp_path) == 0

@@ -40,7 +40,7 @@ def test_missing_folder_a_file_and_an_empty_folder_are_refused_by_name(tmp_path)
     for path, message in (
         (tmp_path / "none", "no such folder"),
         (tmp_path / "file.jpg", "not a folder"),
-        (tmp_path / "empty", "no images here"),
+        (tmp_path / "empty", "there are no images in this folder"),
     ):
         with pytest.raises(UserError, match=message) as error:
             find_images(path)
@@ -109,14 +109,14 @@ def test_a_truncated_png_is_refused_when_decoded(tmp_path):
 
 
 def test_a_jpeg_with_bytes_after_its_end_is_whole(tmp_path):
-    """Phones append a film; somewhere in it there is an SOS marker by chance."""
+    """Phones append a film, in which there may be the bytes of an SOS marker."""
     path = jpeg(tmp_path / "motion.jpg", noise(64, 96))
     path.write_bytes(path.read_bytes() + b"film \xff\xda film")
     assert inspect_image(path).size == (96, 64)
 
 
 def test_a_name_that_is_not_text_is_refused_before_the_work(tmp_path):
-    """COLMAP's database takes UTF-8 only: else a run ends after all its matching."""
+    """COLMAP's database takes UTF-8 only; without the check a run would end after its matching."""
     name = "caf\udce9.png"  # Latin-1 bytes, as the file system hands them over
     write_png(tmp_path / "a.png", noise(64, 64)).rename(tmp_path / name)
     assert find_images(tmp_path) == [name]
@@ -133,7 +133,7 @@ def test_images_of_the_same_content_share_their_identity(tmp_path):
 
 
 def test_only_our_own_limit_refuses_a_large_jpeg(tmp_path):
-    """Pillow's limit for bombs (179 million pixels) lies below MAX_DECODED_PIXELS."""
+    """Pillow's own limit (179 million pixels) is below MAX_DECODED_PIXELS."""
     data = bytearray(jpeg(tmp_path / "a.jpg", noise(64, 64)).read_bytes())
     frame = data.index(b"\xff\xc0")
     data[frame + 5 : frame + 9] = 2 * (20_000).to_bytes(2, "big")

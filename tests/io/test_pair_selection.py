@@ -1,4 +1,4 @@
-"""What `--pairs` means."""
+"""The option `--pairs` selects the pairs that it names."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Which pairs are tried and which are handed on."""
+"""Files of pairs are read or refused by line; the best pairs are those of the definition."""
 
 import math
 
@@ -70,12 +70,12 @@ def test_pairs_come_out_sorted(tmp_path):
     [
         ("a.jpg b.jpg\n\na.jpg x.jpg", "line 3: no image named 'x.jpg'"),
         ("x.jpg\ta.jpg", "line 1: no image named 'x.jpg'"),
-        ("# c\na.jpg a.jpg", "line 2: 'a.jpg' paired with itself"),
+        ("# c\na.jpg a.jpg", "line 2: 'a.jpg' is paired with itself"),
         ("a.jpg", "line 1: expected two image names"),
         ("a.jpg b.jpg 0.5", "line 1: expected two image names"),
         ("a.jpg\t", "line 1: expected two image names"),
-        ("", "no pairs in it"),
-        ("# nothing\n\n", "no pairs in it"),
+        ("", "lists no pairs"),
+        ("# nothing\n\n", "lists no pairs"),
     ],
 )
 def test_a_bad_file_is_refused_with_its_line(tmp_path, text, message):
@@ -119,7 +119,7 @@ def test_without_ties_best_pairs_do_not_depend_on_names(counts, n, names):
 @law
 @given(graphs, st.integers(1, 4))
 def test_a_pair_stays_iff_fewer_than_n_beat_it_on_one_side(counts, n):
-    """The definition, slowly; ties by the other image's name."""
+    """The definition, computed slowly; equal counts are decided by the other image's name."""
 
     def better(pair, image):
         other = next(name for name in pair if name != image)

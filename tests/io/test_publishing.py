@@ -1,4 +1,4 @@
-"""Results take the place of former ones together, wherever the process is killed."""
+"""New results replace the old ones together, wherever the process is killed."""
 
 import shutil
 from pathlib import Path
@@ -30,7 +30,7 @@ def content(folder: Path) -> dict[str, str]:
 
 
 def killed_after(monkeypatch, steps: int) -> list[int]:
-    """Let so many renames and removals happen; counts them."""
+    """Let this many renames and removals happen, and count them."""
     done = [0]
 
     def counted(original):
@@ -101,7 +101,7 @@ def test_a_failure_while_results_are_made_leaves_the_old_ones(tmp_path):
             write_results(fresh, "new", ("report.json",))
             raise Killed
         assert set(content(tmp_path).values()) == {"old"}
-        with folder.publish() as fresh:  # and does not stand in the way
+        with folder.publish() as fresh:  # nor does it prevent the next run
             write_results(fresh, "newer")
     assert set(content(tmp_path).values()) == {"newer"}
 

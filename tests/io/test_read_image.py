@@ -21,7 +21,7 @@ def two_colours(height: int = 64, width: int = 96) -> np.ndarray:
 
 
 def write_png(path: Path, rgb: np.ndarray) -> Path:
-    """`rgb` may be grey, RGB or RGBA, of 8 or 16 bits."""
+    """Write an image that is grey, RGB or RGBA, with 8 or 16 bits."""
     if rgb.ndim == 3:
         code = cv2.COLOR_RGB2BGR if rgb.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
         rgb = cv2.cvtColor(rgb, code)
@@ -135,16 +135,16 @@ def test_what_cannot_be_decoded_reduced_is_refused_by_name(tmp_path, monkeypatch
     png = inspect_image(write_png(tmp_path / "huge.png", two_colours(100, 100)))
     photo = inspect_image(jpeg(tmp_path / "huge.jpg", two_colours(100, 100)))
     monkeypatch.setattr(images, "MAX_DECODED_PIXELS", 100)
-    for image in (png, photo):  # 1/8 of the photo is still too much
+    for image in (png, photo):  # the photo is too large even at 1/8 of its size
         with pytest.raises(ImageError, match=f"{image.name}: 100 x 100 pixels is more than"):
             read_image(image, max_size=96)
 
 
 def test_a_photo_changed_since_it_was_inspected_is_refused(tmp_path):
-    """What is made of it would be kept under its old content."""
+    """Else its features would be stored under the hash of the old content."""
     image = inspect_image(write_png(tmp_path / "a.png", two_colours()))
     write_png(tmp_path / "a.png", two_colours()[:, ::-1])
-    with pytest.raises(ImageError, match="a.png: the file was changed meanwhile") as error:
+    with pytest.raises(ImageError, match="a.png: the file has changed since") as error:
         read_image(image, max_size=1600)
     assert not isinstance(error.value, DamagedImage)
 

@@ -1,4 +1,4 @@
-"""Files of learned scores: what is written is read, anything else is refused by its path."""
+"""A file of learned scores is read as it was written; anything else is refused by its path."""
 
 import json
 import pickle

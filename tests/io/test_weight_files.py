@@ -1,4 +1,4 @@
-"""Converted weights: what is saved is loaded; anything else is refused by its path."""
+"""Converted weights are loaded as they were saved; anything else is refused by its path."""
 
 import dataclasses
 import json
@@ -115,7 +115,7 @@ def test_mutated_files_load_or_are_refused(good):
 
 
 def other_weights(layer: str, monkeypatch_params=None) -> weights.Weights:
-    """The installed ones with one number changed."""
+    """The installed weights with one number changed."""
     loaded = load_weights()
     tree = dict(loaded.params["params"])
     bias = tree[layer]["bias"].copy()

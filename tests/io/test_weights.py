@@ -1,4 +1,4 @@
-"""The weights file: known or refused, and never executed."""
+"""A file of weights is known or refused, and nothing in it is executed."""
 
 import builtins
 import os
@@ -55,7 +55,7 @@ def test_converted_weights_of_another_network_are_refused(tmp_path):
         about={"source": "a test"},
     )
     assert load_weights(path).backbone == "vgg16"
-    with pytest.raises(UserError, match="weights of vgg16; those of alexnet are needed"):
+    with pytest.raises(UserError, match="holds weights of vgg16, but --backbone is alexnet"):
         load_weights(path, backbone="alexnet")
     config = Config(backbone="alexnet")
     with pytest.raises(ValueError, match="weights must be of alexnet; got vgg16"):

@@ -1,4 +1,4 @@
-"""What a run keeps: whole files or none, bit for bit, under all that they depend on."""
+"""What a run stores is found again bit for bit, as long as nothing it depends on has changed."""
 
 import os
 
@@ -8,7 +8,7 @@ import pytest
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures
-from jaxsfm.io.images import ImageFile
+from jaxsfm.io.images import DamagedImage, ImageFile
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.store import SavedMatches, Store
 
@@ -57,7 +57,7 @@ def result(pair=("a.jpg", "b.jpg"), n: int = 5) -> PairResult:
 
 
 def assert_same(got, want) -> None:
-    """Equal field by field, arrays to the bit."""
+    """Whether all fields are equal, and arrays equal bit for bit."""
     for key, value in (want._asdict() if hasattr(want, "_asdict") else vars(want)).items():
         other = getattr(got, key)
         if isinstance(value, tuple) and value and isinstance(value[0], np.ndarray):
@@ -150,7 +150,7 @@ def test_an_interrupted_write_leaves_nothing_that_is_read(tmp_path, monkeypatch)
     assert folder.load_matches(result().pair) is None
     assert not folder.has_features(features().image)
     assert folder.load_features(features().image) is None
-    folder.save_matches(result())  # and it does not stand in the way
+    folder.save_matches(result())  # nor does it prevent saving
     assert_same(folder.load_matches(result().pair), result())
 
 
@@ -173,7 +173,7 @@ def test_saved_matches_are_read_when_asked_for(tmp_path):
     assert list(saved) == pairs and len(saved) == 2
     assert_same(saved[pairs[1]], result(pairs[1], 4))
     assert ("b.jpg", "c.jpg") not in saved and saved.get(("b.jpg", "c.jpg")) is None
-    folder.save_matches(result(("b.jpg", "c.jpg")))  # another run's, or not handed on
+    folder.save_matches(result(("b.jpg", "c.jpg")))  # a pair that was not chosen
     assert ("b.jpg", "c.jpg") not in saved
     for path in (tmp_path / "matches").rglob("*.npz"):
         path.write_bytes(b"")
@@ -188,12 +188,12 @@ def test_counts_say_what_a_result_holds():
 
 
 def test_everything_is_kept_under_all_that_it_depends_on(tmp_path):
-    """And under nothing else: what does not depend on a change is found again."""
+    """What does not depend on a change is found again."""
     store = opened(tmp_path)
     store.save_features(features())
     store.save_matches(result())
     store.save_descriptor(features().image, "kind", {"x": np.ones(3)})
-    store.mark_unusable(features(digit="b").image, "torn")
+    store.record_failure(features(digit="b").image, DamagedImage("torn"))
     other = {"images": IDENTITY["images"] | {"b.jpg": "other"}}
     fewer = {"images": {name: IDENTITY["images"][name] for name in ("a.jpg", "b.jpg")}}
     cases = [  # change, features, matches, descriptor, unusable

@@ -1,4 +1,4 @@
-"""A run's folder has one owner at a time; what changed since the last run is said."""
+"""A work folder has one owner at a time; the log says what changed since the last run."""
 
 import json
 import os
@@ -63,7 +63,7 @@ def test_a_run_of_other_photos_is_refused(tmp_path):
 @pytest.mark.parametrize("record", ["", "{", "[]", "null", '{"images": []}', "\x00"])
 def test_a_damaged_record_is_refused_not_overwritten(tmp_path, record):
     (tmp_path / "run.json").write_text(record)
-    with pytest.raises(UserError, match="holds another run"):
+    with pytest.raises(UserError, match="holds a run whose run.json is damaged"):
         with open_folder(tmp_path, IDENTITY):
             pytest.fail("opened")
     assert (tmp_path / "run.json").read_text() == record
@@ -82,7 +82,10 @@ def test_a_file_or_a_foreign_folder_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter1.tex").write_text("x")
-    for name, message in (("file", "is a file"), ("thesis", "not empty .*'chapter1.tex'")):
+    for name, message in (
+        ("file", "this is a file"),
+        ("thesis", "the folder is not empty .*'chapter1.tex'"),
+    ):
         with pytest.raises(UserError, match=f"{name}: {message}"):
             with open_folder(tmp_path / name, IDENTITY):
                 pytest.fail("opened")
@@ -124,7 +127,7 @@ def test_a_full_disk_is_reported_as_such_and_leaves_no_partial_file(tmp_path, mo
 def test_what_would_not_fit_on_the_disk_is_refused_before_native_code_begins(
     tmp_path, monkeypatch, what
 ):
-    """COLMAP would end the process, or write a model that is cut off."""
+    """On a full disk COLMAP would end the process, or write a model that is cut off."""
     from jaxsfm.colmap.database import write_database
     from jaxsfm.colmap.models import write_models
 

@@ -67,6 +67,7 @@ def assert_same_matches(ours, expected):
             np.testing.assert_array_equal(getattr(ours[pair], field), getattr(want, field))
 
 
+@pytest.mark.slow
 def test_memory_for_two_images_gives_the_same_matches(features, matches):
     tight = Execution(memory_gb=1e-6)
     pairs = list(matches)[::-1]
@@ -78,6 +79,7 @@ def test_memory_for_two_images_gives_the_same_matches(features, matches):
     assert_same_matches({(a, b): alone}, {(a, b): want})
 
 
+@pytest.mark.slow
 def test_pairs_side_by_side_give_the_same_matches_up_to_rounding(features, matches):
     together = Execution(pairs_at_once=3)
     ours = jaxsfm.match(features, list(matches), config=preset("default"), execution=together)
@@ -87,6 +89,7 @@ def test_pairs_side_by_side_give_the_same_matches_up_to_rounding(features, match
         assert len(same) >= 0.99 * max(len(cells), len(ours[pair].cells))
 
 
+@pytest.mark.slow
 def test_images_side_by_side_give_the_same_features_up_to_rounding(weights, images, features):
     together = Execution(images_at_once=3)
     ours = jaxsfm.extract(weights, images, config=preset("default"), execution=together)
@@ -118,6 +121,7 @@ print(json.dumps([len(everything[0]), [all(a == b for a, b in zip(everything[0],
 """
 
 
+@pytest.mark.slow
 def test_any_number_of_devices_gives_what_one_gives_bit_for_bit(folder):
     """Three devices for five images and ten pairs: the last batches are not full."""
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}

@@ -52,6 +52,7 @@ def kill_a_busy_worker(killed: list[int]) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_a_killed_worker_and_a_damaged_photo_change_nothing(scene, tmp_path, monkeypatch, capsys):
     """SIGKILL while it matches; the damaged photo is found by a worker."""
     photos = tmp_path / "photos"

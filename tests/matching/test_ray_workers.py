@@ -91,11 +91,13 @@ def results(work, count: int = 40, number: int = WORKERS) -> list:
         return sorted(workers.results(pieces(workers, count)))
 
 
+@pytest.mark.slow
 def test_every_item_has_its_result_once(cluster):
     assert results(echo) == SQUARES
 
 
 @pytest.mark.parametrize(("number", "item"), [(WORKERS, 19), (1, 39)], ids=["two", "last of one"])
+@pytest.mark.slow
 def test_a_killed_worker_is_replaced_and_every_item_still_comes_once(
     cluster, tmp_path, number, item
 ):
@@ -103,6 +105,7 @@ def test_a_killed_worker_is_replaced_and_every_item_still_comes_once(
     assert (tmp_path / "note").exists()
 
 
+@pytest.mark.slow
 def test_workers_compute_with_as_many_threads_as_this_process(cluster, monkeypatch):
     """With one thread instead of two, features differ in their last place."""
     assert set(results(threads_there, 3)) == {(k, str(xla_threads())) for k in range(3)}
@@ -110,6 +113,7 @@ def test_workers_compute_with_as_many_threads_as_this_process(cluster, monkeypat
     assert set(results(threads_there, 3)) == {(k, "7") for k in range(3)}
 
 
+@pytest.mark.slow
 def test_few_pieces_are_out_at_a_time(cluster):
     """However many there are: those at the workers, and none before the first worker is there."""
     come, most = [], 0
@@ -121,6 +125,7 @@ def test_few_pieces_are_out_at_a_time(cluster):
     assert sorted(come) == SQUARES and 2 <= most <= TASKS_PER_WORKER * WORKERS
 
 
+@pytest.mark.slow
 def test_an_item_that_kills_its_workers_ends_the_run_with_a_sentence(cluster):
     come = []
     with (
@@ -131,11 +136,13 @@ def test_an_item_that_kills_its_workers_ends_the_run_with_a_sentence(cluster):
 
 
 @pytest.mark.parametrize("error", [UserError("photo 3 is too large"), MemoryError("no room")])
+@pytest.mark.slow
 def test_an_error_in_a_worker_is_the_same_error_here(cluster, error):
     with pytest.raises(type(error), match=f"^{error}$"):
         results(Fails(error))
 
 
+@pytest.mark.slow
 def test_what_has_come_is_handed_out_before_an_interrupt(cluster):
     come, given = [], []
     with worker_pool(echo, address=None, workers=WORKERS) as workers:
@@ -149,6 +156,7 @@ def test_what_has_come_is_handed_out_before_an_interrupt(cluster):
     assert sorted(k for k, _ in come) == sorted(k for piece in given for k in piece.items)
 
 
+@pytest.mark.slow
 def test_workers_with_other_packages_are_refused(cluster, monkeypatch):
     ours = workers.package_versions() | {"jaxsfm": "9.9"}
     monkeypatch.setattr(workers, "package_versions", lambda: ours)

@@ -83,6 +83,7 @@ def test_photos_of_one_thing_find_each_other(before, kind):
     assert nearest_pairs(vectors, 99) == jaxsfm.exhaustive_pairs(vectors)
 
 
+@pytest.mark.slow
 def test_the_shortlist_does_not_depend_on_the_order_of_photos(weights, images, before):
     pairs = jaxsfm.shortlist(weights, images[::-1], k=1)
     assert pairs == nearest_pairs(before[1]["vlad"].vectors, 1)
@@ -107,6 +108,7 @@ def test_what_is_damaged_is_made_again_and_equal(weights, images, before, again,
     assert_same(found.vectors, before[1][kind].vectors)
 
 
+@pytest.mark.slow
 def test_local_descriptors_that_went_away_meanwhile_are_made_again(
     weights, images, before, again, computed, monkeypatch
 ):
@@ -124,6 +126,7 @@ def test_local_descriptors_that_went_away_meanwhile_are_made_again(
     assert_same(found.vectors, before[1]["vlad"].vectors)
 
 
+@pytest.mark.slow
 def test_a_new_photo_is_the_only_one_computed(weights, images, before, computed, tmp_path):
     store = Store(tmp_path, before[0].identity)
     describe_photos(weights, images[:-1], kind="vlad", store=store)
@@ -158,6 +161,7 @@ def test_copies_of_a_photo_are_described_once_and_nearest(
     assert ("a copy.png", "d.png") in nearest_pairs(found.vectors, 1)
 
 
+@pytest.mark.slow
 def test_netvlad_takes_the_head_of_its_weights(weights, images, monkeypatch, before, again):
     rng = np.random.default_rng(0)
     shapes = EXTRAS | {"netvlad.whitening": (512 * 64, 8), "netvlad.whitening_bias": (8,)}
@@ -176,6 +180,7 @@ def test_netvlad_without_its_head_is_refused_before_the_work(weights, images, ag
         describe_photos(weights, images, kind="netvlad", store=again)
 
 
+@pytest.mark.slow
 def test_the_command_writes_pairs_that_a_run_reads(folder, images, before, tmp_path, capsys):
     out = tmp_path / "pairs.txt"
     plan = "retrieval:1+sequential:1"
@@ -196,6 +201,7 @@ def test_a_name_that_a_pair_file_cannot_hold_is_refused(folder, tmp_path, capsys
     assert "'# a.png' cannot be written" in capsys.readouterr().err and not out.exists()
 
 
+@pytest.mark.slow
 def test_a_run_tries_the_pairs_of_the_shortlist(scene, weights, tmp_path):
     out, images = tmp_path / "out", scene / "images"
     config = dataclasses.replace(jaxsfm.preset("paper"), max_size=160)

@@ -12,6 +12,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from jaxsfm.cli.main import main
 from jaxsfm.report.finished_run import read_run
 
+pytestmark = pytest.mark.slow
 FIGURES = ("model", "reprojection", "tracks", "view-graph", "inliers", "states")
 
 

@@ -37,6 +37,7 @@ def build(folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning_and_has_every_page(site):
     done = build(site)
     text = done.stdout + done.stderr
@@ -49,6 +50,7 @@ def test_the_site_builds_without_a_warning_and_has_every_page(site):
     assert not re.search(r'(src|href)="https?://[^"]*\.(css|js|woff2?)"', reference)
 
 
+@pytest.mark.slow
 def test_a_link_to_nowhere_stops_the_build(site):
     index = site / "docs/index.md"
     index.write_text(index.read_text() + "\n[gone](gone.md)\n")

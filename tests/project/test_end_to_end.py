@@ -13,6 +13,7 @@ from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 
+@pytest.mark.slow
 def test_the_demo_recovers_its_exact_cameras(tmp_path, capsys):
     """All seven views, the night view among them, within the demo's stated errors."""
     assert main(["demo", "--out", str(tmp_path)]) == 0
@@ -51,6 +52,7 @@ def test_a_dozen_lines_of_python_do_the_same_as_the_command(tmp_path):
         np.testing.assert_array_equal(getattr(alone[pair], field), getattr(matches[pair], field))
 
 
+@pytest.mark.slow
 def test_strecha_cameras_are_recovered_at_half_size(data_folder, tmp_path):
     """A quick look at real photos; docs/results.md has the full-size figures of all sets.
 

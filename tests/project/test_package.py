@@ -45,6 +45,7 @@ def built(tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_wheel_and_sdist_hold_all_modules_and_data(built):
     (wheel,), (sdist,) = built.glob("*.whl"), built.glob("*.tar.gz")
     in_wheel = set(zipfile.ZipFile(wheel).namelist())
@@ -58,6 +59,7 @@ def test_wheel_and_sdist_hold_all_modules_and_data(built):
     assert wheel.stat().st_size < 1_000_000
 
 
+@pytest.mark.slow
 def test_a_wheel_works_in_an_environment_of_its_own(built, tmp_path):
     """Its dependencies are those of this environment, by a path; the package is the wheel's."""
     place = tmp_path / "env"

@@ -133,6 +133,7 @@ def test_without_new_photos_nothing_changes(extended, capsys):
     assert contents(extended.run) == before
 
 
+@pytest.mark.slow
 def test_reconstruct_goes_on_from_what_extend_matched(extended, scene, tmp_path, capsys):
     run = Path(shutil.copytree(extended.run, tmp_path / "run"))
     args = ["--out", str(run), "--intrinsics", str(scene / "K.txt"), "--refine", "0"]
@@ -151,6 +152,7 @@ def copied(plain, scene, tmp_path) -> tuple[Path, Path]:
     return run, photos
 
 
+@pytest.mark.slow
 def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_path, capsys):
     run, photos = copied
     bad = {"broken.png": b"not an image", "cut.png": b""}
@@ -190,6 +192,7 @@ def test_extend_asks_the_engine_that_was_chosen(copied, monkeypatch):
     assert engine.calls == [("extract", 4), ("match", 3)]
 
 
+@pytest.mark.slow
 def test_killed_while_publishing_or_beside_another_run_the_report_is_the_newest(
     copied, capsys, monkeypatch
 ):

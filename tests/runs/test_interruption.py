@@ -41,6 +41,7 @@ def interrupt_after(monkeypatch, owner, name: str, calls: int) -> list[int]:
         ("mapping", jaxsfm.runs.reconstruct, "reconstruct", 0),
     ],
 )
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_where_it_was(
     scene,
     tmp_path,
@@ -114,6 +115,7 @@ def test_what_has_been_started_is_saved(scene, tmp_path, monkeypatch, owner, sta
     assert len(list((tmp_path / "out" / stage).glob("*/*.npz"))) == 1
 
 
+@pytest.mark.slow
 def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
     command = [sys.executable, "-m", "jaxsfm.cli.main", "reconstruct", str(scene / "images")]
     log = tmp_path / "log"
@@ -128,6 +130,7 @@ def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
     assert "interrupted" in text and "Traceback" not in text
 
 
+@pytest.mark.slow
 def test_ctrl_c_during_refinement_keeps_features_and_matches(scene, tmp_path, monkeypatch, capsys):
     import jaxsfm.sfm.refine.passes
 
@@ -171,6 +174,7 @@ sys.exit(jaxsfm.cli.main.main(["stuck"]))
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
+@pytest.mark.slow
 def test_a_signal_during_native_mapping_ends_the_process_cleanly(tmp_path, mapper):
     """Ctrl-C inside Thread.join let Python 3.11 shut down under running native code: SIGABRT."""
     command = [sys.executable, "-c", MAP_AND_INTERRUPT, mapper, str(tmp_path / "d.db")]

@@ -33,6 +33,7 @@ def counted(monkeypatch) -> dict[str, int]:
     return counts
 
 
+@pytest.mark.slow
 def test_a_change_redoes_exactly_what_depends_on_it(scene, tmp_path, counted, capsys):
     photos, out = tmp_path / "images", tmp_path / "out"
     shutil.copytree(scene / "images", photos)
@@ -67,6 +68,7 @@ def test_a_change_redoes_exactly_what_depends_on_it(scene, tmp_path, counted, ca
     assert "1 images, first 'more.png'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_kept_stage_gives_what_it_would_give_if_it_were_made_again(scene, tmp_path):
     base = ["reconstruct", str(scene / "images"), "--preset", "paper", "--threads", "1"]
     for out, refine in (("a", "0"), ("a", "1"), ("b", "1")):
@@ -91,6 +93,7 @@ def test_cameras_keep_what_is_known_of_their_focal_length(tmp_path):
     assert known == {k: k % 2 == 1 for k in model.cameras} and True in known.values()
 
 
+@pytest.mark.slow
 def test_a_refinement_that_a_lost_photo_prevented_is_tried_again(scene, tmp_path, monkeypatch):
     from jaxsfm.io.images import ImageError
 

@@ -76,6 +76,7 @@ def assert_whole(out: Path) -> None:
             json.loads((out / name).read_text())
 
 
+@pytest.mark.slow
 def test_killed_fifty_times_at_random_moments_nothing_is_lost_or_changed(tmp_path, nursery):
     write_scene(tmp_path, num_views=4, size=(192, 144))
     command = ["reconstruct", str(tmp_path / "images"), *OPTIONS, "--out"]

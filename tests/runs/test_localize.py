@@ -137,6 +137,7 @@ def test_one_bad_file_keeps_no_other_from_its_pose(localized):
     assert "not a readable image" in localized["broken.png"]["why"]
 
 
+@pytest.mark.slow
 def test_a_photo_alone_and_under_another_name_has_the_same_pose(localized, plain, photos, tmp_path):
     other = shutil.copy(photos / "photos" / "new.png", tmp_path / "other.png")
     alone = localize([Path(other)], plain[0], options=LocalizeOptions())["photos"][0]
@@ -144,6 +145,7 @@ def test_a_photo_alone_and_under_another_name_has_the_same_pose(localized, plain
         assert alone[key] == localized["new.png"][key], key
 
 
+@pytest.mark.slow
 def test_kept_features_spare_the_next_call_and_change_no_pose(
     localized, plain, photos, tmp_path, monkeypatch
 ):
@@ -190,6 +192,7 @@ def test_localize_on_ray_gives_what_this_process_gives(localized, plain, photos,
             assert row[key] == wanted[key], key
 
 
+@pytest.mark.slow
 def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
     result = localize(
         [photos / "photos" / "new.png"],
@@ -201,6 +204,7 @@ def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
     assert result["photos"][0]["status"] in ("localized", "doubtful")
 
 
+@pytest.mark.slow
 def test_the_most_similar_photos_are_shortlisted_and_described_once(
     plain, photos, weights, tmp_path, monkeypatch
 ):
@@ -229,6 +233,7 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
         choose(bad, names)
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
     plain, photos, weights, tmp_path, monkeypatch
 ):
@@ -247,6 +252,7 @@ def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
     assert not list(home.glob("descriptors/*/*"))
 
 
+@pytest.mark.slow
 def test_features_that_cannot_be_kept_are_one_sentence(plain, photos, tmp_path, capsys):
     run = Path(shutil.copytree(plain[0], tmp_path / "run"))
     (run / "features").write_text("in the way")
@@ -279,6 +285,7 @@ def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, phot
     assert camera_prior(new, model.views[:1], None).source == "guess"  # nobody else's
 
 
+@pytest.mark.slow
 def test_an_empty_folder_keeps_no_photo_from_its_pose(plain, photos, tmp_path):
     (tmp_path / "empty").mkdir()
     new = photos / "photos" / "new.png"
@@ -298,6 +305,7 @@ def says(capsys, *args) -> str:
     return text
 
 
+@pytest.mark.slow
 def test_the_command_writes_poses_and_tells_them(plain, photos, tmp_path, capsys):
     new, out = photos / "photos" / "new.png", tmp_path / "poses.json"
     assert main(["localize", str(new), "--model", str(plain[0]), "--out", str(out)]) == 0

@@ -25,6 +25,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.candidates import plane_affines
 from jaxsfm.sfm.refine.track_alignment import neighbourhoods
 
 # -- the whole refinement --------------------------------------------------------------------------
@@ -229,7 +230,7 @@ def test_plane_affines_are_derivatives_of_the_planes_homography(rendered):
     n = len(both)
     zeros, threes = np.zeros(n, int), np.full(n, 3)
     patches = plane_geometry.ReferencePatches(points, normals, zeros, xy)
-    got = plane_geometry.plane_affines(rendered.views, patches, threes)
+    got = plane_affines(rendered.views, patches, threes)
     k = camera_matrix(SIZE)
     for i in range(0, n, 17):
         rotation = two.rotation @ one.rotation.T

@@ -1,4 +1,4 @@
-"""Training runs optax, which promotes types by itself."""
+"""Allows type promotion in tests of the training, because optax relies on it."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Laws of epipolar supervision from photos with known cameras."""
+"""Epipolar supervision uses right matches of photos with known cameras."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def pairs(weights, inputs):
 
 
 def test_windows_hold_matches_near_their_own_epipolar_lines(weights, pairs):
-    """With the fundamental matrix of the window; a shift of it by a cell breaks that."""
+    """The fundamental matrix is that of the window; shifting the points by two cells shows it."""
     for step in range(4):
         drawn = pairs.draw(step, weights)
         for k in range(3):
@@ -62,6 +62,7 @@ def test_windows_depend_on_the_step_alone(weights, inputs, pairs):
     assert not np.array_equal(pairs.draw(5, weights).known, pairs.draw(6, weights).known)
 
 
+@pytest.mark.slow
 def test_posed_pairs_are_a_loss_of_their_own(weights, inputs, pairs):
     import jax
 

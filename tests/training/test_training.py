@@ -1,4 +1,4 @@
-"""Laws of training: it learns, it can be interrupted, it is of its inputs alone."""
+"""Training learns, can be interrupted, and depends on its inputs alone."""
 
 import dataclasses
 import json
@@ -45,7 +45,7 @@ def few_measurements(monkeypatch):
 
 
 def test_training_lowers_the_loss_on_the_views_it_sees(weights, images, tmp_path, few_measurements):
-    """Steps on one batch again and again."""
+    """All steps use the same batch."""
     options = dataclasses.replace(SMALL, steps=60, hidden=8, learning_rate=0.05)
     warp = relocalizer.warped_examples(
         weights.params,
@@ -62,10 +62,11 @@ def test_training_lowers_the_loss_on_the_views_it_sees(weights, images, tmp_path
 
 
 @pytest.mark.parametrize(("at", "reached"), [("train_step", 3), ("mean_shares", 2)])
+@pytest.mark.slow
 def test_an_interrupted_training_ends_with_the_same_parameters(
     weights, images, tmp_path, monkeypatch, few_measurements, at, reached
 ):
-    """In its fourth step, or while the third one is measured (after the norm rule and two)."""
+    """Interrupts the fourth step, or the fourth measurement (that of the third step)."""
     whole, parts = tmp_path / "whole.safetensors", tmp_path / "parts.safetensors"
     train_relocalizer(weights, images, whole, options=SMALL)
     real, done = getattr(relocalizer, at), []
@@ -160,6 +161,7 @@ def test_wrong_objectives_are_refused_by_name(field):
 # -- command line -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_trained_file_is_used_by_reconstruct_and_match(
     folder, scene, tmp_path, capsys, few_measurements
 ):
@@ -177,7 +179,7 @@ def test_a_trained_file_is_used_by_reconstruct_and_match(
     assert main([*reconstruct, "--relocalizer", str(out)]) == 0
     identity = json.loads((run / "run.json").read_text())
     assert identity["relocalizer"] == load_relocalizer(out).sha256
-    # Another rule is another run: said, and only what depends on it is computed again.
+    # Other keypoints make another run; the log says so, and the rest is used again.
     assert main([*reconstruct, "--keypoints", "relocalized"]) == 0
     said = capsys.readouterr().err
     assert "the last run there differs" in said and "relocalizer: " in said

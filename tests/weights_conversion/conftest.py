@@ -1,4 +1,4 @@
-"""One small network, and it in every format."""
+"""One small network, written in every format."""
 
 from pathlib import Path
 
@@ -16,14 +16,14 @@ def layers() -> Layers:
 
 @pytest.fixture(scope="session")
 def files(layers, tmp_path_factory) -> dict[str, Path]:
-    """Format -> file; tests do not write to them."""
+    """The files by format; tests must not write to them."""
     folder = tmp_path_factory.mktemp("sources")
     return {name: writer(folder, layers) for name, writer in WRITERS.items()}
 
 
 @pytest.fixture(scope="session")
 def sources(files) -> dict[str, Source]:
-    """What is read from them."""
+    """The sources that are read from the files, by format."""
     return {name: read_source(file, shapes=SMALL) for name, file in files.items()}
 
 

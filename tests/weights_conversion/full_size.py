@@ -17,11 +17,11 @@ from jaxsfm.core.vgg import LAYERS  # noqa: E402
 from jaxsfm.io.weight_files import EXTRAS  # noqa: E402
 from jaxsfm.io.weights import load_weights  # noqa: E402
 from weights_conversion.convert import read_source, write_converted  # noqa: E402
-from weights_conversion.verify import SIZE, Compared, compare  # noqa: E402
+from weights_conversion.verify import SIZE, MapComparison, compare  # noqa: E402
 
 
 def full_netvlad(path: Path, layers: Layers) -> Path:
-    """With a random head of NetVLAD's true size."""
+    """A random head of NetVLAD's true size is added."""
     rng = np.random.default_rng(1)
     names = ("assignment", "minus_centres", "whitening", "bias")
     head = {
@@ -31,7 +31,7 @@ def full_netvlad(path: Path, layers: Layers) -> Path:
     return netvlad(path, layers, head)
 
 
-def verified(writer, layers: Layers, size: tuple[int, int]) -> list[Compared]:
+def verified(writer, layers: Layers, size: tuple[int, int]) -> list[MapComparison]:
     with tempfile.TemporaryDirectory() as scratch:
         source = read_source(writer(Path(scratch), layers))
         target = Path(scratch) / "out.safetensors"

@@ -1,4 +1,4 @@
-"""MATLAB's files of version 5 are read as scipy reads them; other things in them are left out."""
+"""MATLAB's files of version 5 are read as scipy reads them; objects in them are left out."""
 
 import struct
 
@@ -47,7 +47,7 @@ def test_big_endian_files_are_read(tmp_path):
 
 
 def test_a_matlab_object_is_left_out_and_said(tmp_path):
-    """NetVLAD's own file holds its VLAD layer as one; here a number is relabelled."""
+    """NetVLAD's own file has its VLAD layer as an object; here the class of a number is changed."""
     path = matconvnet(tmp_path, random_layers())
     top = scipy.io.loadmat(path)
     every = [*top["layers"].ravel(), np.full((3, 5), 7.0)]

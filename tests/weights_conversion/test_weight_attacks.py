@@ -1,4 +1,4 @@
-"""Files that want to run something, and files that are broken: one sentence, nothing executed."""
+"""Malicious and damaged files are refused in one sentence, and nothing in them is executed."""
 
 import builtins
 import os
@@ -155,7 +155,7 @@ KNOWN_HEADS = (
 
 
 def outcome(path) -> str:
-    """converted, or refused by the file's name; anything else fails."""
+    """Return converted, or refused if the error names the file; anything else fails."""
     try:
         source = read_source(path, shapes=SMALL)
     except UserError as error:
@@ -175,7 +175,7 @@ def test_random_bytes_are_refused(tmp_path, head, tail):
     assert outcome(path) == "refused"
 
 
-# Keras' files are read in a process of its own: two of five formats, and few of them.
+# Each Keras file is read in a process of its own, which is slow, so only a few are tried.
 DAMAGED = [name for name in WRITERS if name not in ("keras_theano", "keras_2", "keras_2_theano")]
 
 
@@ -195,7 +195,7 @@ def test_a_mutated_file_is_converted_or_refused(files, tmp_path, name):
     found = set()
     for k in range(4 if name.startswith("keras") else 60):
         broken = bytearray(data)
-        end = len(data) if k % 4 == 0 else 3000  # headers are where structure is
+        end = len(data) if k % 4 == 0 else 3000  # the structure of a file is in its header
         for at in rng.integers(0, end, rng.integers(1, 6)):
             broken[at] = rng.integers(256)
         path.write_bytes(bytes(broken))
@@ -206,7 +206,7 @@ def test_a_mutated_file_is_converted_or_refused(files, tmp_path, name):
 @pytest.mark.parametrize(
     "script, words",
     [
-        ("import time; time.sleep(60)", "not done after 0.5 s"),
+        ("import time; time.sleep(60)", "not finished after 0.5 s"),
         ("import os; os.abort()", "the HDF5 library crashed"),
         ("raise SystemExit(3)", "the HDF5 library crashed"),
     ],

@@ -1,7 +1,8 @@
-"""`jaxsfm weights`: what the commands do with good files and bad ones."""
+"""The commands `jaxsfm weights` convert good files and refuse bad ones."""
 
 import pytest
 from imitations import SMALL, random_layers, torchvision_legacy
+from shared import once
 
 from jaxsfm.cli.main import main
 from jaxsfm.core.vgg import LAYERS
@@ -12,12 +13,16 @@ from weights_conversion.torchvision import CONVENTION
 
 @pytest.fixture(scope="session")
 def other(tmp_path_factory):
-    """Whole VGG-16 of random weights: its source and its conversion."""
-    folder = tmp_path_factory.mktemp("whole")
-    source = torchvision_legacy(folder, random_layers(LAYERS))
-    target = folder / "random.safetensors"
-    assert main(["weights", "convert", str(source), str(target)]) == 0
-    return source, target
+    """A whole VGG-16 of random weights: its source and its conversion."""
+    target = "random.safetensors"
+
+    def make(folder):
+        source = torchvision_legacy(folder, random_layers(LAYERS))
+        assert main(["weights", "convert", str(source), str(folder / target)]) == 0
+
+    with once(tmp_path_factory, "converted", make) as folder:
+        (source,) = (path for path in folder.iterdir() if path.name != target)
+        yield source, folder / target
 
 
 def refused(capsys, *args) -> str:
@@ -39,6 +44,7 @@ def test_a_conversion_is_verified_and_shown(other, capsys):
             assert str(word) in text
 
 
+@pytest.mark.slow
 def test_another_network_does_not_verify(other, tmp_path, capsys):
     source, _ = other
     read = read_source(source)

@@ -1,4 +1,4 @@
-"""Public weights: fetched, compared with their hash, converted."""
+"""Public weights are fetched, compared with their hash, and converted."""
 
 import hashlib
 
@@ -10,11 +10,11 @@ from local_server import url
 from jaxsfm.errors import UserError
 from jaxsfm.io.weight_files import read_converted
 from weights_conversion import fetch
-from weights_conversion.fetch import PUBLIC, Public, fetch_weights
+from weights_conversion.fetch import PUBLIC, PublicWeights, fetch_weights
 
 
-def public(address: str, content: bytes, family="keras") -> Public:
-    return Public(address, f"md5:{hashlib.md5(content).hexdigest()}", family, 1, "")
+def public(address: str, content: bytes, family="keras") -> PublicWeights:
+    return PublicWeights(address, f"md5:{hashlib.md5(content).hexdigest()}", family, 1, "")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Every format holds the same network, and comes out as the same converted weights."""
+"""All formats hold the same network and are converted to the same weights."""
 
 import shutil
 
@@ -91,7 +91,7 @@ def test_kernels_said_to_be_theanos_are_turned(layers, tmp_path):
 def test_another_family_or_option_than_the_files_is_refused(files):
     with pytest.raises(UserError, match="--family keras: .*is of the family torchvision"):
         read_source(files["torchvision_zip"], family="keras", shapes=SMALL)
-    with pytest.raises(UserError, match="--kernels theano: only of Keras"):
+    with pytest.raises(UserError, match="--kernels theano: only Keras"):
         read_source(files["matconvnet"], kernels="theano", shapes=SMALL)
 
 
@@ -133,7 +133,7 @@ def test_a_mean_image_of_several_colours_is_noted(layers, tmp_path):
     top["meta"] = {"normalization": {"averageImage": image}}
     scipy.io.savemat(file, {k: v for k, v in top.items() if not k.startswith("_")})
     source = read_source(file, shapes=SMALL)
-    assert source.preprocessing.mean == (2.0, 2.0, 2.0) and "not of one colour" in source.notes[0]
+    assert source.preprocessing.mean == (2.0, 2.0, 2.0) and "several colours" in source.notes[0]
 
 
 # -- what is refused -------------------------------------------------------------------------------
@@ -168,8 +168,8 @@ def test_safetensors_of_something_else_are_refused(tmp_path):
 def test_a_matlab_file_without_a_network_or_mean_is_refused(layers, tmp_path):
     path = tmp_path / "a.mat"
     for top, words in (
-        ({"x": 1}, "no cell of layers"),
-        ({"layers": np.zeros(3)}, "no cell of layers"),
+        ({"x": 1}, "not a network of MatConvNet"),
+        ({"layers": np.zeros(3)}, "not a network of MatConvNet"),
         ({"net": {"layers": cell([1, 2]), "meta": {}}}, "mean colour, is missing"),
         ({"layers": cell([{"name": "conv1_1"}])}, "mean colour, is missing"),
     ):
@@ -212,7 +212,7 @@ def test_hdf5_files_do_not_lead_to_other_files(layers, tmp_path):
             else:
                 size = 4 * int(np.prod(shape))
                 h5.create_dataset(name, shape, np.float32, external=[(str(secret), 0, size)])
-        with pytest.raises(UserError, match="lies in another file"):
+        with pytest.raises(UserError, match="is in another file"):
             read_source(path, shapes=SMALL)
 
 
@@ -221,7 +221,7 @@ def test_a_huge_dataset_is_refused_before_it_is_read(layers, tmp_path):
     with h5py.File(path, "a") as h5:
         del h5["block2_conv1"]["block2_conv1_W_1:0"]
         h5.create_dataset("block2_conv1/x", (3, 3, 1 << 20, 1 << 20), np.float32, chunks=(3,) * 4)
-    with pytest.raises(UserError, match="is no layer of VGG-16"):
+    with pytest.raises(UserError, match="is not a layer of VGG-16"):
         read_source(path, shapes=SMALL)
 
 
@@ -229,7 +229,7 @@ def test_a_layer_that_is_there_twice_is_refused(layers, tmp_path):
     path = keras_1(tmp_path, layers)
     with h5py.File(path, "a") as h5:
         h5["other/block1_conv1/kernel"] = np.zeros((3, 3, 3, 4), np.float32)
-    with pytest.raises(UserError, match="conv1_1.kernel is in it more than once"):
+    with pytest.raises(UserError, match="conv1_1.kernel is in the file more than once"):
         read_source(path, shapes=SMALL)
 
 
@@ -245,16 +245,16 @@ def test_a_converted_file_is_no_source_and_no_source_is_overwritten(files, sourc
     source = sources["keras_1"]
     out = tmp_path / "a.safetensors"
     write_converted(source, out)
-    with pytest.raises(UserError, match="is converted already"):
+    with pytest.raises(UserError, match="the file is converted already"):
         read_source(out, shapes=SMALL)
     before = files["keras_1"].read_bytes()
-    with pytest.raises(UserError, match="is the file to convert"):
+    with pytest.raises(UserError, match="this is the file to convert"):
         write_converted(source, files["keras_1"])
     assert files["keras_1"].read_bytes() == before
 
 
 def test_vgg19_of_torchvision_is_known_by_its_last_layer(sources, tmp_path):
-    """Its modules are numbered past three more convolutions; the halves of a VGG-16 are none."""
+    """VGG-19 has three more convolutions, so its modules have other numbers than VGG-16's."""
     layers = random_layers({n: (3 if i == 3 else i // 16, o // 16) for n, (i, o) in DEEP.items()})
     tensors = {}
     for module, layer in numbered(BLOCKS_19).items():
@@ -271,7 +271,7 @@ def test_vgg19_of_torchvision_is_known_by_its_last_layer(sources, tmp_path):
     assert found.architecture == "vgg19" and same(found.layers, layers)
     rows = compare(source, tmp_path / "out", size=(32, 32), shapes=small)
     assert agrees(rows) and len(rows) == 16 + 5
-    with pytest.raises(UserError, match="of vgg19, but .* of vgg16"):
+    with pytest.raises(UserError, match="holds a vgg19, but .* a vgg16"):
         compare(sources["torchvision_zip"], tmp_path / "out", shapes=small)
     del tensors["features.34.weight"]
     safetensors.numpy.save_file(tensors, tmp_path / "cut.safetensors")

@@ -1,4 +1,4 @@
-"""Verification agrees where a conversion is right, and says so where anything is exchanged."""
+"""Verification accepts a right conversion and notices whatever has been exchanged."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ from weights_conversion.torchvision import CONVENTION
 from weights_conversion.verify import LIMIT, agrees, compare, noise_image, table_lines
 
 SIZE = (33, 42)
-"""Odd rows: the last one is not pooled."""
+"""The number of rows is odd, so the last one is not pooled."""
 
 
 def rows_of(source, converted):
@@ -122,6 +122,7 @@ def test_the_independent_network_is_what_scipy_computes(layout, convolution, bgr
         np.testing.assert_allclose(found[..., k], sum(planes) + bias[k], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_installed_weights_through_a_file_are_the_installed_weights(tmp_path):
     import safetensors.numpy
 
@@ -135,7 +136,7 @@ def test_the_installed_weights_through_a_file_are_the_installed_weights(tmp_path
     loaded = load_weights(file)
     assert jax.tree.all(jax.tree.map(np.array_equal, loaded.params, installed.params))
     assert loaded.preprocessing == installed.preprocessing and loaded.walked == installed.walked
-    # The network as a whole gives what verification compares, map by map.
+    # The whole network gives the maps that verification compares.
     rgb = noise_image((32, 48))
     images = preprocess(jnp.asarray(rgb), loaded.preprocessing)[None]
     pyramid = VGG16().apply(loaded.params, images, jnp.asarray([[32, 48]], jnp.int32))

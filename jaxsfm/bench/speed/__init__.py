@@ -1,1 +1,1 @@
-"""Speed, with accuracy beside it: `python -m jaxsfm.bench.speed` (docs/performance.md)."""
+"""Measurements of speed, and of accuracy with it: `python -m jaxsfm.bench.speed`."""

@@ -1,4 +1,4 @@
-"""`python -m jaxsfm.bench.speed`: the table; with --gate a comparison with the baseline."""
+"""`python -m jaxsfm.bench.speed` prints a table; with --gate it compares with the baseline."""
 
 import json
 import os
@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
 
-# Before JAX starts: both sides of every comparison use the cores this process may use.
+# Set before JAX starts: both sides of every comparison use the cores that this process may use.
 os.environ.setdefault("OMP_NUM_THREADS", str(len(os.sched_getaffinity(0))))
-os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP tells of every step
+os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP prints every step otherwise
 
 import tyro
 
+from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.speed import extraction, homographies, machine, matching, scaling
 from jaxsfm.bench.speed.timing import Metric
 
@@ -21,7 +22,7 @@ BASELINE = Path(__file__).parent / "baseline.json"
 
 
 def groups(data: Path) -> dict[str, Callable[[], Iterator[Metric]]]:
-    """What can be measured, by name."""
+    """The groups of measurements by name."""
     return {
         "machine": machine.measure,
         "extraction": extraction.measure,
@@ -36,13 +37,13 @@ def groups(data: Path) -> dict[str, Callable[[], Iterator[Metric]]]:
 
 
 def line(metric: Metric) -> str:
-    """A row of the table."""
+    """A row of the table as text."""
     spread = f"+-{metric.spread:4.0%}" if metric.spread else ""
     return f"{metric.name:40s} {metric.value:12.4g} {metric.unit:16s} {spread}"
 
 
 def worse(metric: Metric, baseline: float) -> bool:
-    """Whether a figure lost more than its tolerance."""
+    """Whether a figure is worse than the baseline by more than its tolerance."""
     if metric.tolerance is None:
         return False
     if metric.better == "higher":
@@ -57,15 +58,15 @@ def main(
     data: Path = DATA,
     json_file: Annotated[Path | None, tyro.conf.arg(name="json")] = None,
 ) -> int:
-    """Measure speed, with accuracy beside it.
+    """Measure speed, and accuracy with it.
 
     Args:
       only: groups: machine, extraction, mutual, pairs, homographies, scaling, pixels, start, stage;
         all by default.
-      gate: exit with 1 if a ratio lost more than its tolerance against the baseline.
-      update: write the baseline.
-      data: folder of the data sets; what needs them is skipped without.
-      json_file: where to write the figures.
+      gate: exit with 1 if a ratio is worse than the baseline by more than its tolerance.
+      update: write a new baseline.
+      data: folder of the data sets; groups that need a missing set are skipped.
+      json_file: write all figures to this file.
     """
     known = groups(data)
     unknown = sorted(set(only) - set(known))
@@ -79,10 +80,10 @@ def main(
             metrics.append(metric)
     figures = {metric.name: metric.value for metric in metrics}
     if json_file is not None:
-        json_file.write_text(json.dumps([m._asdict() for m in metrics], indent=1) + "\n")
+        write_json(json_file, {"metrics": [metric._asdict() for metric in metrics]})
     baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
     if update:
-        BASELINE.write_text(json.dumps(baseline | figures, indent=1) + "\n")
+        write_json(BASELINE, baseline | figures)
         return 0
     if not gate:
         return 0

@@ -1,8 +1,7 @@
-"""VGG-16 to pool4 at 1536 x 1024, beside PyTorch and the machine's matrix products."""
+"""Speed of VGG-16 up to pool4 at 1536 x 1024, next to PyTorch and the machine's matrix products."""
 
 import os
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,16 +9,17 @@ import numpy as np
 
 from jaxsfm.bench.speed import machine
 from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
+from jaxsfm.core.types import Levels
 from jaxsfm.core.vgg import BLOCKS, LAYERS, VGG16
 from jaxsfm.io.weights import load_weights
 
 HEIGHT, WIDTH = 1024, 1536
 POOL4 = 4
-"""Blocks up to it."""
+"""The number of blocks up to pool4."""
 
 
 def flop(height: int, width: int) -> float:
-    """Multiplications and additions of the convolutions up to pool4."""
+    """The number of multiplications and additions in the convolutions up to pool4."""
     total = 0.0
     for block, widths in enumerate(BLOCKS[:POOL4], start=1):
         cells = (height >> (block - 1)) * (width >> (block - 1))
@@ -32,13 +32,15 @@ def flop(height: int, width: int) -> float:
 @jax.jit
 def _pool4(params, x):
     size = jnp.asarray([[HEIGHT, WIDTH]], jnp.int32)
-    return VGG16().apply(params, x, size, method="levels").pool4
+    levels = VGG16().apply(params, x, size, method="levels")
+    assert isinstance(levels, Levels)
+    return levels.pool4
 
 
-def _torch_pool4(params: dict, image: np.ndarray) -> Callable[[], Any] | None:
-    """The same layers in PyTorch, channels last, all cores; None where it is not installed."""
+def _torch_pool4(params: dict, image: np.ndarray) -> Callable[[], np.ndarray] | None:
+    """The same layers in PyTorch on all cores; None if PyTorch is not installed."""
     try:
-        import torch
+        import torch  # pyright: ignore[reportMissingImports] # optional: the extra `bench`
     except ImportError:
         return None
     torch.set_num_threads(len(os.sched_getaffinity(0)))
@@ -64,7 +66,7 @@ def _torch_pool4(params: dict, image: np.ndarray) -> Callable[[], Any] | None:
 
 
 def measure() -> Iterator[Metric]:
-    """Speed, share of the floor, and how far the maps are from PyTorch's."""
+    """Time, time compared with matrix products and PyTorch, and the difference from PyTorch."""
     params = jax.device_put(load_weights().params)
     rng = np.random.default_rng(0)
     image = rng.normal(size=(1, HEIGHT, WIDTH, 3)).astype(np.float32)

@@ -1,9 +1,10 @@
-"""What somebody new does, from a clone to a model in another tool's format, timed and written down.
+"""Run a newcomer's first commands, time them, and write a page about them.
 
     python -m jaxsfm.bench.speed.first_steps PHOTOS docs/first-steps.md
 
-Clones this repository into a new folder, runs the README's commands there, then the photos of
-PHOTOS as somebody's own. The page holds the commands, what they printed and the seconds they took.
+The program clones this repository into a new folder, runs the README's commands there, and then
+reconstructs PHOTOS and exports the model to another tool's format. The page holds the commands,
+what they printed and how long they took.
 """
 
 import argparse
@@ -38,12 +39,12 @@ STEPS = (
     ),
 )
 BAR = re.compile(r"(\w+): +\d+%\|")
-"""Of a progress bar, which is drawn again and again; the last one stays."""
+"""A line of a progress bar. It is drawn many times; the page shows the last one."""
 QUIET = {"PYTHONPATH": "", "COLUMNS": "100", "PIP_QUIET": "2"}
 
 
 def shown(text: str, folder: Path) -> str:
-    """What a terminal would show at the end, without this machine's folders."""
+    """The text that a terminal shows at the end, without this machine's folders."""
     text = text.replace("\x1b[A", "").replace(str(folder), "~").replace(str(ROOT), "jaxsfm.git")
     lines = [line.rstrip() for line in text.splitlines() if line.strip()]
     bars = {bar[1]: k for k, line in enumerate(lines) if (bar := BAR.match(line))}
@@ -52,7 +53,7 @@ def shown(text: str, folder: Path) -> str:
 
 
 def run_steps(photos: Path, folder: Path) -> list[str]:
-    """Lines of the page; stops at the first command that fails."""
+    """Run all commands; returns the lines of the page. A command that fails ends the program."""
     shutil.copytree(photos, folder / "photos")
     lines = []
     for title, commands in STEPS:
@@ -80,7 +81,7 @@ def run_steps(photos: Path, folder: Path) -> list[str]:
 
 def main() -> None:
     """Write the page."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("photos", type=Path)
     parser.add_argument("page", type=Path)
     args = parser.parse_args()

@@ -1,11 +1,12 @@
-"""Localizing every image of a run in a model made without it.
+"""Localize every image of a run in a model that was made without it.
 
     jaxsfm reconstruct PHOTOS --out RUN --intrinsics K.txt --reference SET
     python -m jaxsfm.bench.speed.localize RUN --reference SET --out FOLDER
 
-The matches are the run's. They are verified once, each pair by itself; for each image a model
-is made of the pairs without it, as the run's own was (views too dark to align are not placed).
-Models and rows stay in FOLDER: the same command goes on from there, any other one is refused.
+The matches are those of the run. They are verified once, each pair by itself. Then for each image a
+model is made from the pairs without it, in the same way as the model of the run; views that are too
+dark for alignment are not placed. Models and rows stay in FOLDER: the same command continues from
+there, and any other command is refused.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from jaxsfm.colmap import models as colmap_models
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.two_views import read_two_views
+from jaxsfm.colmap.verification import VerificationOptions, verify
 from jaxsfm.io.atomic import read_json, write_atomic
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photos import Photos
@@ -38,12 +40,14 @@ from jaxsfm.runs.localize_report import error_against, localized_photo
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.view_graph import trusted_pairs
 
+Row = dict[str, Any]
+"""The figures of an image, as `jaxsfm localize` writes them."""
 LIMITS = (0.3, 1.0)
-"""Units of the reference, degrees."""
+"""Largest good errors: units of the reference, and degrees."""
 
 
 def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Path:
-    """A database of all the run's pairs, verified: each by itself, whatever the others."""
+    """A database of all pairs of the run, each verified by itself."""
     database = scratch / "verified.db"
     if database.exists():
         return database
@@ -55,23 +59,22 @@ def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Pa
     pairs = [row.pair for row in run.report.pairs.each if row.handed_on]
     partial, options = scratch / "partial.db", map_options(run, files)
     colmap.write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
-    verification = colmap.VerificationOptions(
+    verification = VerificationOptions(
         seed=options.seed,
         threads=options.threads,
         scale=options.scale,
         relative_poses=run.config.view_graph,
     )
-    colmap.verify(partial, verification)
+    verify(partial, verification)
     return partial.rename(database)
 
 
 def map_options(run: FinishedRun, files: dict[str, ImageFile]) -> MapOptions:
-    """The run's."""
+    """The mapper's options of the run."""
     options = run.report.options
-    refines, mapper = options.others["refine_intrinsics"], options.others["mapper"]
-    assert mapper == "incremental" or mapper == "global"  # noqa: PLR1714
+    refines = options.others["refine_intrinsics"]
     return MapOptions(
-        mapper=mapper,
+        mapper="global" if options.others["mapper"] == "global" else "incremental",
         refine_intrinsics=options.intrinsics is None if refines == "auto" else refines == "yes",
         seed=options.seed,
         threads=options.threads,
@@ -82,7 +85,7 @@ def map_options(run: FinishedRun, files: dict[str, ImageFile]) -> MapOptions:
 def without(
     run: FinishedRun, name: str, files: dict[str, ImageFile], scratch: Path, refined: bool
 ) -> None:
-    """The model without an image, in `scratch`/NAME/sparse, from its pairs' verification on."""
+    """Make the model without an image, in `scratch`/NAME/sparse."""
     folder, options = scratch / name, map_options(run, files)
     database = folder / "database.db"
     shutil.copy(verified(run, files, scratch), database)
@@ -107,10 +110,8 @@ def without(
     database.unlink()
 
 
-def localized(
-    run: FinishedRun, name: str, files: dict[str, ImageFile], folder: Path
-) -> dict[str, Any]:
-    """The image's row."""
+def localized(run: FinishedRun, name: str, files: dict[str, ImageFile], folder: Path) -> Row:
+    """Localize an image in the model without it; returns its row of the table."""
     seed = run.report.options.seed
     model, image = read_working_model(folder / "sparse" / "0", run.config, seed=seed), files[name]
     chosen = camera_prior(image, model.views, None)
@@ -140,8 +141,8 @@ def localized(
     return row | {"seconds": seconds, "registered": len(names)}
 
 
-def line(row: dict[str, Any]) -> str:
-    """A row of the table."""
+def line(row: Row) -> str:
+    """A row of the table as text."""
     error, expected = row.get("error"), row["confidence"]
     if not error:
         return f"{row['photo']:12s} {row['status']:9s} {row['why']}"
@@ -154,8 +155,8 @@ def line(row: dict[str, Any]) -> str:
     )
 
 
-def check_same(folder: Path, key: dict[str, Any]) -> None:
-    """End the program if what `folder` keeps was made from something else."""
+def check_same(folder: Path, key: dict[str, object]) -> None:
+    """End the program if the content of `folder` was made from something else."""
     path = folder / "key.json"
     if path.exists():
         old = read_json(path)
@@ -163,14 +164,14 @@ def check_same(folder: Path, key: dict[str, Any]) -> None:
         if changed := sorted(name for name in key if kept.get(name) != key[name]):
             sys.exit(f"--out {folder}: was made with another {changed[0]}; choose another folder")
     elif folder.exists() and any(folder.iterdir()):
-        sys.exit(f"--out {folder}: not empty, and nobody knows of what; choose another folder")
+        sys.exit(f"--out {folder}: not empty, and not made by this command; choose another folder")
     folder.mkdir(parents=True, exist_ok=True)
     write_atomic(path, json.dumps(key, indent=1).encode())
 
 
 def main() -> int:
-    """Print the table; 1 if more than one image is off."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    """Print the table; returns 1 if more than one image is outside `LIMITS`."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("--reference", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)

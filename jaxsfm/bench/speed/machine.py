@@ -1,8 +1,7 @@
-"""What the machine can do: the rates that stages are compared with."""
+"""The rates of the machine, which the stages are compared with."""
 
 import os
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +19,8 @@ def _product(a, b):
     return jnp.matmul(a, b, precision=HIGHEST)
 
 
-def matrix_product() -> Callable[[], Any]:
-    """A float32 product of `MATMUL_FLOP` operations."""
+def matrix_product() -> Callable[[], jax.Array]:
+    """A function that computes a float32 product of `MATMUL_FLOP` operations."""
     a = jax.random.normal(jax.random.key(0), (SIDE, SIDE))
     return lambda: _product(a, a)
 
@@ -32,7 +31,7 @@ def _add(a):
 
 
 def measure() -> Iterator[Metric]:
-    """Matrix products and memory."""
+    """Cores, speed of matrix products, and bandwidth of the memory."""
     a = jnp.zeros(STREAM_ENTRIES, jnp.float32)
     product, stream = seconds(matrix_product(), lambda: _add(a))
     yield Metric("machine.cores", len(os.sched_getaffinity(0)), "", "higher")

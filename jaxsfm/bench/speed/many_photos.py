@@ -1,9 +1,12 @@
-"""Whether a photo costs the same among a hundred as among a thousand: a rendered street, as long as
-it has photos, matched with `--pairs retrieval:K`.
+"""Measure whether a photo costs the same among a hundred photos as among a thousand.
+
+The photos show a rendered street, whose length grows with their number, and are matched with
+`--pairs retrieval:K`.
 
     python -m jaxsfm.bench.speed.many_photos --counts 100 1000 --work FOLDER
 
-Seconds per photo of every stage, and the peak memory up to the end of matching and of the run.
+The table has the seconds per photo of each stage, and the peak memory until matching ends and until
+the run ends.
 """
 
 import argparse
@@ -24,13 +27,14 @@ from jaxsfm.colmap.poses import CameraPose
 
 SIZE = (240, 180)
 STEP, SECTION, REACH = 0.35, 4.0, 9.0
-"""Metres between photos, of a section of the street, and that a photo sees to either side."""
+"""In metres: the distance between photos, the length of a section of the street, and how far a
+photo sees to either side."""
 STAGES = ("retrieval", "extraction", "matching", "mapping")
-"""The last with the refinement, whose bar appears with it."""
+"""The stages of a run. Mapping includes refinement, because their progress bars appear together."""
 
 
 def _texture(photos: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """3 x 3 pieces of photographs, each cut, turned and coloured by chance: no two are alike."""
+    """3 x 3 pieces of photographs, each cut, turned and coloured at random, so that all differ."""
     rows = []
     for _ in range(3):
         tiles = []
@@ -46,7 +50,7 @@ def _texture(photos: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
 
 
 def street(length: float, seed: int) -> list[TexturedPlane]:
-    """A wall, and boards before it, section by section; x along the street, y down."""
+    """A wall with boards in front of it, section by section; x along the street, y down."""
     rng, photos = np.random.default_rng(seed), photo_textures()
     planes = []
     for x in np.arange(-REACH, length + REACH, SECTION):
@@ -64,7 +68,7 @@ def street(length: float, seed: int) -> list[TexturedPlane]:
 
 
 def poses(count: int, seed: int) -> list[CameraPose]:
-    """Cameras along the street, at two heights and changing distance, looking about."""
+    """Cameras along the street, at two heights, random distances and random directions."""
     rng = np.random.default_rng(seed + 1)
     found = []
     for k in range(count):
@@ -74,7 +78,7 @@ def poses(count: int, seed: int) -> list[CameraPose]:
 
 
 def write_street(folder: Path, count: int, seed: int = 0) -> None:
-    """Photos in `folder`/images and K.txt."""
+    """Write photos to `folder`/images, and K.txt."""
     (folder / "images").mkdir(parents=True, exist_ok=True)
     planes = street(count * STEP, seed)
     for k, pose in enumerate(poses(count, seed)):
@@ -85,22 +89,22 @@ def write_street(folder: Path, count: int, seed: int = 0) -> None:
 
 
 class Cost(NamedTuple):
-    """Of a run."""
+    """What a run costs."""
 
-    count: int
+    photos: int
     registered: int
     pairs: int
     seconds: dict[str, float]
-    """By stage."""
+    """Wall time of each stage."""
     busy: dict[str, float]
-    """Seconds of all threads together: what other processes take does not count."""
+    """Processor seconds of all threads, by stage; other processes do not count."""
     matched_mb: float
     """Peak memory until mapping begins."""
     peak_mb: float
 
 
 def _used(pid: int) -> tuple[float, float]:
-    """Seconds of all its threads so far, and its peak memory, MB."""
+    """Processor seconds of a process so far, and its peak memory in MB."""
     ticks = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     busy = (int(ticks[11]) + int(ticks[12])) / os.sysconf("SC_CLK_TCK")
     text = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
@@ -109,7 +113,7 @@ def _used(pid: int) -> tuple[float, float]:
 
 
 def measure(scene: Path, out: Path, count: int, options: list[str]) -> Cost:
-    """A run in a process of its own."""
+    """Measure a run in a process of its own."""
     command = [sys.executable, "-m", "jaxsfm", "reconstruct", str(scene / "images")]
     command += ["--out", str(out), "--intrinsics", str(scene / "K.txt"), *options]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -136,7 +140,7 @@ def measure(scene: Path, out: Path, count: int, options: list[str]) -> Cost:
     wall = report["seconds"]
     wall["mapping"] += wall.get("refinement", 0.0)
     return Cost(
-        count=count,
+        photos=count,
         registered=report["models"][0]["registered"] if report["models"] else 0,
         pairs=report["pairs"]["tried"],
         seconds=wall,
@@ -147,7 +151,8 @@ def measure(scene: Path, out: Path, count: int, options: list[str]) -> Cost:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    """Measure each number of photos and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--counts", type=int, nargs="+", default=[100, 1000])
     parser.add_argument("--nearest", type=int, default=20)
     parser.add_argument("--work", type=Path, required=True)

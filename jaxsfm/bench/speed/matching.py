@@ -1,4 +1,7 @@
-"""Mutual nearest neighbours beside FAISS, and whole pairs beside the product they cannot avoid."""
+"""Speed of mutual nearest neighbours next to FAISS, and of whole pairs.
+
+The time of a pair is compared with that of one matrix product, which no matching can avoid.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -20,7 +23,7 @@ from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import thresholds
 
 CELLS, CHANNELS = 6144, 512
-"""Of pool4 at 1536 x 1024."""
+"""The size of pool4 at 1536 x 1024."""
 
 
 @jax.jit
@@ -34,10 +37,9 @@ def _descriptors(seed: int) -> jax.Array:
 
 def _faiss(a: np.ndarray, b: np.ndarray) -> Callable[[], np.ndarray] | None:
     try:
-        import faiss
+        import faiss  # pyright: ignore[reportMissingImports] # optional: the extra `bench`
     except ImportError:
         return None
-    # Both runtimes bring an OpenMP; it takes all cores.
     there, back = faiss.IndexFlatIP(CHANNELS), faiss.IndexFlatIP(CHANNELS)
     there.add(b)
     back.add(a)
@@ -50,7 +52,7 @@ def _faiss(a: np.ndarray, b: np.ndarray) -> Callable[[], np.ndarray] | None:
 
 
 def measure_mutual() -> Iterator[Metric]:
-    """Random unit descriptors: the time does not depend on them."""
+    """Time with random unit descriptors; it does not depend on their values."""
     a, b = _descriptors(0), _descriptors(1)
     faiss = _faiss(np.asarray(a), np.asarray(b))
     nn = jax.jit(mutual_nn)
@@ -66,7 +68,7 @@ def measure_mutual() -> Iterator[Metric]:
 
 
 def measure_pairs(data: Path) -> Iterator[Metric]:
-    """fountain-P11 0004-0005, 1536 x 1024; the product of the coarse descriptors is the floor."""
+    """Time of the pair 0004-0005 of fountain-P11 at 1536 x 1024."""
     folder = data / "strecha" / "fountain-P11" / "images"
     found = sorted(path for path in folder.glob("*") if path.stem in ("0004", "0005"))
     if len(found) != 2:

@@ -1,12 +1,13 @@
-"""How many of each photo's best partners a shortlist keeps.
+"""Measure how many of each photo's best partners a shortlist keeps.
 
     jaxsfm bench strecha --root DATA/strecha --methods default --out RUNS
     jaxsfm reconstruct DATA/sacre_coeur/mapping --out RUNS/sacre_coeur --refine 0
     python -m jaxsfm.bench.speed.retrieval RUNS --data DATA
 
 A pair is true if more than half of the matches of the exhaustive run lie within 4 pixels of the
-epipolar lines of the ground truth. A photo's best partners are the three true ones with the most
-matches. Each row is a way to describe photos; a set's columns are the K of `retrieval:K`.
+epipolar lines of the ground truth. A photo's best partners are the three photos of its true pairs
+with the most matches. Each row of the table is a way to describe photos; each column is a set and
+the K of `retrieval:K`.
 """
 
 import argparse
@@ -20,6 +21,7 @@ from typing import NamedTuple
 
 import h5py
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jaxsfm
@@ -29,6 +31,7 @@ from jaxsfm.colmap.poses import CameraPose, read_poses
 from jaxsfm.core.blocks import pool
 from jaxsfm.core.numerics import unit
 from jaxsfm.core.pooling import gem, vlad
+from jaxsfm.core.types import Levels
 from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 from jaxsfm.core.vocabulary import fit_vocabulary
 from jaxsfm.io.features import padded_size
@@ -63,10 +66,11 @@ class Known(NamedTuple):
 
     pose: CameraPose
     matrix: np.ndarray
+    """float64 (3, 3)."""
 
 
 def cameras(data: Path, name: str) -> tuple[Path, dict[str, Known]]:
-    """The photos' folder, and their cameras."""
+    """The folder of a set's photos, and their cameras by name."""
     if name == "sacre_coeur":
         folder, found = data / name / "mapping", {}
         for path in sorted((data / name / "ground_truth").glob("*.h5")):
@@ -81,7 +85,7 @@ def cameras(data: Path, name: str) -> tuple[Path, dict[str, Known]]:
 
 
 def true_pairs(database: Path, known: dict[str, Known]) -> dict[Pair, int]:
-    """Matches of every true pair."""
+    """The number of matches of every true pair."""
     found = {}
     for a, b in itertools.combinations(sorted(known), 2):
         xy = read_matches(database, (a, b), verified=False)
@@ -99,15 +103,16 @@ def true_pairs(database: Path, known: dict[str, Known]) -> dict[Pair, int]:
 
 @functools.partial(jax.jit, static_argnames=("of",))
 def both(params: dict, image: jax.Array, valid: jax.Array, *, of: Preprocessing) -> list[jax.Array]:
-    """pool4, conv5_3 before its rectifier, pool5."""
+    """pool4, conv5_3 before its rectifier, and pool5."""
     x = preprocess(image, of)[None]
     levels = VGG16().apply(params, x, valid[None], method="levels")
     conv5 = VGG16().apply(params, x, valid[None], method="conv5")
+    assert isinstance(levels, Levels) and isinstance(conv5, jax.Array)
     return [levels.pool4[0], conv5[0], pool(conv5, valid[None] // 16)[0]]
 
 
 def maps(weights: Weights, images: list[ImageFile], size: int) -> dict[str, Local]:
-    """Local descriptors of both layers."""
+    """Local descriptors of every layer."""
     found: dict[str, Local] = {"pool4": {}, "conv5": {}, "pool5": {}}
     for image in images:
         rgb = read_image(image, max_size=size).rgb
@@ -123,7 +128,7 @@ def maps(weights: Weights, images: list[ImageFile], size: int) -> dict[str, Loca
 
 
 def as_in_runs(weights: Weights, images: list[ImageFile], kind: Retrieval) -> Local:
-    """What `--retrieval` describes photos by."""
+    """The descriptors that `--retrieval` uses."""
     identity = {"version": "", "weights": weights.sha256}
     with tempfile.TemporaryDirectory() as scratch:
         store = Store(Path(scratch), identity)
@@ -131,13 +136,13 @@ def as_in_runs(weights: Weights, images: list[ImageFile], kind: Retrieval) -> Lo
 
 
 def by_gem(local: Local, power: float) -> dict[str, np.ndarray]:
-    """As `jaxsfm.matching.global_descriptors`, another exponent."""
-    return {name: np.asarray(gem(unit(x), power=power)) for name, x in local.items()}
+    """Descriptors as in `jaxsfm.matching.global_descriptors`, with another exponent."""
+    return {name: np.asarray(gem(unit(jnp.asarray(x)), power=power)) for name, x in local.items()}
 
 
 def by_vlad(local: Local, words: int, seed: int) -> dict[str, np.ndarray]:
-    """As `jaxsfm.matching.global_descriptors`, another vocabulary."""
-    units = {name: np.asarray(unit(x)) for name, x in local.items()}
+    """Descriptors as in `jaxsfm.matching.global_descriptors`, with another vocabulary."""
+    units = {name: np.asarray(unit(jnp.asarray(x))) for name, x in local.items()}
     rng = np.random.default_rng(seed)
     parts = [rng.permutation(x)[: SAMPLE // len(units)] for x in units.values()]
     fitted = _fit(jax.random.key(seed), np.concatenate(parts), words=words)
@@ -145,7 +150,7 @@ def by_vlad(local: Local, words: int, seed: int) -> dict[str, np.ndarray]:
 
 
 def ways(found: dict[str, Local]) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """Descriptors by what the table calls them."""
+    """Every way to describe photos, with its name in the table."""
     for layer in ("pool4", "pool5"):
         for power in (1.0, 3.0):
             yield f"gem {layer} p {power:.0f}", by_gem(found[layer], power)
@@ -156,7 +161,7 @@ def ways(found: dict[str, Local]) -> Iterator[tuple[str, dict[str, np.ndarray]]]
 
 
 def kept(vectors: dict[str, np.ndarray], truth: dict[Pair, int], k: int) -> str:
-    """Photos whose best partners are all kept, the share of such partners, and pairs."""
+    """The photos whose best partners are all kept, the share of partners kept, and the pairs."""
     pairs = set(nearest_pairs(vectors, k))
     all_kept, hits = 0, []
     for name in vectors:

@@ -1,4 +1,4 @@
-"""What a larger job costs: pairs, pixels, the start, and COLMAP's SIFT on the same photos."""
+"""Speed of larger jobs: many pairs, many pixels, the start, and COLMAP's SIFT."""
 
 import dataclasses
 import itertools
@@ -14,18 +14,18 @@ import numpy as np
 
 import jaxsfm
 from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
-from jaxsfm.colmap.database import VerificationOptions
 from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.config import Config, preset
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.weights import load_weights
-from jaxsfm.matching.extraction import extract_images
+from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import match_pairs
 
 SMALL = 384
-"""Longer side for a thousand pairs in a minute; the programs are those of any other size."""
+"""Longer side, pixels. It is small so that a thousand pairs take a minute."""
 PHOTOS, FEW = 45, 5
-"""990 pairs, and 10."""
+"""Numbers of photos: they have 990 and 10 pairs."""
 
 
 def _photos(data: Path) -> list[ImageFile]:
@@ -38,8 +38,11 @@ def _photos(data: Path) -> list[ImageFile]:
 
 
 def measure_pairs(data: Path) -> Iterator[Metric]:
-    """Seconds per pair of all pairs of 45 photos over those of five: of each of the nine fives that
-    the 45 are dealt into, because pairs that overlap take less than others."""
+    """Seconds per pair among 45 photos, divided by those among five photos.
+
+    The 45 photos are divided into nine groups of five, and all groups are measured, because pairs
+    that overlap take less time than others.
+    """
     photos = _photos(data)[:PHOTOS]
     if len(photos) < PHOTOS:
         print(f"skipped: scaling (not {PHOTOS} photos in {data}/strecha)")
@@ -58,7 +61,7 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
 
     fives = [names[k : k + FEW] for k in range(0, PHOTOS, FEW)]
     per_pair(fives[0])
-    # Half of the fives before and half after, should the machine's mood change meanwhile.
+    # Half of the groups are measured before and half after, in case the machine's speed changes.
     before = [per_pair(five) for five in fives[::2]]
     many = per_pair(names)
     few = before + [per_pair(five) for five in fives[1::2]]
@@ -67,7 +70,7 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
 
 
 def measure_pixels(data: Path) -> Iterator[Metric]:
-    """Seconds per pixel from 384 x 256 to 2304 x 1536, the largest over the smallest."""
+    """Seconds per pixel from 384 x 256 to 2304 x 1536, and the largest over the smallest."""
     config = preset("default")
     weights = load_weights()
     photos = _photos(data)[:1]
@@ -75,10 +78,10 @@ def measure_pixels(data: Path) -> Iterator[Metric]:
         print(f"skipped: pixels (no photos in {data}/strecha)")
         return
 
-    def work(longer: int) -> Callable[[], list]:
-        # Enlarged where the photo is smaller: only its size matters here.
+    def work(longer: int) -> Callable[[], object]:
+        # A smaller photo is enlarged: only its size matters here.
         sized = dataclasses.replace(config, max_size=longer, enlarge=2.0)
-        return lambda: next(extract_images(weights, photos[:1], config=sized))[1].dense
+        return lambda: image_features(weights, photos[0], config=sized).dense
 
     sizes = (384, 768, 1536, 2304)
     turns = seconds(*(work(longer) for longer in sizes), repeat=3)
@@ -94,7 +97,7 @@ from jaxsfm.io.compiled_programs import keep_compiled
 keep_compiled()
 from pathlib import Path
 import jaxsfm
-from jaxsfm.matching.extraction import extract_images
+from jaxsfm.matching.extraction import image_features
 images, _ = jaxsfm.open_images(Path(sys.argv[1]))
 weights = jaxsfm.load_weights()
 times = []
@@ -107,8 +110,11 @@ print(json.dumps(times))
 
 
 def measure_start(data: Path) -> Iterator[Metric]:
-    """From the start of a process to its first image's features, less what an image takes: the
-    interpreter, imports, weights, the photos' headers, and the compiled program from the cache."""
+    """Seconds from the start of a process to its first image's features, less those of an image.
+
+    What remains is the time of the interpreter, the imports, the weights, the photos' headers and
+    of reading the compiled program from the cache.
+    """
     folder = data / "strecha" / "fountain-P11" / "images"
     if not folder.is_dir():
         print(f"skipped: start (no {folder})")
@@ -126,8 +132,10 @@ def measure_start(data: Path) -> Iterator[Metric]:
 
 
 def measure_stage(data: Path) -> Iterator[Metric]:
-    """Five photos of 1536 x 1024, extraction and all ten pairs: COLMAP's SIFT on the CPU, verified,
-    and ours."""
+    """Seconds of extraction and all ten pairs of five photos of 1536 x 1024.
+
+    Our methods are compared with COLMAP's SIFT on the CPU, including its verification.
+    """
     folder = data / "strecha" / "fountain-P11" / "images"
     photos = jaxsfm.open_images(folder)[0][3:8] if folder.is_dir() else []
     if len(photos) < 5:

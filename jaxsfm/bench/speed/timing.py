@@ -1,9 +1,9 @@
-"""Metrics, and times that mean something: warmed up, synchronised, interleaved, medians."""
+"""Measuring times: functions are warmed up, synchronised and run in turns; medians are compared."""
 
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 
@@ -11,22 +11,25 @@ REPEAT = 5
 
 
 class Metric(NamedTuple):
-    """One figure."""
+    """One figure of the table."""
 
     name: str
     value: float
     unit: str
     better: Literal["higher", "lower"]
     tolerance: float | None = None
-    """Relative loss against the baseline that the gate lets pass; None: told, not gated. Only
-    ratios of one run have one: seconds belong to a machine."""
+    """How much worse than the baseline, relative to it, the figure may be; None if it is not
+    compared. Only ratios within one run are compared, because seconds depend on the machine."""
     spread: float = 0.0
-    """Half the distance between least and largest, relative to the value."""
+    """Half the difference between the largest and the smallest value, relative to the figure."""
 
 
-def seconds(*work: Callable[[], Any], repeat: int = REPEAT) -> list[list[float]]:
-    """Times of each function, in turns, so that a slow minute meets all of them; the first call of
-    each is not counted."""
+def seconds(*work: Callable[[], object], repeat: int = REPEAT) -> list[list[float]]:
+    """The times of each function.
+
+    The functions run in turns, so that a slow minute of the machine affects all of them. The first
+    call of each function compiles and is not counted.
+    """
     for function in work:
         jax.block_until_ready(function())
     times: list[list[float]] = [[] for _ in work]
@@ -39,7 +42,7 @@ def seconds(*work: Callable[[], Any], repeat: int = REPEAT) -> list[list[float]]
 
 
 def median(times: list[float]) -> float:
-    """Of one function's times."""
+    """The median of the times of one function."""
     return statistics.median(times)
 
 
@@ -50,7 +53,7 @@ def ratio(
     better: Literal["higher", "lower"],
     tolerance: float | None,
 ) -> Metric:
-    """Median of the ratios of times taken in turns."""
+    """The median ratio of two functions' times, compared turn by turn."""
     ratios = [a / b for a, b in zip(above, below, strict=True)]
     value = statistics.median(ratios)
     return Metric(name, value, "x", better, tolerance, (max(ratios) - min(ratios)) / 2 / value)

@@ -1,9 +1,9 @@
-"""The photographs that the relocalizer in the package was trained on, out of other packages.
+"""Write the photographs that the package's relocalizer was trained on; other packages hold them.
 
     pip install scikit-image scikit-learn matplotlib
     python -m jaxsfm.bench.speed.training_photos DIR
 
-None of them is in a benchmark's data.
+None of these photographs is in a benchmark's data.
 """
 
 import sys
@@ -13,13 +13,15 @@ import cv2
 import matplotlib
 import numpy as np
 import skimage.data
-from sklearn.datasets import load_sample_image
 
 SCIKIT_IMAGE = ("astronaut", "brick", "camera", "chelsea", "coffee", "grass", "gravel", "rocket")
 
 
 def photographs() -> dict[str, np.ndarray]:
-    """uint8 RGB or grey, by name."""
+    """The photographs by name, uint8 (h, w, 3) RGB or (h, w) grey."""
+    # scikit-learn is needed here only, so it is no dependency of the package.
+    from sklearn.datasets import load_sample_image  # pyright: ignore[reportMissingImports]
+
     found = {name: getattr(skimage.data, name)() for name in SCIKIT_IMAGE}
     found["motorcycle_left"] = skimage.data.stereo_motorcycle()[0]
     found |= {name: load_sample_image(f"{name}.jpg") for name in ("china", "flower")}
@@ -31,7 +33,7 @@ def photographs() -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Write them as PNG."""
+    """Write the photographs as PNG files."""
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
     for name, rgb in photographs().items():

@@ -1,4 +1,4 @@
-"""Bundler's bundle.out (v0.3) and list of images.
+"""Writes Bundler's bundle.out (v0.3) and its list of images.
 
 Source: Bundler v0.4 user's manual, section VI. P = R X + t, p = -P / P.z, pixels f r(p) p with
 r = 1 + k1 |p|^2 + k2 |p|^4; the camera looks along -z, x points right, y up, and the origin of the
@@ -30,10 +30,10 @@ def _row(values: Iterable[float]) -> str:
 
 
 def write_bundler(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Cameras, points and their observations.
+    """Write cameras, points and their observations.
 
     Raises:
-      UserError: a camera that the format cannot express, a name with a blank.
+      UserError: the format cannot express a camera, or a name has a blank in it.
     """
     images = registered_images(model)
     check_no_blanks([image.name for image in images], "bundler")

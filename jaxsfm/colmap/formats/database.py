@@ -1,18 +1,18 @@
-"""COLMAP's database, read only.
+"""Reads COLMAP's database without COLMAP.
 
-Read with sqlite3, not by COLMAP: that opens a file for writing, brings its tables up to date, and
-ends the process on what is damaged. Tables and blobs: https://colmap.github.io/database.html.
+COLMAP opens a database for writing, updates its tables, and ends the process if it is damaged. So
+it is read with sqlite3. Tables and blobs: https://colmap.github.io/database.html.
 """
 
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
+from jaxsfm.colmap.database import PIXEL_OFFSET
 from jaxsfm.colmap.formats.tables import (
     MAX_KEYPOINTS,
     CameraRow,
@@ -25,14 +25,12 @@ from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair
 
 MAX_IMAGES = 2**31 - 1
-"""An id of a pair is this times the lesser image's id, plus the other's."""
-PIXEL_OFFSET = np.float32(0.5)
-"""COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
+"""The id of a pair is this times the lesser id of its images, plus the other id."""
 _DAMAGED = (sqlite3.Error, TypeError, ValueError, OverflowError, KeyError)
 
 
-def _blob(rows: int, columns: int, data: Any, dtype: type, where: str) -> np.ndarray:
-    """A table of a blob; COLMAP leaves it out where it has no rows."""
+def _blob(rows: int, columns: int, data: object, dtype: type, where: str) -> np.ndarray:
+    """Read a table from a blob. COLMAP writes no blob for a table without rows."""
     if data is None or rows == 0:
         return np.zeros((0, max(int(columns), 2)), dtype)
     if not isinstance(data, bytes) or rows > MAX_KEYPOINTS:
@@ -63,19 +61,20 @@ def _pairs(
 
 
 def read_database(path: Path, *, where: str) -> Tables:
-    """Everything in a COLMAP database that was matched.
+    """Read cameras, keypoints and matches from a COLMAP database.
 
     Args:
-      where: how messages begin: an option, the file.
+      where: beginning of messages, such as an option and the file.
 
     Raises:
-      UserError: not a database, damaged, or inconsistent: an index out of range, two images of one
-        name, a match of an image that is not there.
+      UserError: the file is no database, is damaged, or is inconsistent: an index is out of range,
+        two images have one name, or a match is of an image that it does not have.
     """
     if not path.is_file():
         raise UserError(f"{where}: no such file")
-    # COLMAP's databases keep a log beside them: sqlite3 would make one even to read, unless told
-    # that nobody writes. A log that is there already holds what is not in the file yet.
+    # A COLMAP database has a log file beside it while it is open. sqlite3 makes this file even to
+    # read, unless it is told that nobody writes. An existing log holds data that the database does
+    # not hold yet.
     how = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
     try:
         address = f"file:{quote(str(path.absolute()), errors='surrogateescape')}?{how}"

@@ -1,4 +1,4 @@
-"""hloc's features and matches (HDF5) and pair lists.
+"""Reads and writes hloc's features and matches (HDF5) and its pair lists.
 
 Layout (hloc/extract_features.py, match_features.py, utils/io.py, utils/parsers.py):
 
@@ -9,15 +9,14 @@ Layout (hloc/extract_features.py, match_features.py, utils/io.py, utils/parsers.
   (n0,), the second image's keypoint or -1, and `matching_scores0` (n0,).
 * pairs: a text file, two names a line, cut at blanks.
 
-hloc writes matches as int16, which turns indices above 32767 negative, and keypoints as float16,
-which rounds to half a pixel beyond 512 and to one beyond 1024. Its readers take any integers and
-floats: here they are int32 and float32.
+hloc writes matches as int16, in which indices above 32767 turn negative, and keypoints as float16,
+which rounds to half a pixel beyond 512 and to one beyond 1024. hloc reads any integers and floats,
+so int32 and float32 are written here.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -29,13 +28,13 @@ from jaxsfm.io.pairs import Pair, describe
 
 FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 MAX_COLUMNS = 16
-"""Of keypoints: a file that claims more is damaged."""
-# h5py raises whatever the damage leads to; SystemError where a read failed half-way.
+"""Columns of a keypoint. A file that claims more is damaged."""
+# h5py raises various errors for damaged files, SystemError if a read fails half-way.
 _DAMAGED = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, SystemError)
 
 
 def pair_key(name0: str, name1: str) -> str:
-    """The group of a pair's matches."""
+    """The name of the group that holds a pair's matches."""
     return f"{name0.replace('/', '-')}/{name1.replace('/', '-')}"
 
 
@@ -45,17 +44,17 @@ def write_hloc(
     matches: Mapping[Pair, np.ndarray],
     uncertainty_px: Mapping[str, float],
 ) -> None:
-    """Features, matches and the list of pairs, as hloc's mapping reads them.
+    """Write features, matches and the list of pairs, as hloc's mapping reads them.
 
-    Matches get the score 1: they are RANSAC's inliers and have none of their own.
+    All matches get the score 1, because they are inliers of RANSAC without scores of their own.
 
     Args:
-      folder: exists.
-      matches: of `tables`, those wanted.
-      uncertainty_px: per image, of its keypoints; original pixels.
+      folder: an existing folder.
+      matches: those of `tables.matches` or `tables.inliers` to write.
+      uncertainty_px: by image name, uncertainty of its keypoints, original pixels.
 
     Raises:
-      UserError: names that hloc's files cannot tell apart.
+      UserError: hloc's files cannot tell two names apart, or a name has a blank in it.
     """
     _check_names(tables.sizes)
     with h5py.File(folder / FEATURES, "w", libver="latest") as file:
@@ -90,7 +89,7 @@ def _check_names(names: Iterable[str]) -> None:
             )
 
 
-def _dataset(group: Any, key: str, where: str, max_rows: int) -> np.ndarray:
+def _dataset(group: h5py.Group, key: str, where: str, max_rows: int) -> np.ndarray:
     found = group.get(key)
     if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu":
         raise UserError(f"{where}: no numbers {key!r}")
@@ -100,8 +99,8 @@ def _dataset(group: Any, key: str, where: str, max_rows: int) -> np.ndarray:
     return np.asarray(found)
 
 
-def _pairs_in(file: Any, names: Mapping[str, str]) -> Iterator[tuple[str, str, Any]]:
-    """Every pair of known images, and its group.
+def _pairs_in(file: h5py.Group, names: Mapping[str, str]) -> Iterator[tuple[str, str, h5py.Group]]:
+    """Find every pair of known images, and its group.
 
     Args:
       names: shortened name -> name.
@@ -120,14 +119,14 @@ def _pairs_in(file: Any, names: Mapping[str, str]) -> Iterator[tuple[str, str, A
 
 
 def read_hloc(features: Path, matches: Path, names: Iterable[str], *, where: str) -> Tables:
-    """Features and matches of the named images, from hloc's own files or from ours.
+    """Read features and matches of images, from hloc's own files or from ours.
 
     Args:
-      names: the images looked for; what else the files hold is not looked at.
-      where: how messages begin.
+      names: of the images. Other images in the files are ignored.
+      where: beginning of messages.
 
     Raises:
-      UserError: not HDF5, damaged, or inconsistent, with the file and the image.
+      UserError: a file is not HDF5, is damaged, or is inconsistent.
     """
     tables = Tables({}, {}, {}, {}, {})
     for path in (features, matches):
@@ -165,7 +164,7 @@ def read_hloc(features: Path, matches: Path, names: Iterable[str], *, where: str
 
 
 def _matches_of(
-    group: Any, names: tuple[str, str], keypoints: dict[str, np.ndarray], where: str
+    group: h5py.Group, names: tuple[str, str], keypoints: dict[str, np.ndarray], where: str
 ) -> tuple[Pair, np.ndarray]:
     own = f"{where}: {describe(names)}"
     second = _dataset(group, "matches0", own, MAX_KEYPOINTS)

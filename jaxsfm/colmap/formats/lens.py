@@ -1,4 +1,4 @@
-"""COLMAP's cameras in the terms that other formats share, and what a format cannot express."""
+"""COLMAP's cameras and tracks in the terms of other formats, and what those can express."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import PurePosixPath
@@ -13,10 +13,10 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 
 TOLERANCE_PX = 0.01
-"""What may be lost at an image's corner."""
+"""Largest error at a corner of the image that a conversion may make."""
 _PERSPECTIVE = {"SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 2}
 _FISHEYE = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4}
-"""Their numbers of radial terms."""
+"""COLMAP's camera models, and their numbers of radial terms."""
 
 
 class Lens(NamedTuple):
@@ -27,7 +27,7 @@ class Lens(NamedTuple):
     """
 
     model: str
-    """COLMAP's name of it."""
+    """COLMAP's name of the camera model."""
     size: tuple[int, int]
     fx: float
     fy: float
@@ -39,19 +39,19 @@ class Lens(NamedTuple):
 
     @property
     def corner_px(self) -> float:
-        """From the principal point to the farthest corner."""
+        """Distance from the principal point to the farthest corner, pixels."""
         width, height = self.size
         return float(np.hypot(max(self.cx, width - self.cx), max(self.cy, height - self.cy)))
 
 
 def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Camera:
-    """A database's camera.
+    """The camera of a row of a database.
 
     Args:
-      where: how messages begin.
+      where: beginning of messages.
 
     Raises:
-      UserError: no such model, or other parameters than it has.
+      UserError: there is no such model, or it has other parameters.
     """
     try:
         model = pycolmap.CameraModelId(row.model)
@@ -64,7 +64,14 @@ def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Cam
 
 
 def lens_of(camera: pycolmap.Camera, to: str) -> Lens:
-    """Raises UserError where neither of the two formulas is the camera's, naming its model."""
+    """Describe a camera by one of the two formulas.
+
+    Args:
+      to: name of the format, for messages.
+
+    Raises:
+      UserError: neither formula is that of the camera.
+    """
     model = camera.model_name
     fisheye = model in _FISHEYE
     if not fisheye and model not in _PERSPECTIVE:
@@ -87,7 +94,7 @@ def lens_of(camera: pycolmap.Camera, to: str) -> Lens:
 
 
 def check_one_focal(lens: Lens, to: str) -> None:
-    """Raises UserError where the two focal lengths differ."""
+    """Raise UserError if the two focal lengths differ."""
     if abs(lens.fx / lens.fy - 1) * lens.corner_px > TOLERANCE_PX:
         raise UserError(
             f"--to {to}: it has one focal length, but the {lens.model} camera has "
@@ -96,7 +103,7 @@ def check_one_focal(lens: Lens, to: str) -> None:
 
 
 def check_centred(lens: Lens, to: str) -> None:
-    """Raises UserError where the principal point is not the image's centre."""
+    """Raise UserError if the principal point is not the centre of the image."""
     off = np.hypot(lens.cx - lens.size[0] / 2, lens.cy - lens.size[1] / 2)
     if off > TOLERANCE_PX:
         raise UserError(
@@ -106,13 +113,13 @@ def check_centred(lens: Lens, to: str) -> None:
 
 
 def check_no_tangential(lens: Lens, to: str) -> None:
-    """Raises UserError for fisheye and tangential distortion."""
+    """Raise UserError for fisheye cameras and tangential distortion."""
     if lens.fisheye or any(lens.tangential):
         raise UserError(f"--to {to}: it has no camera like COLMAP's {lens.model}")
 
 
 def check_no_blanks(names: Iterable[str], to: str) -> None:
-    """Raises UserError for names that a format would cut in two."""
+    """Raise UserError for names that a format would cut in two."""
     for name in names:
         if len(name.split()) != 1 or name != name.strip():
             raise UserError(
@@ -121,19 +128,20 @@ def check_no_blanks(names: Iterable[str], to: str) -> None:
 
 
 class PointTrack(NamedTuple):
-    """A 3-D point and where images see it."""
+    """A 3-D point and its observations."""
 
     xyz: np.ndarray
     colour: tuple[int, int, int]
     seen: list[tuple[int, int, np.ndarray]]
-    """Index of the image, of its keypoint, and (x, y) in COLMAP's pixels; each image once."""
+    """For each observation the index of the image, that of its keypoint, and (x, y) in COLMAP's
+    pixels. Each image occurs once."""
 
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """Images with a pose, by name.
+    """The images with a pose, sorted by name.
 
     Raises:
-      UserError: a name that leads out of the photos' folder.
+      UserError: a name leads out of the photos' folder.
     """
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     for image in images:
@@ -146,7 +154,11 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 def point_tracks(
     model: pycolmap.Reconstruction, images: list[pycolmap.Image]
 ) -> Iterator[tuple[int, PointTrack]]:
-    """The points by id; indices of images are those in `images`."""
+    """The points of a model, in the order of their ids.
+
+    Yields:
+      the id; the point, with indices into `images`.
+    """
     index = {image.image_id: k for k, image in enumerate(images)}
     pixels = [
         np.asarray([point.xy for point in image.points2D], np.float64).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json and point cloud.
+"""Writes nerfstudio's transforms.json and its point cloud.
 
 Source: nerfstudio's data conventions and its own converter (process_data/colmap_utils.py).
 Cameras to world, OpenGL's axes (x right, y up, looking along -z); the world is turned as their
@@ -8,7 +8,6 @@ are COLMAP's: rays leave through (column + 0.5, row + 0.5) (cameras.py, `get_ima
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -18,10 +17,10 @@ from jaxsfm.errors import UserError
 
 TRANSFORMS, POINTS, IMAGES = "transforms.json", "sparse_pc.ply", "images"
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
-"""World to nerfstudio's world."""
+"""From the world to nerfstudio's world."""
 
 
-def _intrinsics(lens: Lens) -> dict[str, Any]:
+def _intrinsics(lens: Lens) -> dict[str, float]:
     names = ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2")
     return {
         "w": lens.size[0],
@@ -36,13 +35,13 @@ def _intrinsics(lens: Lens) -> dict[str, Any]:
 
 
 def write_nerfstudio(folder: Path, model: pycolmap.Reconstruction, images: Path | None) -> None:
-    """transforms.json and sparse_pc.ply.
+    """Write transforms.json and sparse_pc.ply.
 
     Args:
-      images: the photos' folder as it is referred to; None: `images` beside the file.
+      images: the photos' folder, as the file refers to it; None: `images` beside the file.
 
     Raises:
-      UserError: a camera that nerfstudio does not have, or perspective and fisheye ones together.
+      UserError: nerfstudio does not have a camera, or perspective and fisheye cameras are mixed.
     """
     views = registered_images(model)
     lenses = [lens_of(model.camera(view.camera_id), "nerfstudio") for view in views]

@@ -1,4 +1,4 @@
-"""VisualSFM's NVM.
+"""Writes VisualSFM's NVM.
 
 Source: VisualSFM's documentation of NVM_V3. A camera is NAME f (quaternion w x y z) (centre) r 0,
 (x, y, 1) ~ [R | -R C] X; an observation m, in pixels from the principal point, is *undistorted* by
@@ -22,14 +22,14 @@ from jaxsfm.colmap.formats.lens import (
 from jaxsfm.errors import UserError
 
 MAX_ERROR_PX = 1.0
-"""Of the undistortion, anywhere in the image."""
+"""Largest error of the undistortion, anywhere in the image."""
 
 
 def undistortion(lens: Lens) -> float:
-    """The r that undoes k1 and k2 best over the image.
+    """The coefficient r that undoes k1 and k2 best over the image.
 
     Raises:
-      UserError: it leaves more than a pixel at the corners.
+      UserError: the error that it leaves exceeds MAX_ERROR_PX.
     """
     k1, k2 = lens.radial[:2]
     if k1 == k2 == 0:
@@ -51,10 +51,10 @@ def undistortion(lens: Lens) -> float:
 
 
 def nvm_text(model: pycolmap.Reconstruction) -> str:
-    """The whole file.
+    """The text of the file.
 
     Raises:
-      UserError: a camera that the format cannot express, a name with a blank.
+      UserError: the format cannot express a camera, or a name has a blank in it.
     """
     images = registered_images(model)
     check_no_blanks([image.name for image in images], "nvm")

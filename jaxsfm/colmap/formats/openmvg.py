@@ -1,4 +1,4 @@
-"""OpenMVG's sfm_data.json (version 0.3) and its features and matches as text.
+"""Writes OpenMVG's sfm_data.json (version 0.3), and its features and matches as text.
 
 Source: OpenMVG's sfm_data_io_cereal.cpp, cameras/*_io.hpp, matching/indMatch_utils.cpp. Cameras
 have one focal length; poses are a rotation world to camera and a centre; pixels count from the
@@ -10,7 +10,6 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -29,13 +28,13 @@ from jaxsfm.io.pairs import Pair
 
 SFM_DATA, MATCHES = "sfm_data.json", "matches"
 _NEW, _EXACT = 1 << 31, 1 << 30
-"""Cereal's marks of a first occurrence, and of a pointer to the very type it is declared for."""
+"""Cereal's marks for the first occurrence of a type, and for a pointer to the declared type."""
 
 
-def _intrinsic(lens: Lens) -> tuple[str, dict[str, Any]]:
-    """OpenMVG's name of the camera, and its numbers."""
+def _intrinsic(lens: Lens) -> tuple[str, dict[str, object]]:
+    """OpenMVG's name of a camera model, and the camera's parameters."""
     check_one_focal(lens, "openmvg")
-    data: dict[str, Any] = {
+    data: dict[str, object] = {
         "width": lens.size[0],
         "height": lens.size[1],
         "focal_length": lens.fx,
@@ -53,7 +52,7 @@ def _intrinsic(lens: Lens) -> tuple[str, dict[str, Any]]:
     return "pinhole", data
 
 
-def _keyed(values: Iterable[tuple[int, Any]]) -> list[dict[str, Any]]:
+def _keyed(values: Iterable[tuple[int, object]]) -> list[dict[str, object]]:
     return [{"key": key, "value": value} for key, value in values]
 
 
@@ -61,15 +60,17 @@ def sfm_data(
     cameras: Mapping[str, pycolmap.Camera],
     model: pycolmap.Reconstruction | None,
     root: Path | None,
-) -> dict[str, Any]:
-    """The record of views, cameras, poses and points.
+) -> dict[str, object]:
+    """The content of sfm_data.json: views, cameras, poses and points.
 
     Args:
-      cameras: of every image, with or without a pose; the model's where it has one.
+      cameras: by image name, of images with and without a pose. For images with a pose they are
+        the cameras of the model.
+      model: poses and points; None: there are none.
       root: the photos' folder.
 
     Raises:
-      UserError: a camera that OpenMVG does not have.
+      UserError: OpenMVG does not have a camera.
     """
     names = sorted(cameras)
     lenses = {name: lens_of(camera, "openmvg") for name, camera in cameras.items()}
@@ -93,7 +94,7 @@ def sfm_data(
     intrinsics = []
     for k, lens in enumerate(distinct):
         kind, data = _intrinsic(lens)
-        value: dict[str, Any] = {"polymorphic_id": types.get(kind, _NEW + len(types) + 1)}
+        value: dict[str, object] = {"polymorphic_id": types.get(kind, _NEW + len(types) + 1)}
         if kind not in types:
             types[kind] = len(types) + 1
             value["polymorphic_name"] = kind
@@ -122,12 +123,12 @@ def sfm_data(
 
 
 def write_features(folder: Path, tables: Tables) -> None:
-    """NAME.feat (x y scale orientation a line), matches.putative.txt and matches.f.txt.
+    """Write NAME.feat (x y scale orientation on each line), matches.putative.txt and matches.f.txt.
 
     Views are numbered by name, as in `sfm_data`. Scale and orientation are 1 and 0.
 
     Raises:
-      UserError: two images whose names differ in folder or ending only.
+      UserError: the names of two images differ in folder or ending only.
     """
     names = sorted(tables.sizes)
     stems = Counter(PurePosixPath(name).stem for name in names)
@@ -153,11 +154,11 @@ def _write_matches(path: Path, names: list[str], found: Mapping[Pair, np.ndarray
             file.writelines(f"{i} {j}\n" for i, j in rows.tolist())
 
 
-def write_openmvg(folder: Path, record: dict[str, Any], tables: Tables | None) -> None:
-    """sfm_data.json, and features and matches in `matches`.
+def write_openmvg(folder: Path, record: dict[str, object], tables: Tables | None) -> None:
+    """Write sfm_data.json, and features and matches into the folder `matches`.
 
-    `id_feat` counts the model's own keypoints, which refinement moves; the features and matches
-    are the database's.
+    `id_feat` counts the keypoints of the model, which refinement has moved. The features and the
+    matches are those of the database.
     """
     (folder / SFM_DATA).write_text(json.dumps(record, indent=1), encoding="utf-8")
     if tables is not None:

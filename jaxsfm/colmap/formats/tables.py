@@ -1,4 +1,4 @@
-"""Keypoints and matches as other tools' files hold them, in this package's pixels, checked."""
+"""Keypoints and matches from files of other tools, checked, in this package's pixels."""
 
 from typing import NamedTuple
 
@@ -9,43 +9,43 @@ from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, describe, make_pair
 
 MAX_KEYPOINTS = 10_000_000
-"""Of one image; a file that claims more is damaged."""
+"""Keypoints of one image. A file that claims more is damaged."""
 
 
 class CameraRow(NamedTuple):
-    """A camera as COLMAP's database has it."""
+    """A camera as it is in COLMAP's database."""
 
     model: int
     """COLMAP's number of the camera model."""
     params: tuple[float, ...]
-    """COLMAP's pixels; the focal length in x comes first."""
+    """In COLMAP's pixels. The focal length in x comes first."""
     known: bool
     """The focal length was known before mapping."""
 
 
 class Tables(NamedTuple):
-    """What was matched, whoever matched it."""
+    """Keypoints and matches of another tool's files."""
 
     sizes: dict[str, tuple[int, int]]
-    """Image name -> (width, height), of the images whose size is told."""
+    """Image name -> (width, height), of the images whose size the file holds."""
     cameras: dict[str, CameraRow]
-    """By image name; empty where the file has none."""
+    """By image name; empty if the file has no cameras."""
     keypoints: dict[str, np.ndarray]
     """float32 (n, 2): (x, y), original pixels, centre of the top-left pixel (0, 0)."""
     matches: dict[Pair, np.ndarray]
     """int32 (m, 2): indices of keypoints, before verification."""
     inliers: dict[Pair, np.ndarray]
-    """The same, two-view inliers; empty where nothing was verified."""
+    """The same for two-view inliers; empty if nothing was verified."""
 
 
 def checked_keypoints(values: np.ndarray, where: str) -> np.ndarray:
-    """float32 (n, 2) of finite (x, y).
+    """Check keypoints, and return their (x, y) as float32 (n, 2).
 
     Args:
-      where: how messages begin.
+      where: beginning of messages.
 
     Raises:
-      UserError: not numbers, fewer than two columns, not finite.
+      UserError: they are no numbers, have fewer than two columns, or are not finite.
     """
     if values.ndim != 2 or values.shape[1] < 2 or values.dtype.kind not in "fiu":
         raise UserError(f"{where}: keypoints must be numbers, n x 2; got {values.shape}")
@@ -59,13 +59,17 @@ def checked_keypoints(values: np.ndarray, where: str) -> np.ndarray:
 def checked_matches(
     rows: np.ndarray, names: tuple[str, str], keypoints: dict[str, np.ndarray], where: str
 ) -> tuple[Pair, np.ndarray]:
-    """The pair in canonical order, and its matches (m, 2) with the columns in that order.
+    """Check the matches of a pair.
 
     Args:
       rows: integers (m, 2), columns in the order of `names`.
+      where: beginning of messages.
+
+    Returns:
+      the pair, with its names in order; int32 (m, 2), with its columns in that order.
 
     Raises:
-      UserError: an image matched with itself, without keypoints, or an index out of range.
+      UserError: an image is matched with itself, or an index is out of range.
     """
     if names[0] == names[1]:
         raise UserError(f"{where}: {shown_name(names[0])} is matched with itself")
@@ -82,6 +86,6 @@ def checked_matches(
 
 
 def one_to_one(rows: np.ndarray) -> np.ndarray:
-    """The matches (m, 2) that are the first of both their keypoints: tracks want them so."""
+    """Keep only matches (m, 2) that are the first of both their keypoints, as tracks need it."""
     first0, first1 = (np.unique(column, return_index=True)[1] for column in rows.T)
     return rows[np.intersect1d(first0, first1)]

@@ -1,4 +1,4 @@
-"""The page at the end of a run."""
+"""Writes the page at the end of a run."""
 
 import logging
 from pathlib import Path
@@ -9,10 +9,10 @@ logger = logging.getLogger(__name__)
 
 
 def page_after_run(results: Path) -> None:
-    """Write the page of results that lie in place; a fault here costs the page alone."""
+    """Write the page of finished results. A failure is only a warning: the run is not affected."""
     try:
         from jaxsfm.report.page.write import write_page
 
-        logger.info("what it did, to look at: %s", write_page(results))
+        logger.info("the report, for the browser: %s", write_page(results))
     except Exception as error:
         logger.warning("%s was not written (%s)", results / PAGE, error)

@@ -1,4 +1,4 @@
-"""Close-ups of tracks: the cell that matched, the pixel it walked to, its place in the model."""
+"""Close-ups of tracks: the cell that matched, the keypoint in it, and its place in the model."""
 
 import functools
 import itertools
@@ -7,37 +7,41 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.core.grid import FINE_STRIDE, rescale
+from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.images import WorkingImage
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.report.finished_run import FinishedModel, FinishedRun
 from jaxsfm.report.page.embedded import data_uri
 
 TRACKS, PHOTOS = 5, 6
-"""Tracks shown, and photos of each."""
+"""The number of tracks that are shown, and of photos of each."""
 MATCHED = 12
-"""Photos of a track whose matches with each other are looked at."""
+"""The most photos of a track whose matches with each other are read."""
 SIDE = 40
-"""Side of a patch, working pixels."""
+"""The side of a patch, working pixels."""
 NEAR_PX = 6.0
-"""Working pixels between a keypoint and the observation that the refinement made of it."""
+"""The largest distance between a keypoint and the observation that the refinement made of it,
+working pixels."""
 LEAST = 4
-"""Photos that see a shown point, where there are such points."""
+"""The fewest photos in which a shown point was seen, if there are such points."""
 
 
 class Patch(NamedTuple):
-    """A piece of one photo; places in pixels of the patch, its top-left corner (0, 0)."""
+    """A part of one photo. Places are in pixels of the patch; its top-left corner is (0, 0)."""
 
     name: str
     uri: str
     cell: tuple[float, float] | None
-    """Top-left corner of the cell of FINE_STRIDE pixels; None: none matched."""
+    """The top-left corner of the cell of FINE_STRIDE pixels; None if no cell matched."""
     walked: tuple[float, float] | None
+    """The keypoint: the pixel with the strongest features in the cell."""
     final: tuple[float, float]
+    """The observation in the model."""
 
 
 class ShownTrack(NamedTuple):
-    """One 3-D point in some of the photos that see it."""
+    """One 3-D point in some of the photos in which it was seen."""
 
     length: int
     error: float
@@ -46,22 +50,25 @@ class ShownTrack(NamedTuple):
 
 
 def _candidates(model: FinishedModel) -> list[int]:
-    """Points that many photos see, from all over the model."""
+    """Points that were seen in many photos, from all parts of the model."""
     lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
     least = min(LEAST, int(lengths.max(initial=0)))
     long = np.flatnonzero((lengths >= least) & (lengths > 0))
-    # Points next to each other in the model's order are next to each other in space.
+    # Points that follow each other in the model are near each other in space.
     return long[np.linspace(0, len(long) - 1, 4 * TRACKS).astype(int)].tolist() if len(long) else []
 
 
 def _cells(
     load: Callable[[Pair], PairResult | None], names: list[str], xy: np.ndarray, radius: float
 ) -> dict[int, tuple[int, np.ndarray]]:
-    """Place in `names` -> (cell, keypoint) of the matches that made a track's observations.
+    """The cells and keypoints of the matches that the observations of a track were made of.
 
     Args:
-      xy: (n, 2), original pixels of the observations in the images `names`.
-      radius: original pixels: how far off a keypoint may lie.
+      xy: float (n, 2), the observations in the photos `names`, original pixels.
+      radius: the largest distance between a keypoint and its observation, original pixels.
+
+    Returns:
+      (cell, keypoint) by the place of a photo in `names`.
     """
     found = []
     for i, j in itertools.combinations(range(len(names)), 2):
@@ -89,20 +96,20 @@ def _cells(
 def _patch(
     name: str, image: WorkingImage, final: np.ndarray, own: tuple[int, np.ndarray] | None
 ) -> Patch:
-    """A patch around the cell, or around the place in the model.
+    """A patch around the cell, or around the observation if no cell matched.
 
     Args:
-      final: (2,), original pixels.
-      own: cell index and its keypoint, original pixels.
+      final: float (2,), the observation in the model, original pixels.
+      own: the index of the cell, and its keypoint in original pixels.
     """
     height, width = image.rgb.shape[:2]
-    to_working = 1 / np.asarray(image.scale)
-    aligned = np.asarray(rescale(final, to_working))
+    pixels = Pixels(image.scale)
+    aligned = pixels.from_original(final)
     corner, walked = None, None
     if own is not None:
         row, column = divmod(own[0], width // FINE_STRIDE)
         corner = np.asarray([column, row]) * float(FINE_STRIDE)
-        walked = np.asarray(rescale(np.asarray(own[1], np.float64), to_working))
+        walked = pixels.from_original(own[1].astype(np.float64))
     middle = aligned if corner is None else corner + (FINE_STRIDE - 1) / 2
     x, y = np.round(middle - (SIDE - 1) / 2).astype(int)
     rows = np.clip(np.arange(y, y + SIDE), 0, height - 1)
@@ -143,7 +150,7 @@ def _track(
 
 
 def close_ups(run: FinishedRun) -> list[ShownTrack]:
-    """A few tracks; none without a model, photos or matches."""
+    """A few tracks; none if the model, the photos or the matches are gone."""
     if run.model is None:
         return []
     load = functools.lru_cache(maxsize=None)(run.load_matches)

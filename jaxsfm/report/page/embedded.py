@@ -1,4 +1,4 @@
-"""Photos as part of the page."""
+"""Photos that are embedded in the page."""
 
 import base64
 from typing import NamedTuple
@@ -9,6 +9,7 @@ import numpy as np
 from jaxsfm.io.images import WorkingImage, working_size
 
 QUALITY = 72
+"""Quality of JPEG, 0 .. 100."""
 
 
 class Embedded(NamedTuple):
@@ -19,18 +20,18 @@ class Embedded(NamedTuple):
     width: int
     height: int
     scale: np.ndarray
-    """Original pixels per pixel of it, (x, y)."""
+    """Original pixels per pixel of the embedded photo, (x, y)."""
 
     def place(self, xy: np.ndarray) -> np.ndarray:
-        """Original pixels (n, 2) in SVG's coordinates: the top-left *corner* is (0, 0)."""
+        """Original pixels (n, 2) as coordinates of SVG, whose (0, 0) is the top-left corner."""
         return (xy + 0.5) / self.scale
 
 
 def data_uri(rgb: np.ndarray, suffix: str) -> str:
-    """uint8 (h, w, 3) as the address of an <img>.
+    """Colours uint8 (h, w, 3) as the address of an <img>.
 
     Args:
-      suffix: .jpg or .png (by OpenCV, see jaxsfm.colmap.database).
+      suffix: .jpg or .png. OpenCV encodes both, see jaxsfm.colmap.database.
     """
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if suffix == ".jpg" else []
     ok, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)
@@ -40,7 +41,7 @@ def data_uri(rgb: np.ndarray, suffix: str) -> str:
 
 
 def embed(image: WorkingImage, *, id: str, side: int) -> Embedded:
-    """A photo with its longer side at most `side` pixels, as JPEG."""
+    """A photo as JPEG whose longer side is at most `side` pixels."""
     rgb = image.rgb
     full = (rgb.shape[1], rgb.shape[0])
     width, height = working_size(full, side)

@@ -1,4 +1,4 @@
-"""How exact the model is: by itself, and beside a reference."""
+"""How accurate the model is: by its reprojection errors, and against reference poses."""
 
 import numpy as np
 import plotly.graph_objects as go
@@ -8,6 +8,7 @@ from jaxsfm.report.page.figures import BLUE, GREEN, Figure, figure
 from jaxsfm.report.run_results import EvaluationReport
 
 LONGEST_TRACK = 15
+"""Longer tracks share the last bar."""
 
 
 def _axis(title: str, **more: object) -> dict[str, object]:
@@ -15,15 +16,16 @@ def _axis(title: str, **more: object) -> dict[str, object]:
 
 
 def reprojection_figure(model: FinishedModel) -> Figure:
-    """Histogram of every observation's reprojection error."""
+    """A histogram of the reprojection errors of all observations."""
     errors = model.errors[np.isfinite(model.errors)]
     top = float(max(np.percentile(errors, 99), 0.1)) if len(errors) else 1.0
     counts, edges = np.histogram(np.minimum(errors, top), bins=50, range=(0, top))
     return figure(
         "reprojection",
         "Reprojection errors",
-        "How far the model's points, projected into the photos, lie from where they were seen: a "
-        "good model piles up at the left; the last bar holds the worst 1 %.",
+        "A reprojection error is the distance between the place where a point was seen in a photo "
+        "and the place where the model projects it. In a good model most errors are near zero. The "
+        "last bar holds the largest 1 %.",
         alt=f"Histogram of {len(errors)} reprojection errors",
         data=[
             go.Bar(
@@ -38,7 +40,7 @@ def reprojection_figure(model: FinishedModel) -> Figure:
 
 
 def track_figure(model: FinishedModel) -> Figure:
-    """How many photos see a point."""
+    """A bar chart of the number of photos in which a point was seen."""
     lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
     counts = np.bincount(np.minimum(lengths, LONGEST_TRACK), minlength=3)[2:]
     labels = [str(k) for k in range(2, 2 + len(counts))]
@@ -47,8 +49,8 @@ def track_figure(model: FinishedModel) -> Figure:
     return figure(
         "tracks",
         "How many photos see each point",
-        "Points that many photos agree on are the firm ones; points seen twice only are the least "
-        "certain.",
+        "A point that was seen in many photos is well determined. Points that were seen in two "
+        "photos only are the least certain.",
         alt=f"Bar chart of the track lengths of {len(lengths)} points",
         data=[
             go.Bar(
@@ -67,7 +69,7 @@ def track_figure(model: FinishedModel) -> Figure:
 
 
 def cumulative_figures(evaluation: EvaluationReport) -> list[Figure]:
-    """Share of the reference's photos within an error, for positions and rotations."""
+    """Cumulative curves of the position errors and of the rotation errors."""
     total = evaluation.reference_images
     figures = []
     images = evaluation.images.values()

@@ -1,4 +1,4 @@
-"""What all figures of the page share."""
+"""Figures of the page, and how names and numbers are written in them."""
 
 import html
 from collections.abc import Sequence
@@ -11,7 +11,8 @@ from plotly.basedatatypes import BaseTraceType
 from jaxsfm.io.images import shown_name
 
 BLUE, ORANGE, GREEN, GREY = "#3b82c4", "#e07b39", "#3f9d6b", "#8a94a3"
-"""Legible on light and on dark ground, and apart for colour-blind readers."""
+"""Colours that are legible on light and dark ground, and that colour-blind readers can tell
+apart."""
 
 
 class Figure(NamedTuple):
@@ -20,31 +21,31 @@ class Figure(NamedTuple):
     id: str
     title: str
     caption: str
-    """One sentence: what it shows and how to read it."""
+    """What the figure shows and how to read it."""
     alt: str
     spec: str
-    """JSON of data and layout, numbers in base64; plotly escapes < and > in it, so that no name can
-    end the <script> that holds it."""
+    """Data and layout as JSON, with numbers in base64. plotly escapes < and > in it, so that no
+    name can end the <script> that holds it."""
     tall: bool = False
 
 
 def text(name: str) -> str:
-    """An image's name for plotly, which takes a few tags in its texts."""
+    """The name of a photo for plotly, whose texts may hold a few HTML tags."""
     return html.escape(shown_name(name))
 
 
 def count(n: int) -> str:
-    """With thin spaces between thousands."""
+    """A number with thin spaces between thousands."""
     return f"{n:,}".replace(",", "\u202f")
 
 
 def figures3(value: float) -> str:
-    """Three significant figures, never as a power of ten."""
+    """A number with three significant figures, never as a power of ten."""
     return np.format_float_positional(value, precision=3, fractional=False, trim="-")
 
 
 def short(names: list[str]) -> list[str]:
-    """The names without the folder that all of them share."""
+    """The names without the folder that they share."""
     shared = names[0].rpartition("/")[0] + "/" if names else ""
     if shared != "/" and all(name.startswith(shared) for name in names):
         return [name.removeprefix(shared) for name in names]
@@ -61,7 +62,7 @@ def figure(
     layout: dict[str, object],
     tall: bool = False,
 ) -> Figure:
-    """A figure; colours of ground, text and grid come from the page."""
+    """A figure. The page gives it the colours of ground, text and grid."""
     base = {
         "template": go.layout.Template(),
         "margin": {"l": 60, "r": 16, "t": 12, "b": 50},

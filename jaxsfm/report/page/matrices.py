@@ -1,4 +1,4 @@
-"""Every pair in two squares: how many matches, and what became of it."""
+"""Two heat maps of all pairs: how many matches a pair has, and how far it came."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,12 @@ from jaxsfm.report.page.pair_states import NOT_TRIED, STATES, state
 from jaxsfm.report.run_results import PairRow
 
 MAX_SQUARES = 200
-"""Squares per side; photos beyond it share squares."""
+"""The most squares on a side. If there are more photos, several of them share a square."""
 MAX_LABELS = 25
 
 
 def _reduced(matrix: np.ndarray, block: int) -> np.ndarray:
-    """The largest value of every block x block part."""
+    """The largest value of every block x block part of a square matrix."""
     n = -(-len(matrix) // block)
     wide = np.zeros((n * block, n * block), matrix.dtype)
     wide[: len(matrix), : len(matrix)] = matrix
@@ -23,7 +23,12 @@ def _reduced(matrix: np.ndarray, block: int) -> np.ndarray:
 
 
 def pair_matrices(names: Sequence[str], rows: Sequence[PairRow]) -> tuple[np.ndarray, np.ndarray]:
-    """int32 (n, n): inliers (COLMAP's where it verified) and index into STATES; symmetrical."""
+    """Two symmetrical matrices int32 (n, n).
+
+    Returns:
+      The number of a pair's matches (COLMAP's inliers if it verified the pair), and the place of
+      the pair's state in STATES.
+    """
     index = {name: k for k, name in enumerate(names)}
     inliers = np.zeros((len(names), len(names)), np.int32)
     states = np.zeros_like(inliers)
@@ -35,11 +40,11 @@ def pair_matrices(names: Sequence[str], rows: Sequence[PairRow]) -> tuple[np.nda
 
 
 def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> list[Figure]:
-    """Matches and states of all pairs as heat maps.
+    """Heat maps of the matches and of the states of all pairs.
 
     Args:
-      names: all images, in the order of the axes.
-      rows: `pairs.each` of report.json.
+      names: all photos, in the order of the axes.
+      rows: all pairs that were tried.
     """
     block = max(1, -(-len(names) // MAX_SQUARES))
     inliers, states = (_reduced(m, block) for m in pair_matrices(names, rows))
@@ -69,7 +74,7 @@ def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> list[Figure]:
         "margin": {"l": 20, "r": 10, "t": 12, "b": 20},
     }
     there = sorted(set(states.ravel().tolist()) - {NOT_TRIED})
-    # Only the states that occur take room beside the squares.
+    # The key lists only the states that occur.
     place = np.full(len(STATES), np.nan, np.float32)
     place[there] = np.arange(len(there))
     colours = [
@@ -81,8 +86,8 @@ def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> list[Figure]:
         figure(
             "inliers",
             "How many matches each pair has",
-            "Each square is a pair of photos, brighter with more verified matches (counts on a "
-            f"logarithmic scale); photos of neighbouring places give bright blocks.{note}",
+            "Each square is a pair of photos. The brighter it is, the more verified matches the "
+            f"pair has, on a logarithmic scale. Photos of one place form bright blocks.{note}",
             alt=f"Heat map of the matches of {len(names)} x {len(names)} photos",
             data=[
                 go.Heatmap(
@@ -102,8 +107,8 @@ def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> list[Figure]:
         figure(
             "states",
             "What became of each pair",
-            "The same squares by outcome: only blue pairs reach the model, orange ones were "
-            f"verified but contradict stronger pairs.{note}",
+            "The same squares, coloured by the stage that a pair reached. The model rests on the "
+            f"blue pairs only. Orange pairs were verified, but contradict stronger pairs.{note}",
             alt=f"Heat map of the outcome of the pairs of {len(names)} photos",
             data=[
                 go.Heatmap(
@@ -128,7 +133,8 @@ def _counts_bar(most: int) -> dict[str, object]:
 
 
 def _bar(at: Sequence[float], labels: list[str]) -> dict[str, object]:
-    """The colours' key, above the squares: narrow screens have no room beside them."""
+    """The key of the colours. It is above the squares, because narrow screens have no space beside
+    them."""
     return {
         "orientation": "h",
         "y": 1.0,

@@ -1,4 +1,4 @@
-"""The 3-D model to turn with the mouse."""
+"""The 3-D model, which the reader can turn with the mouse."""
 
 import numpy as np
 import plotly.graph_objects as go
@@ -8,6 +8,7 @@ from jaxsfm.report.page.figures import BLUE, ORANGE, Figure, figure, text
 from jaxsfm.report.scene import Scene, ShownCamera
 
 MAX_POINTS = 40_000
+"""The most points that are drawn."""
 
 
 def _hex(colours: np.ndarray) -> list[str]:
@@ -17,7 +18,7 @@ def _hex(colours: np.ndarray) -> list[str]:
 def _cameras(
     cameras: list[ShownCamera], depth: float, name: str, colour: str
 ) -> list[BaseTraceType]:
-    """Frusta as one line with gaps, and the centres to point at."""
+    """The frusta as one line with gaps, and the centres, which show a name under the mouse."""
     gap = np.full((1, 3), np.nan)
     lines = np.concatenate([p for c in cameras for p in (c.frustum(depth), gap)])
     lines = lines.astype(np.float32)
@@ -49,7 +50,7 @@ def _cameras(
 
 
 def _start(scene: Scene) -> dict[str, object]:
-    """Where to look from first, in plotly's units."""
+    """The first viewpoint, in the units of plotly."""
     eye = 1.55 * scene.behind()
     return {
         "eye": dict(zip("xyz", eye.tolist(), strict=True)),
@@ -58,10 +59,10 @@ def _start(scene: Scene) -> dict[str, object]:
 
 
 def model_figure(scene: Scene, unit: str) -> Figure:
-    """Points with their colours, cameras, and the reference's cameras if there are any.
+    """The points in their colours, the cameras, and the cameras of the reference if there is one.
 
     Args:
-      unit: what the axes count, for the caption.
+      unit: the unit of the axes, for the caption.
     """
     n = len(scene.points)
     some = np.sort(np.random.default_rng(0).permutation(n)[:MAX_POINTS])
@@ -85,14 +86,14 @@ def model_figure(scene: Scene, unit: str) -> Figure:
     if n > MAX_POINTS:
         notes += f" {MAX_POINTS} of {n} points are drawn, taken at random."
     if scene.far:
-        notes += f" {scene.far} points far outside are left out."
-    reference = ", orange ones (a little larger) where they ought to be" if scene.reference else ""
+        notes += f" {scene.far} points far away from the others are left out."
+    reference = " Orange pyramids, a little larger, show the reference." * bool(scene.reference)
     axis = {"showbackground": False, "title": {"text": ""}, "nticks": 6}
     return figure(
         "model",
         "The 3-D model",
-        f"Drag to turn, scroll to zoom: points in the photos' colours, blue pyramids where the "
-        f"cameras stand and look{reference}; axes in {unit}.{notes}",
+        "Drag to turn the model, scroll to zoom. Points have the colours of the photos. Blue "
+        f"pyramids show where the cameras stand and look.{reference} The axes count {unit}.{notes}",
         alt=f"3-D model with {len(some)} points and {len(scene.cameras)} cameras",
         data=data,
         layout={

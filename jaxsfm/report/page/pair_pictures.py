@@ -1,4 +1,4 @@
-"""The best and the most doubtful pairs, with their matches."""
+"""Pictures of the matches of the best, the weakest and the refused pairs."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -13,15 +13,15 @@ from jaxsfm.report.plot import COLOURS, MAX_LINES
 from jaxsfm.report.run_results import PairRow
 
 OF_A_KIND = 3
-"""Pairs shown of the best, the weakest and the refused."""
+"""The number of pairs of each kind: best, weakest, refused."""
 SIDE = 640
 """Longer side of a photo in the page, pixels."""
 MAX_DOTS = 400
-"""Dots drawn per plane and photo."""
+"""The most dots of a plane in a photo."""
 
 
 class Plane(NamedTuple):
-    """The matches on one homography, as paths."""
+    """The matches of one homography, as paths of SVG."""
 
     colour: str
     matches: int
@@ -30,14 +30,14 @@ class Plane(NamedTuple):
 
 
 class PairPicture(NamedTuple):
-    """Two photos side by side, what to draw on them and what to say."""
+    """Two photos side by side with their matches."""
 
     heading: str
     note: str
     names: tuple[str, str]
     photos: tuple[Embedded, Embedded]
     shift: int
-    """Left edge of the second photo."""
+    """The left edge of the second photo."""
     width: int
     height: int
     planes: list[Plane]
@@ -45,7 +45,7 @@ class PairPicture(NamedTuple):
 
 
 def _chosen(rows: list[PairRow]) -> list[tuple[str, PairRow]]:
-    """Headings and rows of report.json, best first."""
+    """The pairs that are shown, each with a heading, the best first."""
     used = [row for row in rows if state(row) == USED]
     used.sort(key=lambda row: (-row.colmap_inliers, row.pair))
     best, weakest = used[:OF_A_KIND], used[OF_A_KIND:][-OF_A_KIND:]
@@ -67,7 +67,7 @@ def _note(row: PairRow) -> str:
         if verdict.reason:
             parts.append(f"refused because {verdict.reason}")
     elif not row.colmap_inliers:
-        parts.append("no common geometry found")
+        parts.append("COLMAP found no common geometry")
     return "; ".join(parts)
 
 
@@ -126,9 +126,9 @@ def _photo(photos: RecordedPhotos, name: str, number: int) -> Embedded | None:
 
 
 def pair_pictures(run: FinishedRun) -> tuple[list[PairPicture], Iterable[Embedded]]:
-    """Pictures of a few pairs, and the photos they use, each once.
+    """Pictures of a few pairs, and the photos in them, each once.
 
-    Pairs whose photos or matches are gone have none.
+    A pair has no picture if its photos or its matches are gone.
     """
     seen: dict[str, Embedded] = {}
     made = [_picture(run, heading, row, seen) for heading, row in _chosen(run.report.pairs.each)]

@@ -9,14 +9,14 @@ from jaxsfm.report.finished_run import FinishedModel, FinishedRun
 from jaxsfm.report.page.embedded import Embedded, embed
 from jaxsfm.report.page.figures import count, figures3
 from jaxsfm.report.page.pair_states import USED, state
-from jaxsfm.report.run_results import LostPhoto
-from jaxsfm.sfm.evaluation import ImageError
+from jaxsfm.report.run_results import Advice, LostPhoto, Stage
+from jaxsfm.sfm.evaluation import PoseError
 
 MAX_PHOTOS = 60
 """The most rows of the table. How many photos are left out is said below it."""
 THUMBNAIL = 96
 """Longer side of a thumbnail, pixels."""
-OLD_ADVICE = {
+OLD_ADVICE: dict[Stage, str] = {
     "pairs": "name pairs with it in the --pairs file, or leave that option out",
     "too few matches": "try --preset robust, or a larger --max-size; is it of the same scene?",
     "no plane": "try --preset robust; the scene may show no surface that both photos share",
@@ -40,11 +40,11 @@ class PhotoRow(NamedTuple):
     """The number of points that were seen in it; None if it is not in the model."""
     reprojection_px: float | None
     """Mean over the observations, original pixels."""
-    error: ImageError | None
+    error: PoseError | None
     """The error against the reference poses."""
     lost: LostPhoto | None
     """Why the photo was lost; None if it is in the model."""
-    advice: str | None
+    advice: list[Advice]
     """What may help a lost photo."""
 
 
@@ -106,13 +106,11 @@ class PhotoTable(NamedTuple):
         return len(self.columns) > len(COLUMNS)
 
 
-def advice(lost: LostPhoto) -> str | None:
-    """What may help a lost photo, in one line."""
+def advice(lost: LostPhoto) -> list[Advice]:
+    """What may help a lost photo."""
     if lost.help is None:
-        return OLD_ADVICE.get(lost.stage)
-    return "; ".join(
-        f"{each.option} ({each.reason})" if each.option else each.reason for each in lost.help
-    )
+        return [Advice(option=None, reason=OLD_ADVICE[lost.stage])]
+    return lost.help
 
 
 def _seen_points(model: FinishedModel | None) -> dict[str, tuple[int, float]]:
@@ -163,7 +161,7 @@ def photo_table(run: FinishedRun, names: Sequence[str]) -> PhotoTable:
                 reprojection_px=reprojection_px,
                 error=errors.get(name),
                 lost=lost.get(name),
-                advice=advice(lost[name]) if name in lost else None,
+                advice=advice(lost[name]) if name in lost else [],
             )
         )
     if len(rows) == len(names):  # all photos have a row: names are easier to find in order

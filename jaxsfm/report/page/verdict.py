@@ -78,10 +78,13 @@ def _sentences(report: RunReport, best: ModelRow) -> Iterable[str]:
     if report.evaluation:
         position, rotation = report.evaluation.position, report.evaluation.rotation_deg
         mean, most = (
-            f"{figures3(p)} of its units and {figures3(r)} deg"
+            f"{figures3(p)} units and {figures3(r)} deg"
             for p, r in ((position.mean, rotation.mean), (position.max, rotation.max))
         )
-        yield f"Against the reference the cameras are off by {mean} on average, {most} at most."
+        yield (
+            f"Against the reference the cameras are off by {mean} on average, and by {most} at "
+            "most."
+        )
     else:
         yield report.evaluation_failed or (
             "There are no reference poses to compare with: look at the 3-D model and at the "

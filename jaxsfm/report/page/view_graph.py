@@ -1,4 +1,4 @@
-"""The view graph: photos on a circle, pairs as lines."""
+"""The view graph: photos are dots on a circle, pairs are lines."""
 
 from collections.abc import Collection, Sequence
 
@@ -10,16 +10,17 @@ from jaxsfm.report.page.pair_states import LOST, NOT_TRUSTED, REGISTERED, USED, 
 from jaxsfm.report.run_results import PairRow
 
 MAX_USED, MAX_NOT_TRUSTED = 1200, 300
-"""Lines drawn of either kind, the strongest first."""
+"""The most lines of either kind that are drawn, the strongest first."""
 BEST_OF_EACH = 2
-"""Strongest pairs of every photo that are drawn before all others."""
+"""The number of strongest pairs of every photo that are drawn before all others."""
 MAX_LABELS = 40
+"""The most photos that are labelled with their names."""
 BINS = ((0.0, 0.1, 0.8, 0.5), (0.1, 0.4, 1.3, 0.65), (0.4, np.inf, 2.4, 0.9))
-"""Of the strength: from, to, line width in pixels, opacity."""
+"""Classes of strength: from, to, line width in pixels, opacity."""
 
 
 def chosen_edges(rows: Sequence[PairRow], limit: int, most: int) -> list[PairRow]:
-    """At most `limit` rows, strongest first, but every photo's best before anyone's tenth."""
+    """At most `limit` pairs: the strongest, but the best pairs of every photo come first."""
     ranked = sorted(rows, key=lambda row: (-strength(row, most), row.pair))
     if len(ranked) <= limit:
         return ranked
@@ -34,12 +35,12 @@ def chosen_edges(rows: Sequence[PairRow], limit: int, most: int) -> list[PairRow
 
 
 def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection[str]) -> Figure:
-    """Photos as dots, in order of name around a circle; verified pairs as lines.
+    """The photos around a circle, in the order of their names, and the verified pairs.
 
     Args:
-      names: all images.
-      rows: `pairs.each` of report.json.
-      registered: images with a pose in the best model.
+      names: all photos.
+      rows: all pairs that were tried.
+      registered: the photos with a pose in the best model.
     """
     by_state = {k: [row for row in rows if state(row) == k] for k in (USED, NOT_TRUSTED)}
     most = max((row.colmap_inliers for row in rows), default=1)
@@ -96,9 +97,10 @@ def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection
     return figure(
         "view-graph",
         "Which photos see the same thing",
-        "Each dot is a photo, each blue line a pair that the model rests on, thicker the stronger "
-        "it is (1: as many matches as the best pair of both photos, all over the image); orange "
-        f"lines are pairs that stronger ones contradict.{note}",
+        "Each dot is a photo. Each blue line is a pair that the model rests on; the stronger the "
+        "pair, the thicker the line. A pair has the largest strength, 1, if it has as many matches "
+        "as the best pair of each of its photos, spread over the whole image. Orange lines are "
+        f"pairs that stronger pairs contradict.{note}",
         alt=f"Graph of {len(names)} photos with {len(used)} used and {len(odd)} untrusted pairs",
         data=data,
         layout={
@@ -111,7 +113,7 @@ def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection
 
 
 def _side(xy: np.ndarray) -> str:
-    """Where a label stands clear of the circle."""
+    """The side on which a label does not cover the circle."""
     if abs(xy[0]) < 0.3:
         return "top center" if xy[1] > 0 else "bottom center"
     return "middle right" if xy[0] > 0 else "middle left"

@@ -1,4 +1,4 @@
-"""What is known of an image beside the model: its matches, and the surface under them."""
+"""The evidence for a pose from matches: keypoints of an image, and the surface under them."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -29,7 +29,7 @@ class UnmappedImage(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What refinement knows beside a model."""
+    """Facts that refinement uses besides the model."""
 
     matches: Mapping[Pair, PairResult]
     """Verified matches by pair, original pixels."""

@@ -66,7 +66,7 @@ class AlignedPoints(NamedTuple):
         return cls(*(np.concatenate(column) for column in zip(nothing, *parts, strict=True)))
 
     def observations(self, view: int, rows: np.ndarray) -> Observations:
-        """The same as observations of a model.
+        """These points as observations of a model.
 
         Args:
           view: index of the view in the model.
@@ -82,7 +82,7 @@ class OctavePose(NamedTuple):
     octave_px: int
     """Working pixels per pixel of the octave."""
     points: AlignedPoints
-    """Those within the error limit, in working pixels."""
+    """The points within the error limit, in working pixels."""
     agreed: int
     error_px: float
     """Median distance of where points agree from where the pose puts them, working pixels."""
@@ -100,11 +100,11 @@ class PoseHypothesis:
     own_camera: bool
     """No other view has its camera, and its focal length may change."""
     best: OctavePose | None = None
-    """Of the octaves' poses, the one of least doubt."""
+    """The pose of least doubt among those of the octaves."""
     candidates: int = 0
     """Points that the view could show, at the last octave."""
     agreed: int = 0
-    """Those that agreed, at the last octave."""
+    """Candidates that agreed, at the last octave."""
     share: float = 0.0
     """Largest share of the candidates that agreed at an octave."""
 

@@ -42,7 +42,7 @@ keeps its old observations in the pass: otherwise a night photo would hang on a 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PassFigures:
-    """What one pass did."""
+    """The result of one pass."""
 
     accepted: bool
     """False: too little agreed, and the model before the pass stays."""
@@ -61,11 +61,11 @@ class PassFigures:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RefinementFigures:
-    """What the refinement of a model did."""
+    """The result of the refinement of a model."""
 
     passes: list[PassFigures]
     placed: list[Placement]
-    """Of the views that were weak in any pass, and of images that the mapper left out."""
+    """One for each view that was weak in any pass, and for each image that the mapper left out."""
 
 
 def _gather(model: Model, blocks: Sequence[AlignedBlock]) -> tuple[Model, np.ndarray]:

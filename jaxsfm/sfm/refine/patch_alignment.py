@@ -13,7 +13,7 @@ from jaxsfm.core.align import Aligned, Patch, Templates
 
 
 class AlignmentLimits(NamedTuple):
-    """What an aligned keypoint must fulfil to count as an observation."""
+    """Limits that an aligned keypoint must keep to count as an observation."""
 
     min_score: float
     """Least normalised cross-correlation with the reference patch."""

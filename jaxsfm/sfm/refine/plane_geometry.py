@@ -1,8 +1,7 @@
-"""Local planes at 3-D points: their normals, their reference views, which views could see them, and
-how a patch of the plane maps from one view to another. Pure functions of numpy arrays.
+"""Local planes at 3-D points: their normals, how views see them, and their patches in reference
+views. Pure functions of numpy arrays.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy.spatial import KDTree
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
-from jaxsfm.config import Refinement
 
 MIN_NORMAL_COSINE = 0.05
 """Where a plane is seen from the side, its scale is taken for this cosine."""
@@ -44,17 +42,6 @@ class ReferencePatches(NamedTuple):
     def select(self, rows: np.ndarray) -> "ReferencePatches":
         """Some of the patches, by index."""
         return ReferencePatches(*(column[rows] for column in self))
-
-
-class Candidates(NamedTuple):
-    """Possible observations, to be aligned: candidate k is of point `point[k]` in `view[k]`."""
-
-    point: np.ndarray
-    view: np.ndarray
-    start: np.ndarray
-    """float (m, 2): where the model puts it, working pixels."""
-    affine: np.ndarray
-    """float (m, 2, 2): offsets in the reference view to offsets in the view."""
 
 
 def normals(model: Model, *, neighbours: int) -> np.ndarray:
@@ -177,71 +164,3 @@ def under_pixels(
     near = np.flatnonzero(distance <= reach_px)
     point = tracks.point[own[nearest[near]]]
     return _on_planes(model.views[view], xy[near], tracks.points[point], normal[point]), near
-
-
-def candidates(
-    views: Sequence[View],
-    patches: ReferencePatches,
-    seen: Visibility,
-    refinement: Refinement,
-    *,
-    targets: Sequence[int] | None = None,
-) -> Candidates:
-    """The observations of every track, and other views that could see its patch.
-
-    Args:
-      refinement: `min_cosine` and `max_stretch` limit the views that could see a patch; `radius`
-        gives the distance that a keypoint must have from the border.
-      targets: only these views, by index; None: all.
-    """
-    margin = refinement.radius + 2
-    own_scale = seen.log_scale[np.arange(len(patches.points)), patches.reference]
-    parts = []
-    for k in range(len(views)) if targets is None else targets:
-        view = views[k]
-        at, _ = view.project(patches.points)
-        with np.errstate(invalid="ignore"):
-            inside = (at >= margin).all(1) & (at <= np.asarray(view.size) - 1 - margin).all(1)
-        fits = (seen.cosine[:, k] > refinement.min_cosine) & (
-            np.abs(seen.log_scale[:, k] - own_scale) < np.log(refinement.max_stretch)
-        )
-        rows = np.flatnonzero(inside & (patches.reference != k) & (seen.tracked[:, k] | fits))
-        parts.append((rows, np.full(len(rows), k), at[rows]))
-    point, view, start = (np.concatenate(column) for column in zip(*parts, strict=True))
-    affine = plane_affines(views, patches.select(point), view)
-    ok = np.isfinite(affine).all((1, 2))
-    return Candidates(point[ok], view[ok], start[ok], affine[ok])
-
-
-def plane_affines(
-    views: Sequence[View], patches: ReferencePatches, view: np.ndarray, *, step: float = 2.0
-) -> np.ndarray:
-    """Derivatives (m, 2, 2) of pixels in `view` by pixels in the reference view, via the plane.
-
-    They are central differences over `step` pixels, which serves any camera model.
-
-    Args:
-      view: int (m,), for each patch the index of the other view.
-    """
-    points, normal, reference, xy = patches
-
-    def through(offset: tuple[float, float]) -> np.ndarray:
-        target = np.empty_like(points)
-        for k in np.unique(reference):
-            rows = reference == k
-            ray = views[k].rays(xy[rows] + offset)
-            along = np.einsum("ni,ni->n", ray, normal[rows])
-            along = np.where(np.abs(along) < 1e-9, np.nan, along)
-            hit = np.einsum("ni,ni->n", points[rows] - views[k].centre, normal[rows]) / along
-            target[rows] = views[k].centre + hit[:, None] * ray
-        at = np.empty((len(points), 2))
-        for k in np.unique(view):
-            rows = view == k
-            at[rows] = views[k].project(target[rows])[0]
-        return at
-
-    columns = [
-        (through(plus) - through(minus)) / (2 * step)
-        for plus, minus in (((step, 0.0), (-step, 0.0)), ((0.0, step), (0.0, -step)))
-    ]
-    return np.stack(columns, axis=2)

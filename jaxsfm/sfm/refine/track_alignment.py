@@ -17,9 +17,10 @@ from jaxsfm.config import Refinement
 from jaxsfm.core.align import Patch, Templates, square_patch
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.candidates import Candidates, find_candidates
 from jaxsfm.sfm.refine.padding import chunks, padded
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits, align_patches, make_templates
-from jaxsfm.sfm.refine.plane_geometry import Candidates, ReferencePatches
+from jaxsfm.sfm.refine.plane_geometry import ReferencePatches
 
 CELLS = 5_000_000
 """Points times views that are looked at together. Each takes about 100 bytes, and each point
@@ -198,7 +199,7 @@ def align_blocks(
         part = model.with_tracks(tracks)
         seen = plane_geometry.visibility(part, normal[rows])
         patches = plane_geometry.reference_patches(part, normal[rows], seen)
-        found = plane_geometry.candidates(views, patches, seen, refinement, targets=targets)
+        found = find_candidates(views, patches, seen, refinement, targets=targets)
         templates = _templates(patches, np.unique(found.point), views, read, patch)
         moved, agrees = _align(
             found, templates, views, read, patch, limits, iterations=refinement.iterations

@@ -36,7 +36,7 @@ class Placement:
     candidates: int
     """Points of the other views that it could show."""
     agreed: int
-    """Those that agree, at that octave (or at the last one, if no octave gives the pose)."""
+    """Candidates that agree, at that octave (at the last one, if no octave gives the pose)."""
     error_px: float | None
     """Median distance of where they agree from where the pose puts them, working pixels."""
     held: int | None = None

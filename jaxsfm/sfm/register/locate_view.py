@@ -46,11 +46,11 @@ class Localization:
     on_surface: int
     """Matches with the surface of the model under them."""
     inliers: int
-    """Those that agree with the resection."""
+    """Matches on the surface that agree with the resection."""
     candidates: int
     """Points of the model that it could show."""
     agreed: int
-    """Those that alignment finds there."""
+    """Candidates that alignment finds there."""
     octave_px: int | None
     """Working pixels per pixel of the octave that gives the pose; None: it is not trusted."""
     error_px: float | None

@@ -1,0 +1,190 @@
+"""The options of the benchmarks' commands, each declared once; `jaxsfm.cli` reads them.
+
+Nothing heavy is imported here, so that `jaxsfm bench NAME --help` is quick.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from jaxsfm.config import MIN_SIDE
+from jaxsfm.errors import UserError
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+
+
+def _names(values: Sequence[str]) -> list[str]:
+    """Names separated by commas, blanks or both."""
+    return [name for value in values for name in value.split(",") if name]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BenchOptions:
+    """Options of every benchmark. All options raise UserError for values that cannot be used."""
+
+    root: Path
+    """Folder of the data."""
+    methods: tuple[str, ...]
+    """Methods to compare, separated by commas or blanks."""
+    json: Path | None = None
+    """Write all figures to this file."""
+
+    def chosen_methods(self, known: Sequence[str]) -> list[str]:
+        """The names in `methods`, in the order of `known`.
+
+        Raises:
+          UserError: there is no name, or one that is not in `known`.
+        """
+        names = _names(self.methods)
+        if not names:
+            raise UserError("--methods: none given")
+        if unknown := [name for name in names if name not in known]:
+            raise UserError(f"--methods: no method {unknown[0]!r}; there are {', '.join(known)}")
+        return [name for name in known if name in names]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Sets(BenchOptions):
+    sets: tuple[str, ...] | None = None
+    """Names of the sets to use, separated by commas or blanks; default: all sets."""
+
+    def chosen_sets(self) -> list[str] | None:
+        """The names in `sets`; None stands for all."""
+        return None if self.sets is None else _names(self.sets)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Network(BenchOptions):
+    network: WeightsChoice = USUAL_WEIGHTS
+    """The network's parameters."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Seeds(BenchOptions):
+    seeds: int = 5
+    """How often each method is run, with seeds 0, 1, ..."""
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise UserError(f"--seeds must be at least 1; got {self.seeds}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlanesOptions(_Sets, _Seeds):
+    """Options of `bench planes`."""
+
+    root: Path
+    """Folder of the points: NAME_pts.txt, with rows of x1 y1 1 x2 y2 1 label."""
+    methods: tuple[str, ...] = ("paper,default",)
+    """Presets, separated by commas or blanks."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WarpsOptions(_Network, _Seeds):
+    """Options of `bench warps`."""
+
+    root: Path
+    """Folder of any photos; sub-folders are included."""
+    methods: tuple[str, ...] = ("norm,learned",)
+    """Rules, separated by commas or blanks: norm (the paper's rule), learned."""
+    seeds: int = 5
+    """Number of sets of 64 pairs of views, made with seeds 0, 1, ..."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PairOptions(_Sets, _Network, _Seeds):
+    """Options of the benchmarks of image pairs."""
+
+    methods: tuple[str, ...] = ("rootsift,paper,default,robust",)
+    """Methods, separated by commas or blanks. rootsift: COLMAP's own features. paper, default,
+    robust: the presets. paper-learned: the preset paper with keypoints by learned scores. grid,
+    reloc, learned: the preset default without alignment, with keypoints at cell centres, by the
+    largest norms, by learned scores. PRESET-no-IDEA: default or robust without one idea (octaves,
+    centring, consensus, competition, alignment; robust also enlarging). PRESET-norm,
+    PRESET-learned, PRESET-alexnet, PRESET-bfloat16: default or robust with that keypoint rule,
+    network or arithmetic."""
+    max_size: int | None = None
+    """Longer side of the working images, pixels; default: the preset's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.max_size is not None and self.max_size < MIN_SIDE:
+            raise UserError(f"--max-size must be at least {MIN_SIDE} pixels; got {self.max_size}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WxbsOptions(PairOptions):
+    """Options of `bench wxbs`."""
+
+    root: Path
+    """Folder of the categories: CATEGORY/NAME/{01,02}.png and corrs.txt."""
+    sets: tuple[str, ...] | None = None
+    """CATEGORY or CATEGORY/NAME, separated by commas or blanks; default: all pairs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HomographyOptions(PairOptions):
+    """Options of `bench homography`."""
+
+    root: Path
+    """Folder of the sequences: SEQUENCE/img1.png and H1to2p (or .xml), or SEQUENCE/1.ppm and
+    H_1_2."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Runs(_Sets, _Network):
+    """Options of the benchmarks of whole reconstructions."""
+
+    seed: int = 0
+    """Seed of all random choices."""
+    threads: int = -1
+    """Number of threads of COLMAP's part; -1 uses all cores."""
+
+    def __post_init__(self) -> None:
+        from jaxsfm.runs.run_options import check_seed, check_threads
+
+        check_seed(self.seed)
+        check_threads(self.threads)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StrechaOptions(_Runs):
+    """Options of `bench strecha`."""
+
+    root: Path
+    """Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera."""
+    methods: tuple[str, ...] = ("rootsift,grid,reloc,default",)
+    """Methods, separated by commas or blanks. rootsift: COLMAP's own features. default, robust: the
+    presets. grid, reloc, learned: the preset default without refinement, with keypoints at cell
+    centres, by the largest norms, by learned scores. PRESET-IDEA: as in bench daynight."""
+    intrinsics: Literal["known", "unknown"] = "known"
+    """known: the cameras are those of the sets' K.txt and stay fixed. unknown: each image has its
+    own camera, which is guessed and refined."""
+    out: Path | None = None
+    """Folder for databases and models; a later run continues from what is there."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DayNightOptions(_Runs):
+    """Options of `bench daynight`."""
+
+    root: Path
+    """Folder of scenes (SCENE/day, SCENE/night and SCENE/reference), of Strecha sets (each of
+    their images is turned to a synthetic night in its turn), or Aachen Day-Night."""
+    methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default,robust",)
+    """Methods, separated by commas or blanks: rootsift; paper-grid, paper and paper-learned (the
+    paper's method with keypoints at cell centres, relocalized, and by learned scores); default,
+    robust; PRESET-IDEA as in bench wxbs, and also PRESET-no-placing."""
+    severity: float = 2.0
+    """Of the synthetic night: 0 is day, 1 is clean, 2 is noisy, 3 is dark, 5 is nothing but
+    noise."""
+    denoise: bool = True
+    """Whether the synthetic night's camera removes noise."""
+    jpeg: bool = True
+    """Whether the synthetic night's camera stores JPEG."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (math.isfinite(self.severity) and self.severity >= 0):
+            raise UserError(f"--severity must be at least 0; got {self.severity}")
