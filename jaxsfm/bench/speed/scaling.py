@@ -103,7 +103,7 @@ weights = jaxsfm.load_weights()
 times = []
 for _ in range(3):
     start = time.time()
-    list(extract_images(weights, images[:1], config=jaxsfm.preset("default")))
+    image_features(weights, images[0], config=jaxsfm.preset("default"))
     times.append((start, time.time()))
 print(json.dumps(times))
 """
