@@ -19,7 +19,7 @@ from jaxsfm.io.features import ImageFeatures, image_capacity
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.matching.extraction import image_features
-from jaxsfm.matching.pair_matching import matched
+from jaxsfm.matching.pair_matching import match_pairs
 from jaxsfm.sfm.reconstruction import reconstruct
 
 FEATURES = 64
@@ -99,7 +99,7 @@ def dense_models(
     for k, subset in enumerate(scene.subsets):
         pairs = exhaustive_pairs([*subset.day, subset.night])
         missing = [pair for pair in pairs if pair not in results]
-        for result in matched(features, capacities, missing, config=config, seed=options.seed):
+        for result in match_pairs(features, capacities, missing, config=config, seed=options.seed):
             results[result.pair] = result
         made = reconstruct(
             [scene.images[name] for name in sorted({*subset.day, subset.night})],

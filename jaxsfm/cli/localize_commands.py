@@ -1,11 +1,11 @@
-"""`jaxsfm localize` and `jaxsfm extend`: more photos for a finished run."""
+"""`jaxsfm localize` and `jaxsfm extend`: new photos for a finished run."""
 
 import sys
 from json import dumps
 from pathlib import Path
 
 from jaxsfm.cli.run_commands import Positional, check_writable
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice
 
 
 def localize(
@@ -13,47 +13,34 @@ def localize(
     *,
     model: Path,
     out: Path | None = None,
-    images: Path | None = None,
-    intrinsics: str | None = None,
     reference: Path | None = None,
-    shortlist: int = 20,
-    keep_features: bool = False,
-    network: WeightsChoice = USUAL_WEIGHTS,
+    new_photos: NewPhotosChoice,
+    network: WeightsChoice,
+    engine: EngineChoice,
 ) -> int:
-    """Where photos were taken, in the model of a finished run, which stays as it is.
+    """Find where photos were taken, in the model of a finished run. The model does not change.
 
-    Ends with 1 if no photo could be localized.
+    The exit status is 1 if no photo could be localized.
 
     For example
         $ jaxsfm localize A.jpg --model OUT --out poses.json
 
     Args:
-      photos: Photos, or folders of them.
-      model: A run's folder.
-      out: File.json for poses, what they rest on and their expected errors.
-      images: Folder with the run's photos; default: where the run found them.
-      intrinsics: Of the photos, as in reconstruct; default: the run's camera, if exactly one of
-        this size is that of several photos, else one per photo, whose focal length is estimated.
+      photos: Photos, or folders with photos.
+      model: The folder of a finished run.
+      out: File.json to write: the poses, the matches that they rest on, and their expected errors.
       reference: Reference poses (Strecha .camera files or a COLMAP model) of these photos and of
-        the run's: errors are told.
-      shortlist: How many of the run's photos, the most similar ones, a photo is matched with.
-      keep_features: Leave the features of those in the run's folder (25 MB for a photo of
-        1536 x 1024): the next call has them at hand.
-      network: The network's parameters; they must be the run's.
+        the run's photos; with them the errors of the poses are printed.
+      network: The files of the network's parameters. They must be those of the run.
     """
     check_writable(out, "--out", (".json",))
     from jaxsfm.io.atomic import write_atomic
-    from jaxsfm.runs.localize import LocalizeOptions, localize_photos
+    from jaxsfm.runs.localize import localize_photos
     from jaxsfm.runs.localize_report import localize_lines
+    from jaxsfm.runs.run_options import LocalizeOptions
 
     options = LocalizeOptions(
-        images=images,
-        intrinsics=intrinsics,
-        reference=reference,
-        shortlist=shortlist,
-        keep_features=keep_features,
-        network=network,
-        progress=True,
+        **vars(new_photos), reference=reference, network=network, engine=engine, progress=True
     )
     result = localize_photos(photos, model, options=options)
     if out is not None:
@@ -68,39 +55,30 @@ def localize(
 def extend(
     run: Positional[Path],
     *,
-    images: Path | None = None,
-    intrinsics: str | None = None,
-    shortlist: int = 20,
-    keep_features: bool = False,
-    network: WeightsChoice = USUAL_WEIGHTS,
+    new_photos: NewPhotosChoice,
+    network: WeightsChoice,
+    engine: EngineChoice,
 ) -> int:
-    """Put photos that were added to a finished run's folder since into its model.
+    """Add photos to the model of a finished run.
 
-    Poses and points that are there stay as they are. Ends with 1 if no new photo found its place.
+    New photos are those that were put into the folder of the run's photos after the run.
+
+    Poses and points that are in the model do not change.
+
+    The exit status is 1 if no new photo found its place.
 
     For example
         $ jaxsfm extend OUT
 
     Args:
-      run: A run's folder.
-      images: Folder with the photos, old and new; default: where the run found them.
-      intrinsics: Of the new photos, as in localize.
-      shortlist: How many others, the most similar ones, a new photo is matched with.
-      keep_features: Do not delete the folder's features in the end; see localize.
-      network: The network's parameters; they must be the run's.
+      run: The folder of a finished run.
+      network: The files of the network's parameters. They must be those of the run.
     """
     from jaxsfm.io.images import shown_name
     from jaxsfm.runs.extend import extend_run
-    from jaxsfm.runs.localize import LocalizeOptions
+    from jaxsfm.runs.run_options import LocalizeOptions
 
-    options = LocalizeOptions(
-        images=images,
-        intrinsics=intrinsics,
-        shortlist=shortlist,
-        keep_features=keep_features,
-        network=network,
-        progress=True,
-    )
+    options = LocalizeOptions(**vars(new_photos), network=network, engine=engine, progress=True)
     report = extend_run(run, options=options)
     if report is None:
         print(f"no new photos for {run}")

@@ -1,4 +1,4 @@
-"""The command line: parses, runs a command, turns failures into one sentence."""
+"""The command line: it parses arguments, runs a command, and reports a failure in one sentence."""
 
 import logging
 import os
@@ -35,7 +35,7 @@ _Benchmark = one_of(BENCHMARKS)
 
 
 def bench(result: _Benchmark) -> int:  # pyright: ignore[reportInvalidTypeForm]
-    """Benchmarks on public data sets."""
+    """Run a benchmark on a public data set."""
     return result
 
 
@@ -45,7 +45,7 @@ For example
     $ jaxsfm demo
     $ jaxsfm reconstruct PHOTOS --out OUT
 
-jaxsfm --version tells versions; jaxsfm --tyro-print-completion bash (or zsh, tcsh) prints a script
+jaxsfm --version prints versions; jaxsfm --tyro-print-completion bash (or zsh, tcsh) prints a script
 that completes commands and options."""
 COMMANDS = {
     "reconstruct": reconstruct,
@@ -63,17 +63,27 @@ COMMANDS = {
     "data": data,
     "bench": bench,
 }
+for _command in COMMANDS.values():
+    unwrapped(_command)
 
 
 def version_lines() -> list[str]:
-    """jaxsfm's own version and those of what its results depend on."""
+    """The version of jaxsfm, and the versions of the packages that its results depend on."""
     found = package_versions()
     lines = [f"jaxsfm {found.pop('jaxsfm')}"]
     return lines + [f"  {name} {version}" for name, version in found.items()]
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns the exit status (2: what was given cannot be used)."""
+    """Run one command.
+
+    Args:
+      argv: arguments without the program's name; None: those of this process.
+
+    Returns:
+      The exit status: 0 for success, 1 for a command that found no solution, 2 for arguments or
+      files that cannot be used, 130 after Ctrl-C.
+    """
     if (sys.argv[1:] if argv is None else argv) == ["--version"]:
         print("\n".join(version_lines()))
         return 0
@@ -86,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with interrupt.noted():
             return tyro.extras.subcommand_cli_from_dict(
-                {name: unwrapped(command) for name, command in COMMANDS.items()},
+                COMMANDS,
                 prog="jaxsfm",
                 description=DESCRIPTION,
                 args=with_action(sys.argv[1:] if argv is None else argv),
@@ -97,13 +107,13 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print(
-            "jaxsfm: interrupted; what reconstruct had finished is kept: the same command goes on "
-            "from there (bench: finished rows are in --json)",
+            "jaxsfm: interrupted; what reconstruct had finished is kept, and the same command goes "
+            "on from there (bench: finished rows are in the --json file)",
             file=sys.stderr,
         )
         if any(thread.name == "jaxsfm-colmap" for thread in threading.enumerate()):
-            # Native code that did not stop (the global mapper cannot) must not meet the
-            # interpreter's shutdown: it would abort.
+            # The global mapper cannot be stopped. If its native code still ran while the
+            # interpreter shuts down, the process would abort.
             sys.stdout.flush()
             os._exit(130)
         return 130
@@ -112,7 +122,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"jaxsfm: {named}{error.strerror or error}", file=sys.stderr)
         return 2
     except Exception as error:
-        # XLA's allocator raises its own type; the rest is a fault of ours and keeps its traceback.
+        # XLA's allocator raises an exception type of its own. Any other exception is a fault in
+        # jaxsfm, and its traceback is shown.
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
         print(

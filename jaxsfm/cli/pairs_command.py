@@ -1,14 +1,13 @@
-"""The command `pairs`: which pairs of photos `--pairs` means, written to a file."""
+"""`jaxsfm pairs`: the pairs of photos that `--pairs` selects, written to a file."""
 
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from jaxsfm.cli.run_commands import check_writable
 from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
-from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.options import Retrieval, WeightsChoice
 
 
 def pairs(
@@ -16,22 +15,22 @@ def pairs(
     *,
     out: Path,
     pairs: str = "retrieval:20",
-    retrieval: Literal["gem", "vlad", "netvlad"] = "vlad",
-    network: WeightsChoice = USUAL_WEIGHTS,
+    retrieval: Retrieval = "vlad",
     backbone: BackboneName = "vgg16",
+    network: WeightsChoice,
 ) -> int:
-    """The pairs that a run would try, as a file that --pairs takes.
+    """Write the pairs that reconstruct would try to a file, which its --pairs takes.
 
     For example
         $ jaxsfm pairs PHOTOS --out pairs.txt --pairs retrieval:20
 
     Args:
       images: Folder with the photos; sub-folders are included.
-      out: File.txt to write: two names a line.
-      pairs: See reconstruct.
-      retrieval: See reconstruct.
-      network: The network's parameters.
-      backbone: See reconstruct.
+      out: File.txt to write, with two image names on each line.
+      pairs: Which pairs; see jaxsfm reconstruct --help.
+      retrieval: How photos are described for retrieval:K; netvlad needs weights of its own, given
+        with --weights.
+      backbone: The network that describes the photos.
     """
     check_writable(out, "--out", (".txt",))
     from tqdm import tqdm
@@ -40,7 +39,7 @@ def pairs(
     from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.pipeline import open_images
-    from jaxsfm.matching.retrieval import described_alone, nearest_pairs
+    from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
 
     selection = parse_pair_selection(pairs)
     usable, skipped = open_images(images, progress=True)
@@ -51,7 +50,7 @@ def pairs(
     if selection.retrieval:
         weights = chosen_weights(network, backbone)
         with tqdm(total=len(usable), desc="retrieval", unit="image") as bar:
-            alone = described_alone(weights, usable, kind=retrieval, on_image=bar.update)
+            alone = describe_photos(weights, usable, kind=retrieval, on_image=bar.update)
         found.update(nearest_pairs(alone.vectors, selection.retrieval))
         skipped |= {image.name: str(error) for image, error in alone.lost}
         found = {pair for pair in found if not skipped.keys() & set(pair)}

@@ -1,30 +1,44 @@
-"""Commands as tyro wants them."""
+"""Commands and option classes in the form that tyro expects."""
 
+import dataclasses
 import functools
+import inspect
 import operator
 import re
+import typing
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-Command = Callable[..., Any]
-_WRAPPED = re.compile(r"\n {8,}(?=[^\s$])")
-"""A line of an argument's description that goes on; examples start with $."""
+Command = Callable[..., int]
+_WRAPPED = re.compile(r"\n {4,}(?=[^\s$])")
+"""Where an argument's description goes on in the next line; lines of examples start with $."""
 
 
 def unwrapped(command: Command) -> Command:
-    """With every argument's description on one line: tyro wraps by itself and keeps our ends."""
-    command.__doc__ = _WRAPPED.sub(" ", command.__doc__ or "")
+    """Join the lines of every argument's description, also in the option classes of the command.
+
+    tyro wraps descriptions itself, but keeps some of the line ends that it finds.
+    """
+    _unwrap(command)
     return command
 
 
-def one_of(commands: Mapping[str, Command]) -> Any:
+def _unwrap(documented: Callable[..., object]) -> None:
+    documented.__doc__ = _WRAPPED.sub(" ", inspect.cleandoc(documented.__doc__ or ""))
+    for kind in typing.get_type_hints(documented).values():
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            for each in kind.__mro__[:-1]:
+                _unwrap(each)
+
+
+def one_of(commands: Mapping[str, Command]) -> object:
     """The type of a command's argument that is the result of one of several commands."""
     return functools.reduce(
         operator.or_,
         (
-            Annotated[Any, tyro.conf.subcommand(name, constructor=unwrapped(command))]
+            Annotated[object, tyro.conf.subcommand(name, constructor=unwrapped(command))]
             for name, command in commands.items()
         ),
     )

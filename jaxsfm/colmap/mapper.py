@@ -8,7 +8,6 @@ import dataclasses
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
 
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
@@ -16,8 +15,8 @@ import pycolmap
 from jaxsfm.colmap.native import native
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.io.pairs import Pair, component_of
+from jaxsfm.options import Mapper
 
-Mapper = Literal["incremental", "global"]
 MISSING = 0.1
 """If at most this share of the connected images is left out, the mapper is not started again. One
 image of ten lacks matches rather than a better start, and new starts take two more runs."""

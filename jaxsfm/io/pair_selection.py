@@ -8,13 +8,10 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.pairs import Pair, exhaustive_pairs, make_pair, read_pairs
-
-Retrieval = Literal["gem", "vlad", "netvlad"]
-"""The ways to describe a photo as a whole (`jaxsfm.core.pooling`)."""
 
 
 class PairSelection(NamedTuple):

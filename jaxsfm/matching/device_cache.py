@@ -1,4 +1,4 @@
-"""Images at hand: joined features that stay on the devices from pair to pair."""
+"""Images' features that stay on the devices from pair to pair, and the order of pairs for that."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -14,12 +14,17 @@ from jaxsfm.core.types import JoinedFeatures
 from jaxsfm.io.features import ImageFeatures, pad_features
 
 Name = TypeVar("Name")
+Loaded = TypeVar("Loaded")
 
 
-def by_tiles(pairs: Sequence[tuple[Name, Name]], side: int) -> list[tuple[Name, Name]]:
-    """Pairs in an order in which 2 `side` images at a time go far: those between two blocks of
-    `side` images after each other, where images that are paired are near each other in the blocks'
-    order (reverse Cuthill-McKee), whatever their names. Of all pairs any order is as good."""
+def tile_order(pairs: Sequence[tuple[Name, Name]], side: int) -> list[tuple[Name, Name]]:
+    """Order pairs so that a cache of 2 `side` images loads every image as rarely as possible.
+
+    The images are ordered by reverse Cuthill-McKee, which puts paired images near each other
+    whatever their names are, and cut into blocks of `side`. All pairs between two blocks, a tile
+    of the table of pairs, follow each other. If all pairs are to be matched, any order of the
+    images is as good.
+    """
     if not pairs:
         return []
     number = {name: k for k, name in enumerate(dict.fromkeys(n for p in pairs for n in p))}
@@ -31,34 +36,39 @@ def by_tiles(pairs: Sequence[tuple[Name, Name]], side: int) -> list[tuple[Name, 
     return sorted(pairs, key=lambda pair: sorted(block[number[name]] for name in pair))
 
 
-class OnDevice(NamedTuple):
-    """One image between batches: its joined features on every device, the rest on the host."""
+class DeviceFeatures(NamedTuple):
+    """One image's features between batches: descriptors on every device, the rest on the host."""
 
     features: ImageFeatures
-    """Without descriptors."""
+    """The features without descriptors."""
     joined: JoinedFeatures
 
 
-def join(features: ImageFeatures, room: int, mesh: Mesh) -> OnDevice:
-    """Features joined, with room for so many coarse cells."""
+def put_on_devices(features: ImageFeatures, num_coarse: int, mesh: Mesh) -> DeviceFeatures:
+    """Join an image's octaves on all devices of a mesh, padded to `num_coarse` coarse cells."""
     bare = features.dense._replace(coarse=(), fine=())
-    joined = join_everywhere(pad_features(features.dense, room), mesh=mesh)
-    return OnDevice(features._replace(dense=bare), joined)
+    joined = join_everywhere(pad_features(features.dense, num_coarse), mesh=mesh)
+    return DeviceFeatures(features._replace(dense=bare), joined)
 
 
-Held = TypeVar("Held")
+class ImageCache(Generic[Name, Loaded]):
+    """What was loaded of images, while a list of pairs (or of blocks of pairs) is worked off.
 
-
-class Resident(Generic[Name, Held]):
-    """What is held of the images of a list of pairs, or of blocks of pairs; the one wanted again
-    last makes room."""
+    The list is known in advance. So a full cache drops the image whose next use is furthest away,
+    which is the best choice there is (Belady 1966), and an image after its last use.
+    """
 
     def __init__(
-        self, load: Callable[[Name], Held], pairs: Sequence[Sequence[Name]], most: int
+        self, load: Callable[[Name], Loaded], pairs: Sequence[Sequence[Name]], most: int
     ) -> None:
-        """`load` gives what is held of an image; `most` images are held at a time."""
+        """
+        Args:
+          load: loads an image by its name.
+          pairs: the names in each pair or block, in the order in which `take` will ask for them.
+          most: how many images are held at a time.
+        """
         self._load, self._most = load, most
-        self._images: dict[Name, Held] = {}
+        self._images: dict[Name, Loaded] = {}
         self._uses: dict[Name, deque[int]] = {}
         for k, pair in enumerate(pairs):
             for name in pair:
@@ -67,8 +77,8 @@ class Resident(Generic[Name, Held]):
     def __len__(self) -> int:
         return len(self._images)
 
-    def take(self, name: Name) -> Held:
-        """For the next of its pairs."""
+    def take(self, name: Name) -> Loaded:
+        """An image for its next pair."""
         if name not in self._images:
             while len(self._images) >= self._most:
                 del self._images[max(self._images, key=lambda other: self._uses[other][0])]

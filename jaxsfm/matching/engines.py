@@ -1,4 +1,4 @@
-"""Where images and pairs are computed: in this process, or by workers on Ray."""
+"""Engines extract features and match pairs: in this process, or with workers on Ray."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Protocol
@@ -15,9 +15,15 @@ from jaxsfm.options import EngineChoice
 
 
 class Engine(Protocol):
-    """Two stages. Results come in any order, and never depend on the engine."""
+    """Extracts and matches. Results come in any order, and never depend on the engine."""
 
-    def extracted(
+    @property
+    def starts_workers(self) -> bool:
+        """Whether every call starts workers first, which takes seconds: then few calls with many
+        items are better than many calls."""
+        ...
+
+    def extract_images(
         self,
         weights: Weights,
         images: Iterable[ImageFile],
@@ -25,10 +31,10 @@ class Engine(Protocol):
         config: Config,
         execution: Execution | None = None,
     ) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
-        """As `jaxsfm.matching.extraction.extracted`."""
+        """See `jaxsfm.matching.extraction.extract_images`."""
         ...
 
-    def matched(
+    def match_pairs(
         self,
         load: Callable[[str], ImageFeatures],
         capacities: Mapping[str, FeatureCapacity],
@@ -38,19 +44,20 @@ class Engine(Protocol):
         seed: int = 0,
         execution: Execution | None = None,
     ) -> Iterator[PairResult]:
-        """As `jaxsfm.matching.pair_matching.matched`."""
+        """See `jaxsfm.matching.pair_matching.match_pairs`."""
         ...
 
 
 class LocalEngine:
-    """All devices of this process."""
+    """This process computes, with all of its devices."""
 
-    extracted = staticmethod(extraction.extracted)
-    matched = staticmethod(pair_matching.matched)
+    starts_workers = False
+    extract_images = staticmethod(extraction.extract_images)
+    match_pairs = staticmethod(pair_matching.match_pairs)
 
 
 def chosen_engine(choice: EngineChoice) -> Engine:
-    """The engine of a command's --engine, --workers and --ray-address.
+    """The engine that --engine, --workers and --ray-address choose.
 
     Raises:
       UserError: an option that the engine does not have, or Ray is not installed.
@@ -62,8 +69,8 @@ def chosen_engine(choice: EngineChoice) -> Engine:
             given = "--ray-address" if choice.workers is None else "--workers"
             raise UserError(f"{given} is for --engine ray")
         return LocalEngine()
-    from jaxsfm.matching.ray.cluster import imported_ray
+    from jaxsfm.matching.ray.cluster import import_ray
     from jaxsfm.matching.ray.engine import RayEngine
 
-    imported_ray()  # before the work
+    import_ray()  # a missing package is reported before the work
     return RayEngine(address=choice.ray_address, workers=choice.workers)

@@ -1,14 +1,14 @@
-"""How the compiled programs run: devices, batches, memory. Never what they give, up to rounding:
-with more than one item side by side on a device, the last place of a product may differ.
+"""How the compiled programs run: on which devices, in which batches, with how much memory.
 
-Everything here follows from the machine, the images' sizes and how many there are, not from what is
-free at the moment.
+Nothing here changes a result, up to rounding: with more than one item side by side on a device, a
+product may differ in its last place. Everything follows from the machine, the images' sizes and
+their number, not from what memory is free at the moment.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,31 +23,31 @@ from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.features import total_memory
+from jaxsfm.options import ExecutionChoice
 
 HOST_SHARE, DEVICE_SHARE = 1 / 8, 1 / 2
-"""Of a machine's memory, or of an accelerator's, that joined features may take."""
+"""Shares of a host's memory, and of an accelerator's, that joined features may take."""
 HOST_BYTES = 3 << 29
-"""And at most this of a host's: ten images of 1536 x 1024 with four octaves."""
+"""Joined features take at most so much of a host's memory: ten images of 1536 x 1024 with four
+octaves."""
 HOST_IMAGES = 32
-"""And so many images: with them one is loaded for eight pairs of all, and what a run of a hundred
-small photos takes is what one of a thousand takes."""
+"""At most so many images' joined features are held on a host. With 32, one image is loaded for
+eight pairs if all pairs are matched, and a thousand small photos take no more memory than a
+hundred."""
 MAX_IMAGES, MAX_PAIRS = 16, 64
-"""Side by side on an accelerator; more keep it no busier, but wait longer for the slowest."""
+"""Items side by side on an accelerator at most. More would not keep it busier, but all would wait
+longer for the slowest one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Execution:
-    """None: chosen from the machine."""
+class Execution(ExecutionChoice):
+    """How many devices are used, how large batches are, and how much memory features may take.
 
-    devices: int | None = None
-    """How many of the visible ones; None: all."""
-    images_at_once: int | None = None
-    """Extracted side by side on each device; None: one on a CPU, which one image keeps busy."""
-    pairs_at_once: int | None = None
-    """Matched side by side on each device; None: one on a CPU."""
-    memory_gb: float | None = None
-    """For the joined features of the images at hand, on each device; None: half of an accelerator,
-    an eighth of a host, at most 1.6 GB. Less makes images come back more often."""
+    The fields are those of `jaxsfm.options.ExecutionChoice`, checked.
+
+    Raises:
+      ValueError: a number that is not positive, or not finite.
+    """
 
     def __post_init__(self) -> None:
         for name in ("devices", "images_at_once", "pairs_at_once"):
@@ -58,15 +58,15 @@ class Execution:
             raise ValueError(f"memory_gb must be positive; got {self.memory_gb}")
 
 
-SINGLE = Execution(devices=1, images_at_once=1, pairs_at_once=1)
-"""For one image or one pair."""
+ONE_AT_A_TIME = Execution(devices=1, images_at_once=1, pairs_at_once=1)
+"""The execution for a single image or a single pair."""
 
 
-def chosen_devices(execution: Execution) -> Mesh:
-    """The devices to use, in a row.
+def select_devices(execution: Execution) -> Mesh:
+    """The devices that are used, as a mesh with one axis.
 
     Raises:
-      UserError: there are not so many.
+      UserError: fewer devices are there than `execution.devices`.
     """
     devices = jax.local_devices()
     if execution.devices is not None and execution.devices > len(devices):
@@ -77,35 +77,37 @@ def chosen_devices(execution: Execution) -> Mesh:
 
 
 def _device_memory(mesh: Mesh) -> int | None:
-    """Bytes that JAX may use on each accelerator; None for CPUs, or where it does not tell."""
+    """Bytes that JAX may use on each accelerator; None for CPUs, or if JAX does not know."""
     device = mesh.devices.flat[0]
     stats = None if device.platform == "cpu" else device.memory_stats()
     return stats.get("bytes_limit") if stats else None
 
 
-def _bytes(tree: Any) -> int:
-    return sum(int(np.prod(x.shape)) * x.dtype.itemsize for x in jax.tree.leaves(tree))
-
-
 def joined_bytes(num_coarse: int, *, octaves: int, backbone: str = "vgg16") -> int:
-    """Of one image's joined features, of VGG about 98 per working pixel with four octaves, 24 with
-    one."""
+    """Bytes of one image's joined features.
+
+    With VGG they are about 98 bytes per working pixel with four octaves, and 24 with one.
+
+    Args:
+      num_coarse: the padded number of coarse cells of the first octave.
+    """
     network = BACKBONES[backbone]
 
     def blank() -> DenseFeatures:
         def octave(cells: int, channels: int) -> tuple[jax.Array, ...]:
-            rooms = (octave_capacity(cells, k) for k in range(octaves))
-            return tuple(jnp.zeros((room, channels)) for room in rooms)
+            sizes = (octave_capacity(cells, k) for k in range(octaves))
+            return tuple(jnp.zeros((size, channels)) for size in sizes)
 
         coarse, fine = octave(num_coarse, network.coarse), octave(4 * num_coarse, network.fine)
         grid = jnp.zeros(2, jnp.int32)
         return DenseFeatures(coarse, fine, jnp.zeros((4 * num_coarse, 2)), grid, grid)
 
-    return _bytes(jax.eval_shape(lambda: join_octaves(blank())))
+    shapes = jax.tree.leaves(jax.eval_shape(lambda: join_octaves(blank())))
+    return sum(math.prod(x.shape) * x.dtype.itemsize for x in shapes)
 
 
-def resident_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:
-    """How many images' joined features stay on each device, at least the two of a pair."""
+def cached_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:
+    """How many images' joined features stay on each device: at least the two of a pair."""
     each = joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone)
     memory = _device_memory(mesh)
     if execution.memory_gb is not None:
@@ -119,25 +121,31 @@ def resident_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config
 
 
 ACCELERATOR_BYTES_PER_PIXEL = 3000
-"""Of an extraction where the largest maps exist whole: the compiler's own account for CPUs was
-1540, and a library's convolutions want room of their own. Not measured on a GPU yet."""
+"""Working memory of an extraction, bytes per pixel of the padded image. XLA's own account for CPUs
+was 1540, with the largest feature maps whole; the convolutions of GPU libraries need more. It has
+not been measured on a GPU yet."""
 
 
 def images_at_once(execution: Execution, mesh: Mesh, pixels: int, count: int) -> int:
-    """Images extracted side by side on each device.
+    """How many images each device extracts side by side.
 
     Args:
-      pixels: of one padded image.
-      count: images there are of that size.
+      pixels: number of pixels of one padded image.
+      count: number of images of that size.
     """
     each = ACCELERATOR_BYTES_PER_PIXEL * pixels
-    return _at_once(execution.images_at_once, mesh, DEVICE_SHARE, each, MAX_IMAGES, count)
+    return _side_by_side(execution.images_at_once, mesh, DEVICE_SHARE, each, MAX_IMAGES, count)
 
 
-def _at_once(asked: int | None, mesh: Mesh, share: float, each: int, most: int, count: int) -> int:
-    """Items side by side on a device: as asked for, else what fits into a share of its memory (one
-    on a CPU); no more than each device gets of `count`, up to a power of two, so that few programs
-    are compiled."""
+def _side_by_side(
+    asked: int | None, mesh: Mesh, share: float, each: int, most: int, count: int
+) -> int:
+    """How many items each device computes side by side.
+
+    It is the number that was asked for; else as many as fit into a share of the device's memory,
+    or one on a CPU. It is no more than a device's part of `count`, rounded up to a power of two so
+    that few programs are compiled.
+    """
     memory = _device_memory(mesh)
     if asked is None:
         asked = 1 if memory is None else int(np.clip(share * memory / each, 1, most))
@@ -146,19 +154,19 @@ def _at_once(asked: int | None, mesh: Mesh, share: float, each: int, most: int, 
 
 
 PAIR_BYTES_PER_CELL = 35_000
-"""Working memory of a pair per coarse cell, alone or side by side: the compiler's own account of
-`default`'s program at 1600 x 1200; `paper` takes 13 000."""
+"""Working memory of a pair, bytes per coarse cell, alone or side by side with others. It is XLA's
+own account of the program of the preset `default` at 1600 x 1200; `paper` takes 13 000."""
 
 
 def pairs_at_once(
     execution: Execution, mesh: Mesh, num_coarse: int, count: int, *, config: Config
 ) -> int:
-    """Pairs matched side by side on each device, of `count`."""
-    # A batch copies both sides of its pairs, in half of what the images at hand leave.
+    """How many of `count` pairs each device matches side by side."""
+    # A batch copies both sides of its pairs, into half of the memory that cached images leave.
     share = (1 - DEVICE_SHARE) / 2
     joined = joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone)
     each = 2 * joined + PAIR_BYTES_PER_CELL * num_coarse
-    return _at_once(execution.pairs_at_once, mesh, share, each, MAX_PAIRS, count)
+    return _side_by_side(execution.pairs_at_once, mesh, share, each, MAX_PAIRS, count)
 
 
 Batch = TypeVar("Batch")
@@ -166,16 +174,21 @@ Started = TypeVar("Started")
 Result = TypeVar("Result")
 
 
-def one_ahead(
+def overlap_batches(
     batches: Iterable[Batch],
     start: Callable[[Batch], Started],
     finish: Callable[[Started], Iterable[Result]],
 ) -> Iterator[Result]:
-    """Results of batches, of which one runs on the devices while the next is loaded (`batches` is
-    asked for it) and the one before is handed out.
+    """Yield the results of batches, while loading, computing and saving overlap.
 
-    Whatever goes wrong with the next (Ctrl-C, a photo that went away, no memory): what has been
-    started is finished and handed out first.
+    While a batch runs on the devices, the next one is taken from `batches`, which loads it, and the
+    results of the one before are yielded. Whatever goes wrong with the next batch (Ctrl-C, a photo
+    that is gone, too little memory), the batch that runs is finished and yielded first.
+
+    Args:
+      batches: loads a batch when it is asked for the next one.
+      start: starts a batch on the devices and returns arrays without waiting for them.
+      finish: waits for a batch that was started, and yields its results.
     """
     todo = iter(batches)
     running: list[Started] = []

@@ -1,4 +1,4 @@
-"""Image files to dense features, in batches over all devices."""
+"""Dense features of image files, in batches over all devices."""
 
 import dataclasses
 import itertools
@@ -19,21 +19,32 @@ from jaxsfm.core.types import DenseFeatures
 from jaxsfm.io.features import ImageFeatures, check_memory, feature_capacity, padded_size
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
 from jaxsfm.io.weights import Weights
-from jaxsfm.matching.execution import SINGLE, Execution, chosen_devices, images_at_once, one_ahead
+from jaxsfm.matching.execution import (
+    ONE_AT_A_TIME,
+    Execution,
+    images_at_once,
+    overlap_batches,
+    select_devices,
+)
 
 READERS = 8
-"""Threads that decode at most: one JPEG takes 20 ms, an accelerator wants 150 a second."""
+"""Threads that decode images at most. A JPEG takes 20 ms, and an accelerator takes 150 images a
+second."""
 
 
 def _start(
     weights: Weights, working: Sequence[WorkingImage], config: Config, mesh: Mesh, batch_size: int
 ) -> DenseFeatures:
-    """Features, with a leading axis, of images that share a padded size and capacity; on the
-    devices, and not waited for."""
+    """Start the extraction of images that share a padded size and a capacity.
+
+    Returns:
+      Features on the devices, with leading axes for the devices and their batches. They are not
+      waited for.
+    """
     padded, num_coarse = _shapes(working[0].rgb.shape[1::-1])
-    room = batch_size * mesh.size
-    images = np.zeros((room, *padded, 3), np.uint8)
-    sizes = np.zeros((room, 2), np.int32)
+    count = batch_size * mesh.size
+    images = np.zeros((count, *padded, 3), np.uint8)
+    sizes = np.zeros((count, 2), np.int32)
     for k, each in enumerate(working):
         height, width = sizes[k] = each.rgb.shape[:2]
         images[k, :height, :width] = each.rgb
@@ -48,10 +59,10 @@ def _start(
 
 
 def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Extraction:
-    """The config's part of the extraction's program.
+    """What a config and the weights fix in the compiled program of an extraction.
 
     Raises:
-      ValueError: the weights are of another network.
+      ValueError: the weights belong to another network than the config's.
     """
     if weights.backbone != config.backbone:
         raise ValueError(f"weights must be of {config.backbone}; got {weights.backbone}")
@@ -67,7 +78,7 @@ def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Ex
 
 
 def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
-    """Padded size and capacity of a working image of (width, height): they fix the program."""
+    """Padded size (width, height) and coarse capacity of a working image, which fix the program."""
     return padded_size(size), feature_capacity(size).num_coarse
 
 
@@ -75,30 +86,32 @@ def image_features(weights: Weights, image: ImageFile, *, config: Config) -> Ima
     """Read one image and compute its features.
 
     Raises:
-      ImageError: the image cannot be used.
+      ImageError: the image cannot be read.
       UserError: it needs more memory than there is.
     """
-    ((_, found),) = extracted(weights, [image], config=config, execution=SINGLE)
+    ((_, found),) = extract_images(weights, [image], config=config, execution=ONE_AT_A_TIME)
     if isinstance(found, ImageError):
         raise found
     return found
 
 
-def extracted(
+def extract_images(
     weights: Weights,
     images: Iterable[ImageFile],
     *,
     config: Config,
     execution: Execution | None = None,
 ) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
-    """Features of every image, or why it has none, as batches are done; images of one padded size
-    follow each other. The next images are read meanwhile.
+    """Yield every image with its features, or with the error if it cannot be read.
+
+    Images come batch by batch, and those of one padded size follow each other. The next images are
+    read while a batch is computed.
 
     Raises:
       UserError: an image needs more memory than there is.
     """
     execution, images = execution or Execution(), list(images)
-    mesh = chosen_devices(execution)
+    mesh = select_devices(execution)
     at_once = mesh.size * (execution.images_at_once or 1)
     for image in images:  # before the first is computed
         check_memory(image, at_once, config=config)
@@ -121,11 +134,11 @@ def extracted(
         good = [each for _, each in batch.read if isinstance(each, WorkingImage)]
         return batch, _start(weights, good, config, mesh, batch.side_by_side) if good else None
 
-    return one_ahead(batches(), start, _results)
+    return overlap_batches(batches(), start, _results)
 
 
 class _Batch(NamedTuple):
-    """Images that were read together, and how many of them a device computes side by side."""
+    """Images that are extracted together, and how many of them a device computes side by side."""
 
     read: list[tuple[ImageFile, WorkingImage | ImageError]]
     side_by_side: int
@@ -148,7 +161,7 @@ def _results(
 def _read_ahead(
     images: Iterable[ImageFile], *, config: Config, ahead: int
 ) -> Iterator[tuple[ImageFile, WorkingImage | ImageError]]:
-    """Images in order, decoded by threads up to `ahead` of the one that is wanted."""
+    """Yield images in order; threads decode up to `ahead` images in advance."""
 
     def read(image: ImageFile) -> WorkingImage | ImageError:
         try:
@@ -156,7 +169,7 @@ def _read_ahead(
         except ImageError as error:
             return error
 
-    waiting: deque[tuple[ImageFile, Future]] = deque()
+    waiting: deque[tuple[ImageFile, Future[WorkingImage | ImageError]]] = deque()
     todo = iter(images)
     pool = ThreadPoolExecutor(min(READERS, os.cpu_count() or 1))
     try:
@@ -167,5 +180,5 @@ def _read_ahead(
                 return
             image, working = waiting.popleft()
             yield image, working.result()
-    finally:  # an interrupted run does not wait for what it will not use
+    finally:  # an interrupted run does not wait for images that it will not use
         pool.shutdown(cancel_futures=True)

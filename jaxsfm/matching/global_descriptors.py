@@ -1,8 +1,8 @@
 """One descriptor for each photo of a collection, kept in a store.
 
-Photos are described at a small size of their own, whatever the preset, so a descriptor depends on
-the photo and the weights alone; VLAD's also on the collection, which its vocabulary is fitted on.
-Of the local descriptors a bounded sample is held, the others lie in the store.
+Photos are described at a small size of their own, whatever the preset. So a descriptor depends on
+the photo and the weights alone; that of VLAD depends also on the collection, because its vocabulary
+is fitted on it. Local descriptors are kept in the store; memory holds a sample of bounded size.
 """
 
 import functools
@@ -26,95 +26,96 @@ from jaxsfm.io.store import Store, digest
 from jaxsfm.io.weight_files import read_extras
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import Execution
-from jaxsfm.matching.extraction import extracted
+from jaxsfm.matching.extraction import extract_images
 
 SIDE, NETVLAD_SIDE = 480, 640
-"""Longer side of a photo that is described, pixels: at 640 GeM and VLAD find no more than at 480
-(docs/guide/many-photos.md); NetVLAD's authors describe photos of 640 x 480."""
+"""Longer side of a photo that is described, pixels. GeM and VLAD find no more at 640 than at 480
+(docs/guide/many-photos.md). The authors of NetVLAD describe photos of 640 x 480."""
 SAMPLE = 1 << 14
-"""Local descriptors that a vocabulary is fitted on, over all photos: 34 MB, however many."""
+"""Number of local descriptors that a vocabulary is fitted on, over all photos (34 MB)."""
 CELLS = f"cells {SIDE}"
-"""What local descriptors are called in the store."""
+"""The kind of local descriptors in the store."""
 GEM = f"gem {SIDE}"
-"""What its descriptors are called in the store."""
-Found = dict[str, np.ndarray]
-"""Descriptors by content (SHA-256)."""
+"""The kind of GeM descriptors in the store."""
+ByContent = dict[str, np.ndarray]
+"""Descriptors by the SHA-256 of the photo's file."""
 _gem, _vlad, _netvlad, _fit = (jax.jit(f) for f in (gem, vlad, netvlad, fit_vocabulary))
 
 
 @dataclass(frozen=True)
-class Work:
-    """What is to be described, and where descriptors are kept."""
+class PhotoCollection:
+    """Photos that are described together, and the store that keeps their descriptors."""
 
     weights: Weights
     unique: list[ImageFile]
-    """Each content once, in order of the contents' hashes."""
+    """One photo of each content, in order of the SHA-256."""
     store: Store
     execution: Execution | None
     on_image: Callable[[], object]
-    """Told of every photo that has been through the network."""
+    """Called for every photo that has been through the network."""
     lost: dict[str, ImageError] = field(default_factory=dict)
-    """Contents that could not be decoded, and why; grows."""
+    """Errors of photos that cannot be decoded, by SHA-256; added while photos are described."""
 
     def load(self, image: ImageFile, kind: str) -> np.ndarray | None:
-        """An array in the store; None if it is not there, or damaged."""
+        """A photo's array in the store; None if it is missing or damaged."""
         return (self.store.load_descriptor(image, kind) or {}).get("array")
 
     def save(self, image: ImageFile, kind: str, array: np.ndarray) -> None:
-        """Keep an array."""
+        """Keep a photo's array in the store."""
         self.store.save_descriptor(image, kind, {"array": array})
 
-    def stored(self, kind: str) -> Found:
+    def stored(self, kind: str) -> ByContent:
         """All descriptors of this kind that are in the store."""
         found = {image.sha256: self.load(image, kind) for image in self.unique}
         return {sha256: each for sha256, each in found.items() if each is not None}
 
     def missing(self, have: Collection[str]) -> list[ImageFile]:
-        """Photos whose contents are not in `have`."""
+        """The photos whose SHA-256 is not in `have`."""
         return [image for image in self.unique if image.sha256 not in have]
 
 
-def by_gem(work: Work) -> Found:
-    """Generalised means of the coarse descriptors."""
-    found = work.stored(GEM)
-    for image, rows in _noted(work, _rows(work, work.missing(found))):
+def gem_descriptors(collection: PhotoCollection) -> ByContent:
+    """The generalised mean of each photo's coarse descriptors, float32 (c,)."""
+    found = collection.stored(GEM)
+    for image, rows in _decoded(collection, _coarse_rows(collection, collection.missing(found))):
         found[image.sha256] = np.asarray(_gem(_padded(rows)))
-        work.save(image, GEM, found[image.sha256])
+        collection.save(image, GEM, found[image.sha256])
     return found
 
 
-def by_vlad(work: Work) -> Found:
-    """VLAD of the coarse descriptors, with the collection's vocabulary."""
-    found = work.stored(_vlad_kind(work.unique))
-    if len(found) == len(work.unique):
+def vlad_descriptors(collection: PhotoCollection) -> ByContent:
+    """VLAD of each photo's coarse descriptors, with a vocabulary fitted on the collection."""
+    found = collection.stored(_vlad_kind(collection.unique))
+    if len(found) == len(collection.unique):
         return found
-    here = {image.sha256 for image in work.unique if work.load(image, CELLS) is not None}
-    for image, rows in _noted(work, _rows(work, work.missing(here))):
-        work.save(image, CELLS, rows)
-    good = work.missing(work.lost)
+    todo = [image for image in collection.unique if collection.load(image, CELLS) is None]
+    for image, rows in _decoded(collection, _coarse_rows(collection, todo)):
+        collection.save(image, CELLS, rows)
+    good = collection.missing(collection.lost)
     kind = _vlad_kind(good)
-    found = work.stored(kind)
+    found = collection.stored(kind)
     todo = [image for image in good if image.sha256 not in found]
-    words = _vocabulary(work, good) if todo else None
+    words = _vocabulary(collection, good) if todo else None
     for image in todo:
         interrupt.check()
-        found[image.sha256] = np.asarray(_vlad(_padded(_again(work, image)), words))
-        work.save(image, kind, found[image.sha256])
+        rows = _padded(_local_descriptors(collection, image))
+        found[image.sha256] = np.asarray(_vlad(rows, words))
+        collection.save(image, kind, found[image.sha256])
     return found
 
 
-def by_netvlad(work: Work) -> Found:
-    """NetVLAD with the head that the weights bring."""
+def netvlad_descriptors(collection: PhotoCollection) -> ByContent:
+    """NetVLAD of each photo, with the head that is in the file of the weights."""
     kind = f"netvlad {NETVLAD_SIDE}"
-    found = work.stored(kind)
-    todo = work.missing(found)
+    found = collection.stored(kind)
+    todo = collection.missing(found)
     if not todo:
         return found
-    extras = read_extras(work.weights.path)
+    extras = read_extras(collection.weights.path)
     head = NetVLADHead(*(jnp.asarray(extras[f"netvlad.{name}"]) for name in NetVLADHead._fields))
-    for image, rows in _noted(work, _conv5_rows(work.weights, todo)):
+    for image, rows in _decoded(collection, _conv5_rows(collection.weights, todo)):
         found[image.sha256] = np.asarray(_netvlad(rows, head))
-        work.save(image, kind, found[image.sha256])
+        collection.save(image, kind, found[image.sha256])
     return found
 
 
@@ -122,12 +123,12 @@ def _vlad_kind(images: Iterable[ImageFile]) -> str:
     return f"vlad {SIDE} {SAMPLE} {digest(sorted(image.sha256 for image in images))}"
 
 
-def _vocabulary(work: Work, good: list[ImageFile]) -> Vocabulary:
-    """Fitted on as many random cells of each photo as make up `SAMPLE`."""
+def _vocabulary(collection: PhotoCollection, good: list[ImageFile]) -> Vocabulary:
+    """Fit a vocabulary on random cells, equally many of each photo and `SAMPLE` in all."""
     each = max(1, SAMPLE // len(good))
     sample: list[np.ndarray] = []
     for image in good[:SAMPLE]:
-        rows = _again(work, image)
+        rows = _local_descriptors(collection, image)
         order = np.random.default_rng(image.identity).permutation(len(rows))
         sample.append(rows[order[:each]])
     together = np.concatenate(sample)
@@ -136,26 +137,28 @@ def _vocabulary(work: Work, good: list[ImageFile]) -> Vocabulary:
     return _fit(jax.random.key(0), full)
 
 
-def _noted(
-    work: Work, stream: Iterator[tuple[ImageFile, np.ndarray | ImageError]]
+def _decoded(
+    collection: PhotoCollection, stream: Iterator[tuple[ImageFile, np.ndarray | ImageError]]
 ) -> Iterator[tuple[ImageFile, np.ndarray]]:
-    """The photos that could be decoded; the others go to `work.lost`."""
+    """Yield the photos that could be decoded; the others go to `collection.lost`."""
     for image, rows in stream:
         interrupt.check()
         if isinstance(rows, ImageError):
-            work.lost[image.sha256] = rows
+            collection.lost[image.sha256] = rows
         else:
             yield image, rows
-        work.on_image()
+        collection.on_image()
 
 
-def _rows(
-    work: Work, images: list[ImageFile]
+def _coarse_rows(
+    collection: PhotoCollection, images: list[ImageFile]
 ) -> Iterator[tuple[ImageFile, np.ndarray | ImageError]]:
-    """Unit coarse descriptors, float16 (cells, c)."""
+    """Yield photos with their coarse descriptors of unit length, float16 (cells, c)."""
     for side, some in itertools.groupby(sorted(images, key=_side), key=_side):
-        config = Config(max_size=side, backbone=work.weights.backbone, keypoints="grid")
-        stream = extracted(work.weights, some, config=config, execution=work.execution)
+        config = Config(max_size=side, backbone=collection.weights.backbone, keypoints="grid")
+        stream = extract_images(
+            collection.weights, some, config=config, execution=collection.execution
+        )
         for image, found in stream:
             if isinstance(found, ImageError):
                 yield image, found
@@ -164,24 +167,24 @@ def _rows(
                 yield image, np.asarray(found.dense.coarse[0][:cells])
 
 
-def _again(work: Work, image: ImageFile) -> np.ndarray:
-    """Kept local descriptors; made again if they were damaged or deleted meanwhile."""
-    rows = work.load(image, CELLS)
+def _local_descriptors(collection: PhotoCollection, image: ImageFile) -> np.ndarray:
+    """A photo's local descriptors from the store; if missing there, they are made again."""
+    rows = collection.load(image, CELLS)
     if rows is None:
-        ((_, rows),) = _rows(work, [image])
+        ((_, rows),) = _coarse_rows(collection, [image])
         if isinstance(rows, ImageError):
             raise rows
-        work.save(image, CELLS, rows)
+        collection.save(image, CELLS, rows)
     return rows
 
 
 def _side(image: ImageFile, least: int = SIDE) -> int:
-    """Longer side at which an image is described; of very long ones more."""
+    """Longer side at which an image is described, pixels: more for a very elongated one."""
     return max(least, math.ceil(MIN_SIDE * max(image.size) / min(image.size)))
 
 
 def _padded(rows: np.ndarray) -> np.ndarray:
-    """float32, with zero rows up to `padded_cells`, so that few programs are compiled."""
+    """Rows as float32, padded with zeros to `padded_cells` so that few programs are compiled."""
     full = np.zeros((padded_cells(len(rows)), rows.shape[1]), np.float32)
     full[: len(rows)] = rows
     return full
@@ -190,7 +193,7 @@ def _padded(rows: np.ndarray) -> np.ndarray:
 def _conv5_rows(
     weights: Weights, images: list[ImageFile]
 ) -> Iterator[tuple[ImageFile, np.ndarray | ImageError]]:
-    """conv5_3 before its rectifier, float32 (cells, 512); zero rows are padding."""
+    """Yield photos with conv5_3 before its rectifier, float32 (cells, 512); padding is zero."""
     params = jax.device_put(weights.params)
     for image in images:
         try:

@@ -1,7 +1,7 @@
 """Verified matches of pairs of images, in batches over all devices.
 
-Joined features of the images at hand stay on the devices; pairs are taken tile by tile of the table
-of all pairs, so that an image comes back as rarely as that memory allows.
+The devices keep the joined features of some images. Pairs are matched tile by tile of the table of
+all pairs, so that an image is loaded as rarely as that memory allows.
 """
 
 import dataclasses
@@ -20,14 +20,19 @@ from jaxsfm.core.types import JoinedFeatures, PairMatches, Status, Thresholds
 from jaxsfm.io.features import FeatureCapacity, ImageFeatures
 from jaxsfm.io.pairs import PairResult, make_pair
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.matching.device_cache import OnDevice, Resident, by_tiles, join
+from jaxsfm.matching.device_cache import (
+    DeviceFeatures,
+    ImageCache,
+    put_on_devices,
+    tile_order,
+)
 from jaxsfm.matching.execution import (
-    SINGLE,
+    ONE_AT_A_TIME,
     Execution,
-    chosen_devices,
-    one_ahead,
+    cached_images,
+    overlap_batches,
     pairs_at_once,
-    resident_images,
+    select_devices,
 )
 
 Name = TypeVar("Name")
@@ -36,13 +41,13 @@ Name = TypeVar("Name")
 def match_features(
     features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int = 0
 ) -> PairResult:
-    """Verified matches of two images, in the order given."""
+    """Verified matches of two images; `features0` is the first image of the result."""
     both = {0: features0, 1: features1}
     capacities = {side: features.capacity for side, features in both.items()}
-    return next(_matched(both.__getitem__, capacities, [(0, 1)], config, seed, SINGLE))
+    return next(_match_pairs(both.__getitem__, capacities, [(0, 1)], config, seed, ONE_AT_A_TIME))
 
 
-def matched(
+def match_pairs(
     load: Callable[[str], ImageFeatures],
     capacities: Mapping[str, FeatureCapacity],
     pairs: Iterable[tuple[str, str]],
@@ -51,22 +56,22 @@ def matched(
     seed: int = 0,
     execution: Execution | None = None,
 ) -> Iterator[PairResult]:
-    """Verified matches of pairs (the lesser name first), as batches are done.
+    """Yield the verified matches of pairs, batch by batch; in each pair the lesser name is first.
 
-    A pair's result depends on the two images, the config and the seed; not on the other pairs, nor
-    on their order, nor on how many devices there are. With several pairs side by side on a device
-    products may round differently in the last place (`jaxsfm.matching.execution`).
+    A pair's result depends on the two images, the config and the seed. It does not depend on the
+    other pairs, on their order, or on the number of devices. With several pairs side by side on a
+    device, products may round differently in the last place (`jaxsfm.matching.execution`).
 
     Args:
-      load: an image's features by its name; asked again when they have left the device.
-      capacities: the feature capacity of every image.
+      load: loads an image's features by its name; it is called again if they have left the device.
+      capacities: the feature capacity of every image, by its name.
     """
     named = [make_pair(a, b) for a, b in pairs]
-    return _matched(load, capacities, named, config, seed, execution or Execution())
+    return _match_pairs(load, capacities, named, config, seed, execution or Execution())
 
 
 def thresholds(config: Config) -> Thresholds:
-    """The config's traced half."""
+    """The numbers of a config that a compiled program takes as arguments."""
     return Thresholds(
         np.float32(config.threshold_px),  # pyright: ignore[reportArgumentType]
         np.int32(config.min_inliers),  # pyright: ignore[reportArgumentType]
@@ -75,10 +80,10 @@ def thresholds(config: Config) -> Thresholds:
 
 
 class _Program(NamedTuple):
-    """What a compiled program of pairs is made for."""
+    """What a program for pairs is compiled for."""
 
-    room: int
-    """Coarse capacity of both sides."""
+    num_coarse: int
+    """Coarse capacity of both images."""
     shape: PairShape
 
 
@@ -90,13 +95,13 @@ def _program(capacity0: FeatureCapacity, capacity1: FeatureCapacity, config: Con
 
 
 class _Started(NamedTuple):
-    """A batch on the devices, and the hosts' part of its images."""
+    """A batch that runs on the devices, and the parts of its images that are on the host."""
 
-    found: PairMatches
-    sides: list[tuple[ImageFeatures, ImageFeatures]]
+    matches: PairMatches
+    images: list[tuple[ImageFeatures, ImageFeatures]]
 
 
-def _matched(
+def _match_pairs(
     load: Callable[[Name], ImageFeatures],
     capacities: Mapping[Name, FeatureCapacity],
     pairs: Sequence[tuple[Name, Name]],
@@ -104,23 +109,24 @@ def _matched(
     seed: int,
     execution: Execution,
 ) -> Iterator[PairResult]:
-    mesh, root = chosen_devices(execution), jax.random.key(seed)
+    mesh, root = select_devices(execution), jax.random.key(seed)
     programs: dict[_Program, list[tuple[Name, Name]]] = {}
     for a, b in pairs:
         programs.setdefault(_program(capacities[a], capacities[b], config), []).append((a, b))
 
     def batches() -> Iterator[_Batch]:
         for program, some in programs.items():
-            side_by_side = pairs_at_once(execution, mesh, program.room, len(some), config=config)
-            most = resident_images(execution, mesh, program.room, config=config)
-            ordered = by_tiles(some, max(1, most // 2))
+            num_coarse = program.num_coarse
+            side_by_side = pairs_at_once(execution, mesh, num_coarse, len(some), config=config)
+            most = cached_images(execution, mesh, num_coarse, config=config)
+            ordered = tile_order(some, max(1, most // 2))
 
-            def joined(name: Name, room: int = program.room) -> OnDevice:
-                return join(load(name), room, mesh)
+            def on_devices(name: Name, num_coarse: int = num_coarse) -> DeviceFeatures:
+                return put_on_devices(load(name), num_coarse, mesh)
 
-            resident, todo = Resident(joined, ordered, most), iter(ordered)
+            cache, todo = ImageCache(on_devices, ordered, most), iter(ordered)
             while batch := list(itertools.islice(todo, side_by_side * mesh.size)):
-                images = [(resident.take(a), resident.take(b)) for a, b in batch]
+                images = [(cache.take(a), cache.take(b)) for a, b in batch]
                 yield _Batch(program, side_by_side, images)
 
     def start(batch: _Batch) -> _Started:
@@ -136,26 +142,26 @@ def _matched(
         )
         return _Started(found, [(a.features, b.features) for a, b in batch.images])
 
-    return one_ahead(batches(), start, _results)
+    return overlap_batches(batches(), start, _results)
 
 
 class _Batch(NamedTuple):
-    """Pairs of one program, loaded, and how many of them a device computes side by side."""
+    """Loaded pairs of one program, and how many of them a device computes side by side."""
 
     program: _Program
     side_by_side: int
-    images: list[tuple[OnDevice, OnDevice]]
+    images: list[tuple[DeviceFeatures, DeviceFeatures]]
 
 
-def _identities(images: Sequence[tuple[OnDevice, OnDevice]], mesh: Mesh) -> np.ndarray:
+def _identities(images: Sequence[tuple[DeviceFeatures, DeviceFeatures]], mesh: Mesh) -> np.ndarray:
     ids = [[each.features.image.identity for each in sides] for sides in images]
     return np.asarray(ids, np.uint32).reshape(mesh.size, -1, 2)
 
 
 def _columns(
-    images: Sequence[tuple[OnDevice, OnDevice]], mesh: Mesh
+    images: Sequence[tuple[DeviceFeatures, DeviceFeatures]], mesh: Mesh
 ) -> Iterator[tuple[JoinedFeatures, JoinedFeatures]]:
-    """For each place in a device's batch both sides, over the devices."""
+    """For each place in a device's batch, the first and the second images of all devices."""
     each = len(images) // mesh.size
     for k in range(each):
         left, right = zip(*images[k::each], strict=True)
@@ -166,16 +172,16 @@ def _columns(
 
 
 def _results(started: _Started) -> Iterator[PairResult]:
-    host = jax.device_get(started.found)
+    host = jax.device_get(started.matches)
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), host)
-    for k, sides in enumerate(started.sides):
+    for k, sides in enumerate(started.images):
         yield to_original_pixels(jax.tree.map(lambda x, k=k: x[k], flat), *sides)
 
 
 def to_original_pixels(
     found: PairMatches, features0: ImageFeatures, features1: ImageFeatures
 ) -> PairResult:
-    """From the program's padded output to lists in original pixels."""
+    """Convert a program's padded output to the pair's matches, in original pixels."""
     keep = np.asarray(found.plane) >= 0
     cells = np.asarray(found.cells)[keep]
 
@@ -183,7 +189,8 @@ def to_original_pixels(
         xy = np.asarray(features.dense.keypoints, np.float64)[cells[:, side]]
         return np.asarray(rescale(xy, np.asarray(features.scale))).astype(np.float32)
 
-    # In float64 on the host: 1600 px coordinates squared leave float32 no digits to invert with.
+    # The conversion is done in float64 on the host: squares of coordinates up to 1600 px leave
+    # float32 too few digits for an inverse.
     present = np.asarray(found.num_inliers) > 0
     to0, to1 = (Pixels(each.scale).matrix() for each in (features0, features1))
     h = to1 @ np.asarray(found.homographies, np.float64)[present] @ np.linalg.inv(to0)

@@ -1,7 +1,6 @@
-"""The stages up to matches: photos to features to matches.
+"""The stages from photos to matches, as functions that keep everything in memory.
 
-Every stage is a function of its inputs and a config. `jaxsfm.run_folder` strings them together in a
-work folder.
+`jaxsfm.run_folder` runs the same stages in a work folder, where results are kept.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,15 +15,18 @@ from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import Execution
-from jaxsfm.matching.extraction import extracted
-from jaxsfm.matching.pair_matching import matched
+from jaxsfm.matching.extraction import extract_images
+from jaxsfm.matching.pair_matching import match_pairs
 
 
 def open_images(folder: Path, *, progress: bool = False) -> tuple[list[ImageFile], dict[str, str]]:
-    """The usable images below a folder, and why each of the others is not.
+    """Find the images in a folder and its sub-folders, and read their headers.
+
+    Returns:
+      The usable images, and for each of the others the reason why it cannot be used, by its name.
 
     Raises:
-      UserError: no such folder, or no image files in it.
+      UserError: there is no such folder, or no image file in it.
     """
     images, lost = [], {}
     names = find_images(folder)
@@ -43,13 +45,13 @@ def extract(
     config: Config,
     execution: Execution | None = None,
 ) -> dict[str, ImageFeatures]:
-    """Dense features of images, by name; all of them in memory (25 MB for 1536 x 1024).
+    """Dense features of images, by their names. An image of 1536 x 1024 takes 25 MB of memory.
 
     Raises:
       ImageError: an image cannot be decoded.
     """
     features = {}
-    for image, found in extracted(weights, images, config=config, execution=execution):
+    for image, found in extract_images(weights, images, config=config, execution=execution):
         if isinstance(found, ImageError):
             raise found
         features[image.name] = found
@@ -64,12 +66,12 @@ def match(
     seed: int = 0,
     execution: Execution | None = None,
 ) -> dict[Pair, PairResult]:
-    """Verified matches of pairs of images, by pair (the lesser name first).
+    """Verified matches of pairs of images, by pair; in each pair the lesser name is first.
 
-    A pair's result depends on the two images, the config and the seed; not on other pairs.
+    A pair's result depends on the two images, the config and the seed, not on other pairs.
     """
     capacities = {name: each.capacity for name, each in features.items()}
-    results = matched(
+    results = match_pairs(
         features.__getitem__, capacities, pairs, config=config, seed=seed, execution=execution
     )
     return {result.pair: result for result in results}

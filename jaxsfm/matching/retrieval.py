@@ -1,5 +1,6 @@
-"""Which photos may show the same: the nearest neighbours of their descriptors."""
+"""Which photos may show the same scene: the nearest neighbours of their global descriptors."""
 
+import contextlib
 import importlib.metadata
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
@@ -12,17 +13,24 @@ import numpy as np
 from jaxsfm.core.pooling import nearest
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
-from jaxsfm.io.pair_selection import Retrieval
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.store import Store
 from jaxsfm.io.weight_files import has_extras, is_converted
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import Execution
-from jaxsfm.matching.global_descriptors import Work, by_gem, by_netvlad, by_vlad
+from jaxsfm.matching.global_descriptors import (
+    PhotoCollection,
+    gem_descriptors,
+    netvlad_descriptors,
+    vlad_descriptors,
+)
+from jaxsfm.options import Retrieval
+
+_DESCRIBE = {"gem": gem_descriptors, "vlad": vlad_descriptors, "netvlad": netvlad_descriptors}
 
 
-class Described(NamedTuple):
-    """A collection's descriptors."""
+class GlobalDescriptors(NamedTuple):
+    """One descriptor for each photo of a collection."""
 
     vectors: dict[str, np.ndarray]
     """float32, unit length, by the photos' names."""
@@ -31,7 +39,11 @@ class Described(NamedTuple):
 
 
 def check_retrieval(kind: Retrieval, weights: Weights) -> None:
-    """Raises UserError if photos cannot be described so with these weights."""
+    """Check that photos can be described in a way with these weights.
+
+    Raises:
+      UserError: they cannot.
+    """
     if kind == "netvlad" and not (is_converted(weights.path) and has_extras(weights.path)):
         raise UserError(
             "--retrieval netvlad: needs NetVLAD's weights with their head (--weights; jaxsfm "
@@ -47,71 +59,61 @@ def shortlist(
     kind: Retrieval = "vlad",
     execution: Execution | None = None,
 ) -> list[Pair]:
-    """Every image with its `k` most similar ones, as a union of pairs in order of names.
+    """Pairs of each image with its `k` most similar ones, each pair once, in order of names.
 
-    Depends on the photos and their names alone, not on their order.
+    The pairs depend on the photos and their names alone, not on their order.
 
     Raises:
       ImageError: an image cannot be decoded.
-      UserError: `netvlad`, and the weights have no head.
+      UserError: the kind is `netvlad`, and the weights have no head.
     """
-    found = described_alone(weights, images, kind=kind, execution=execution)
+    found = describe_photos(weights, images, kind=kind, execution=execution)
     for _, error in found.lost:
         raise error
     return nearest_pairs(found.vectors, k)
 
 
-def described_alone(
+def describe_photos(
     weights: Weights,
     images: Iterable[ImageFile],
     *,
     kind: Retrieval,
+    store: Store | None = None,
     execution: Execution | None = None,
     on_image: Callable[[], object] = lambda: None,
-) -> Described:
-    """As `described`; nothing is kept."""
-    identity = {"version": importlib.metadata.version("jaxsfm"), "weights": weights.sha256}
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        store = Store(Path(scratch), identity)
-        return described(
-            weights, images, kind=kind, store=store, execution=execution, on_image=on_image
-        )
-
-
-def described(
-    weights: Weights,
-    images: Iterable[ImageFile],
-    *,
-    kind: Retrieval,
-    store: Store,
-    execution: Execution | None = None,
-    on_image: Callable[[], object] = lambda: None,
-) -> Described:
-    """Descriptors of all images; what is in the store is not computed again.
+) -> GlobalDescriptors:
+    """Describe photos; descriptors that are in the store are not computed again.
 
     Args:
-      store: of a run with these weights.
-      on_image: told of every photo that has been through the network.
+      store: of a run with these weights; None: nothing is kept.
+      on_image: called for every photo that has been through the network.
 
     Raises:
-      UserError: `netvlad`, and the weights have no head.
+      UserError: the kind is `netvlad`, and the weights have no head.
     """
     check_retrieval(kind, weights)
     images = list(images)
-    # Each content once, in an order that is nobody's choice.
+    # Each content is described once, in an order that does not depend on the caller.
     of_content = {image.sha256: image for image in images}
     unique = [of_content[sha256] for sha256 in sorted(of_content)]
-    work = Work(weights, unique, store, execution, on_image)
-    found = {"gem": by_gem, "vlad": by_vlad, "netvlad": by_netvlad}[kind](work)
-    return Described(
+    with contextlib.ExitStack() as stack:
+        if store is None:
+            scratch = stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
+            identity = {"version": importlib.metadata.version("jaxsfm"), "weights": weights.sha256}
+            store = Store(Path(scratch), identity)
+        collection = PhotoCollection(weights, unique, store, execution, on_image)
+        found = _DESCRIBE[kind](collection)
+    lost = collection.lost
+    return GlobalDescriptors(
         {image.name: found[image.sha256] for image in images if image.sha256 in found},
-        [(image, work.lost[image.sha256]) for image in images if image.sha256 in work.lost],
+        [(image, lost[image.sha256]) for image in images if image.sha256 in lost],
     )
 
 
 def nearest_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
-    """Every name with the `k` nearest others (all, if there are not so many), as a union; equally
-    near ones by name.
+    """Pairs of each name with the `k` nearest others, each pair once, in order of names.
+
+    With fewer than `k` others, all of them are taken. Equally near ones are taken by name.
 
     Raises:
       ValueError: k is less than 1.

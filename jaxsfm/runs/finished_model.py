@@ -1,16 +1,9 @@
-"""What placing photos in a finished run needs of it: its model, weights, photos, and which of them
-may show the same as a new one.
-"""
+"""What `localize` and `extend` need of a finished run: its model, its weights and its photos."""
 
-import contextlib
-import functools
-import tempfile
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.database import camera_for
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
@@ -18,26 +11,21 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
-from jaxsfm.core.pooling import TIE
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, ImageFile, shown_name, working_size
+from jaxsfm.io.images import ImageFile, shown_name, working_size
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights, chosen_weights
-from jaxsfm.matching.execution import Execution
-from jaxsfm.matching.global_descriptors import GEM
-from jaxsfm.matching.retrieval import described
 from jaxsfm.options import WeightsChoice
 from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.run_inputs import UsedWeights
 from jaxsfm.report.typed_json import from_json
 
-Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
-"""A photo and the names of the model's photos -> those that it is matched with."""
+if TYPE_CHECKING:
+    import pycolmap
 
 
-class KnownModel(NamedTuple):
-    """The best model of a run, in working pixels."""
+class WorkingModel(NamedTuple):
+    """The best model of a run in working pixels, and the settings of the run."""
 
     model: Model
     config: Config
@@ -49,25 +37,24 @@ class KnownModel(NamedTuple):
         return self.model.views
 
 
-class ChosenCamera(NamedTuple):
-    """A photo's camera before it is localized."""
+class CameraPrior(NamedTuple):
+    """What is known of a photo's camera before the photo is localized."""
 
-    camera: Any
-    """pycolmap.Camera."""
+    camera: "pycolmap.Camera"
     source: str
-    """given, run, exif or guess."""
+    """Where it comes from: `given`, `run`, `exif` or `guess`."""
 
     @property
-    def own(self) -> bool:
-        """Whether its focal length is estimated."""
+    def estimated(self) -> bool:
+        """Whether localization estimates the focal length."""
         return self.source in ("exif", "guess")
 
 
-def known_model(folder: Path, config: Config, *, seed: int = 0) -> KnownModel:
-    """A COLMAP model on disk, seen in the working pixels of a config.
+def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> WorkingModel:
+    """Read a COLMAP model and convert it to the working pixels of a config.
 
     Raises:
-      UserError: no readable model in `folder`.
+      UserError: `folder` has no readable model.
     """
     model = read_model(folder)
     cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
@@ -75,40 +62,49 @@ def known_model(folder: Path, config: Config, *, seed: int = 0) -> KnownModel:
     for name, camera in cameras.items():
         width, height = working_size((camera.width, camera.height), config.max_size, config.enlarge)
         sizes[name] = (width, height), (camera.width / width, camera.height / height)
-    return KnownModel(Model.from_colmap(model, sizes), config, seed)
+    return WorkingModel(Model.from_colmap(model, sizes), config, seed)
 
 
-def choose_camera(
+def camera_prior(
     image: ImageFile, views: Sequence[View], intrinsics: Intrinsics | None
-) -> ChosenCamera:
-    """The given camera; else the model's, if exactly one of this size is that of several views;
-    else one from EXIF or a guess.
+) -> CameraPrior:
+    """The camera that a photo starts with.
+
+    It is the given one. Without one, it is the camera of the model, if the model has exactly one
+    camera of the photo's size that several views share. Else it comes from EXIF, or is a guess.
+
+    Args:
+      intrinsics: given by the user; None: none.
 
     Raises:
-      UserError: the given one does not fit.
+      UserError: the given intrinsics do not fit the photo's size.
     """
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size})
-        return ChosenCamera(intrinsics.camera(image.size), "given")
+        return CameraPrior(intrinsics.camera(image.size), "given")
     fitting = [v.camera for v in views if (v.camera.width, v.camera.height) == image.size]
     count = Counter(camera.camera_id for camera in fitting)
     shared = {c.camera_id: c for c in fitting if count[c.camera_id] > 1}
     if len(shared) == 1:
         (camera,) = shared.values()
-        return ChosenCamera(camera, "run")
+        return CameraPrior(camera, "run")
     camera = camera_for(image, None)
-    return ChosenCamera(camera, "exif" if camera.has_prior_focal_length else "guess")
+    return CameraPrior(camera, "exif" if camera.has_prior_focal_length else "guess")
 
 
-def view_of(image: ImageFile, chosen: ChosenCamera, config: Config) -> View:
-    """A photo that has no pose yet."""
+def view_without_pose(image: ImageFile, prior: CameraPrior, config: Config) -> View:
+    """The view of a photo that is not localized yet."""
     width, height = working_size(image.size, config.max_size, config.enlarge)
     pixels = Pixels((image.size[0] / width, image.size[1] / height))
-    return View.without_pose(image.name, 0, chosen.camera, (width, height), pixels)
+    return View.without_pose(image.name, 0, prior.camera, (width, height), pixels)
 
 
-def run_weights(run: FinishedRun, choice: WeightsChoice) -> Weights:
-    """Those of the run, or UserError."""
+def weights_of_run(run: FinishedRun, choice: WeightsChoice) -> Weights:
+    """Load the weights that a run was made with.
+
+    Raises:
+      UserError: `choice` names other weights.
+    """
     config = run.config
     weights = chosen_weights(choice, config.backbone)
     made_with, now = run.report.weights, from_json(UsedWeights, weights.described(config))
@@ -124,8 +120,12 @@ def run_weights(run: FinishedRun, choice: WeightsChoice) -> Weights:
     return weights
 
 
-def run_files(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile]:
-    """The run's photos, or UserError for one that is gone."""
+def photos_of_run(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile]:
+    """The files of photos of a run, by name.
+
+    Raises:
+      UserError: a photo is gone or has changed.
+    """
     files = {}
     for name in names:
         image = run.photos.file(name)
@@ -136,59 +136,3 @@ def run_files(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile]:
             )
         files[name] = image
     return files
-
-
-def by_similarity(
-    run: FinishedRun, weights: Weights, k: int, new: Mapping[str, ImageFile], execution: Execution
-) -> Shortlist:
-    """The `k` most similar photos by GeM, which describes each photo by itself; equally similar
-    ones by name. The run's photos are described once and kept in its folder, if it can be written.
-
-    Args:
-      new: photos that the run does not know, by name.
-
-    The shortlist raises ImageError for a photo that cannot be decoded.
-
-    Raises:
-      UserError: k is less than 1.
-    """
-    if k < 1:
-        raise UserError(f"--shortlist must be at least 1; got {k}")
-
-    def describe(images: Sequence[ImageFile], store: Store) -> dict[str, np.ndarray]:
-        found = described(weights, images, kind="gem", store=store, execution=execution)
-        for _, error in found.lost:
-            raise error
-        return found.vectors
-
-    def described_apart(image: ImageFile) -> np.ndarray:
-        with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-            store = Store(Path(scratch), run.report.identity.to_json())
-            return describe([image], store)[image.name]
-
-    @functools.cache
-    def of(name: str) -> np.ndarray:
-        if name in new:
-            return described_apart(new[name])
-        unread = run.photos.recorded(name)
-        kept = run.matches.load_descriptor(unread, GEM)
-        if kept is not None and "array" in kept:
-            return kept["array"]
-        image = run_files(run, [name])[name]
-        try:
-            return describe([image], run.matches)[name]
-        except ImageError:
-            raise
-        except UserError:  # the run's folder cannot be written
-            return described_apart(image)
-
-    def shortlist(image: ImageFile, names: Sequence[str]) -> Sequence[str]:
-        if k >= len(names):
-            return names
-        own, nearness = of(image.name), {}
-        for name in names:
-            with contextlib.suppress(ImageError):  # another one that cannot be decoded
-                nearness[name] = round(float(of(name) @ own) / TIE)
-        return sorted(nearness, key=lambda name: (-nearness[name], name))[:k]
-
-    return shortlist

@@ -1,4 +1,4 @@
-"""A whole run in its work folder: photos in, COLMAP model, database and report out."""
+"""A whole run in its work folder: from photos to a COLMAP model, a database and a report."""
 
 import importlib.metadata
 import logging
@@ -21,15 +21,17 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair, PairCounts, PairResult, best_pairs
 from jaxsfm.io.store import SavedMatches, digest
-from jaxsfm.io.weights import Weights, chosen_weights
-from jaxsfm.io.work_folder import WorkFolder, open_folder
+from jaxsfm.io.weights import chosen_weights
+from jaxsfm.io.work_folder import open_folder
+from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.matching.retrieval import check_retrieval, described, nearest_pairs
+from jaxsfm.matching.retrieval import check_retrieval, describe_photos, nearest_pairs
+from jaxsfm.options import Retrieval
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json
-from jaxsfm.runs.compute_missing import extract_missing, match_missing
+from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.runs.report import StageResults, evaluated, run_report
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.sfm.reconstruction import Reconstructed, reconstruct
@@ -51,26 +53,31 @@ def reconstruct_folder(
 ) -> RunReport:
     """Reconstruct a folder of photos; returns the report, also written to `out`/report.json.
 
-    Features, matches and finished stages are kept in `out` as they are made, each under what it
-    depends on: after an interruption, or with other photos or options, the same call goes on with
-    what still holds. `out`/sparse/0 is the best model, `out`/database.db the database.
+    Features, matches and finished stages are kept in `out` as soon as they are there, each under a
+    key made of all that it depends on. So the same call continues an interrupted run, and a call
+    with other photos or options uses again whatever does not depend on the change. `out`/sparse/0
+    is the best model, and `out`/database.db is COLMAP's database.
+
+    Args:
+      images: folder of the photos.
+      out: folder for the results; it is made if it does not exist.
 
     Raises:
-      UserError: what was given cannot be used. Nothing already computed is lost.
+      UserError: a photo, a file or an option cannot be used. What was computed is kept.
     """
     check_options(options)
     reference = read_poses(options.reference) if options.reference else None
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, skipped = open_images(images, progress=options.progress)
     names = [*(image.name for image in usable), *skipped]
-    plan = parse_pair_selection(options.pairs)
-    pairs = selected_pairs(plan, (image.name for image in usable), names)
+    selection = parse_pair_selection(options.pairs)
+    pairs = selected_pairs(selection, (image.name for image in usable), names)
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
-    given = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
+    external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
     weights = chosen_weights(options.network, config.backbone)
-    if plan.retrieval:
+    if selection.retrieval:
         check_retrieval(options.retrieval, weights)
     relocalizer = weights.chosen_relocalizer(config)
     identity = RunIdentity(
@@ -83,36 +90,46 @@ def reconstruct_folder(
     )
     seconds: dict[str, float] = {}
     with open_folder(out, identity.to_json()) as folder:
+        job = Job(
+            store=folder,
+            weights=weights,
+            config=config,
+            engine=chosen_engine(options.engine),
+            execution=options.execution,
+            seed=options.seed,
+            progress=options.progress,
+        )
         skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
-        if plan.retrieval:
+        if selection.retrieval:
             with _timed(seconds, "retrieval"):
                 tried = [image for image in usable if image.name not in skipped]
-                found, lost = _retrieve(folder, weights, tried, plan.retrieval, options)
+                found, lost = _retrieve(job, tried, options.retrieval, selection.retrieval)
                 pairs, skipped = sorted({*pairs, *found}), skipped | lost
         by_name = {image.name: image for image in usable if image.name not in skipped}
-        pairs = [pair for pair in pairs if pair[0] in by_name and pair[1] in by_name]
+        pairs = pairs_without(pairs, skipped)
         with _timed(seconds, "extraction"):
             results = {p: r.counts for p in pairs if (r := folder.load_matches(p)) is not None}
             missing = [pair for pair in pairs if pair not in results]
             if results:
                 logger.info("%d of %d pairs have been matched before", len(results), len(pairs))
-            skipped |= extract_missing(folder, weights, by_name, missing, config, options)
-            missing = [pair for pair in missing if not skipped.keys() & set(pair)]
+            skipped |= job.extract_missing(images_of(missing, by_name))
+            missing = pairs_without(missing, skipped)
             good = [image for image in usable if image.name not in skipped]
             _check_enough(images, good, skipped)
         with _timed(seconds, "matching"):
-            for result in match_missing(folder, weights, by_name, missing, config, options):
+            for result in job.match_missing(by_name, missing):
                 results[result.pair] = result.counts
-        chosen = sorted(_choose(results, options.best_pairs))
+        chosen = sorted(_verified_pairs(results, options.best_pairs))
         ours = SavedMatches(folder, chosen)
-        handed_on = JoinedMatches(ours, given, {image.name for image in good})
+        handed_on = JoinedMatches(ours, external, {image.name for image in good})
         matches_key = digest(
             [[*pair, folder.match_key(pair)] for pair in chosen],
-            given.about and given.about["sha256"],
+            external.about and external.about["sha256"],
         )
-        kept = StageCache(folder, matches_key)
-        with folder.publish() as fresh:
-            made = _map(fresh, good, handed_on, intrinsics, kept, config, options, seconds)
+        stages = StageCache(folder, matches_key)
+        with folder.publish() as target:
+            made, took = _map(target, good, handed_on, intrinsics, stages, config, options)
+            seconds |= took
             report = run_report(
                 StageResults(
                     folder=images,
@@ -121,7 +138,7 @@ def reconstruct_folder(
                     skipped=skipped,
                     results=results,
                     handed_on=handed_on,
-                    external=given,
+                    external=external,
                     reconstructed=made,
                     weights=from_json(UsedWeights, weights.described(config)),
                     seconds=seconds,
@@ -131,26 +148,26 @@ def reconstruct_folder(
             )
             if reference is not None and made.models:
                 report = evaluated(report, model_poses(made.models[0]), reference)
-            write_report(fresh, report)
+            write_report(target, report)
         if not options.keep_features:
             folder.drop_features()
-        # While the folder is ours: another run there would replace what the page shows.
+        # The page is written before the lock is released: another run there would replace the files
+        # that it shows.
         page_after_run(out if made.models or not (out / "sparse").exists() else out / "failed")
         return report
 
 
 def _map(
-    fresh: Path,
+    target: Path,
     images: list[ImageFile],
     matches: Mapping[Pair, PairResult],
     intrinsics: Intrinsics | None,
-    kept: StageCache,
+    stages: StageCache,
     config: Config,
     options: RunOptions,
-    seconds: dict[str, float],
-) -> Reconstructed:
-    """Database and models, written into `fresh`."""
-    start = time.monotonic()
+) -> tuple[Reconstructed, dict[str, float]]:
+    """Write the database and the models into `target`; returns also the seconds of each stage."""
+    start, seconds = time.monotonic(), {}
     passes = config.refinement.passes if config.refinement else 0
     quiet = not options.progress
     with (
@@ -171,7 +188,7 @@ def _map(
         made = reconstruct(
             images,
             matches,
-            fresh / "database.db",
+            target / "database.db",
             config=config,
             intrinsics=intrinsics,
             options=MapOptions(
@@ -180,19 +197,18 @@ def _map(
                 seed=options.seed,
                 threads=options.threads,
             ),
-            kept=kept,
+            kept=stages,
             on_image=on_image,
             on_mapped=on_mapped,
             on_pass=on_pass,
         )
         if made.models:
-            bar.update(
-                made.models[0].num_reg_images() - bar.n
-            )  # the global mapper tells at the end
+            # The global mapper does not report images before it ends.
+            bar.update(made.models[0].num_reg_images() - bar.n)
     if passes:
         seconds["refinement"] = time.monotonic() - start - seconds["mapping"]
-    write_models(made.models, fresh / "sparse")
-    return made
+    write_models(made.models, target / "sparse")
+    return made, seconds
 
 
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:
@@ -209,26 +225,31 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def _retrieve(
-    folder: WorkFolder, weights: Weights, images: list[ImageFile], k: int, options: RunOptions
+    job: Job, images: list[ImageFile], kind: Retrieval, k: int
 ) -> tuple[list[Pair], dict[str, str]]:
-    """Each image with its k most similar ones; why some cannot be described."""
-    total, quiet = len(images), not options.progress
+    """Pairs of each image with its k most similar ones; for images without descriptor the reason.
+
+    Args:
+      kind: how images are described.
+    """
+    total, quiet = len(images), not job.progress
     with tqdm(total=total, desc="retrieval", unit="image", disable=quiet) as bar:
-        found = described(
-            weights,
+        found = describe_photos(
+            job.weights,
             images,
-            kind=options.retrieval,
-            store=folder,
-            execution=options.execution,
+            kind=kind,
+            store=job.store,
+            execution=job.execution,
             on_image=bar.update,
         )
     for image, error in found.lost:
-        folder.record_failure(image, error)
+        job.store.record_failure(image, error)
     lost = {image.name: str(error) for image, error in found.lost}
     return nearest_pairs(found.vectors, k), lost
 
 
-def _choose(results: dict[Pair, PairCounts], n: int | None) -> set[Pair]:
+def _verified_pairs(results: dict[Pair, PairCounts], n: int | None) -> set[Pair]:
+    """The pairs with inliers; with `n`, only the best `n` pairs of each image."""
     counts = {pair: result.num_inliers for pair, result in results.items()}
     if n is None:
         return {pair for pair, count in counts.items() if count}

@@ -1,62 +1,57 @@
-"""What a run does beyond matching, and what it refuses before the work."""
+"""The options of runs as Python callers give them, and the checks that come before the work."""
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
 
-from jaxsfm.colmap.mapper import Mapper
 from jaxsfm.errors import UserError
-from jaxsfm.io.pair_selection import Retrieval
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.execution import Execution
-from jaxsfm.options import LOCAL, USUAL_WEIGHTS, EngineChoice, WeightsChoice
+from jaxsfm.options import (
+    LOCAL,
+    USUAL_WEIGHTS,
+    EngineChoice,
+    NewPhotosChoice,
+    ReconstructionChoice,
+    WeightsChoice,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """What to do, beyond the matching `Config`."""
+class RunOptions(ReconstructionChoice):
+    """What a reconstruction does, beyond its `Config`."""
 
-    pairs: str = "exhaustive"
-    """`exhaustive`, a file with two image names a line, `sequential:K`, `retrieval:K`, or several
-    joined by `+` (`jaxsfm.io.pair_selection`)."""
-    retrieval: Retrieval = "vlad"
-    """How photos are described for `retrieval:K`."""
-    best_pairs: int | None = None
-    """Hand on only each image's N pairs with the most inliers (a union); None: all."""
-    intrinsics: str | None = None
-    """K.txt or MODEL:p1,p2,..; None: one camera per photo."""
-    refine_intrinsics: Literal["auto", "yes", "no"] = "auto"
-    """`auto` refines them unless they are given."""
-    mapper: Mapper = "incremental"
-    seed: int = 0
-    threads: int = -1
     network: WeightsChoice = USUAL_WEIGHTS
-    """The files of its parameters."""
-    reference: Path | None = None
-    """Reference poses to evaluate the model against."""
-    with_database: Path | None = None
-    """A COLMAP database of the same photos, whose matches are mapped beside ours."""
-    with_hloc: tuple[Path, Path] | None = None
-    """hloc's features and matches, likewise."""
+    """The files of the network's parameters."""
     execution: Execution = dataclasses.field(default_factory=Execution)
-    """Devices, batches, memory."""
+    """Devices, batches and memory."""
     engine: EngineChoice = LOCAL
     """This process, or workers on Ray."""
-    keep_features: bool = False
-    """Leave them in the folder, for `localize` and `extend` (25 MB for 1536 x 1024)."""
     progress: bool = False
-    """Progress bars on standard error."""
+    """Whether progress bars are shown on standard error."""
 
-    @property
-    def refines(self) -> bool:
-        """Whether mapping refines intrinsics."""
-        if self.refine_intrinsics == "auto":
-            return self.intrinsics is None
-        return self.refine_intrinsics == "yes"
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocalizeOptions(NewPhotosChoice):
+    """What `localize` and `extend` do, beyond what the finished run fixes."""
+
+    reference: Path | None = None
+    """Reference poses of the new photos and of the run's photos."""
+    network: WeightsChoice = USUAL_WEIGHTS
+    """The files of the network's parameters; they must be those of the run."""
+    execution: Execution = dataclasses.field(default_factory=Execution)
+    """Devices, batches and memory."""
+    engine: EngineChoice = LOCAL
+    """This process, or workers on Ray."""
+    progress: bool = False
+    """Whether progress bars are shown on standard error."""
 
 
 def check_options(options: RunOptions) -> None:
-    """Raises UserError for what COLMAP or the engine would not take, before the work."""
+    """Check, before the work, the options that COLMAP or the engine would refuse.
+
+    Raises:
+      UserError: an option that cannot be used.
+    """
     if options.best_pairs is not None and options.best_pairs < 1:
         raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
     check_seed(options.seed)
@@ -65,12 +60,20 @@ def check_options(options: RunOptions) -> None:
 
 
 def check_seed(seed: int) -> None:
-    """Raises UserError unless COLMAP takes it."""
+    """Check that COLMAP takes a seed.
+
+    Raises:
+      UserError: it does not.
+    """
     if not 0 <= seed < 2**31:
         raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
 
 
 def check_threads(threads: int) -> None:
-    """Raises UserError unless COLMAP takes it."""
+    """Check that COLMAP takes a number of threads.
+
+    Raises:
+      UserError: it does not.
+    """
     if threads == 0 or threads < -1:
         raise UserError(f"--threads must be positive, or -1 for all; got {threads}")

@@ -1,5 +1,6 @@
 """Every option has an effect; bad input gets one sentence and no traceback."""
 
+import dataclasses
 import importlib.metadata
 import json
 import re
@@ -11,6 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from jaxsfm import options
+from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.main import BENCHMARKS, COMMANDS, main
 
 SIZE = (320, 240)
@@ -465,7 +468,7 @@ def test_running_out_of_memory_is_one_sentence(scene, tmp_path, monkeypatch, cap
     def exhausted(*args, **kwargs):
         raise RuntimeError("RESOURCE_EXHAUSTED: out of memory allocating 1 TB")
 
-    monkeypatch.setattr("jaxsfm.matching.engines.LocalEngine.matched", exhausted)
+    monkeypatch.setattr("jaxsfm.matching.engines.LocalEngine.match_pairs", exhausted)
     args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
     assert main(args) == 1
     error = capsys.readouterr().err
@@ -533,7 +536,7 @@ def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatc
     (folder / "bad.png").write_bytes(data[: len(data) // 2])
     run(scene, tmp_path / "out", images=folder)
     monkeypatch.setattr(
-        "jaxsfm.matching.engines.LocalEngine.extracted", None
+        "jaxsfm.matching.engines.LocalEngine.extract_images", None
     )  # calling it would fail
     report = run(scene, tmp_path / "out", images=folder)
     assert list(report["images"]["skipped"]) == ["bad.png"]
@@ -572,8 +575,26 @@ def test_the_version_and_a_completion_script_are_printed(capsys):
 def test_no_description_of_an_option_is_broken_where_the_source_wraps():
     for command in (*COMMANDS.values(), *BENCHMARKS.values()):
         arguments = (command.__doc__ or "").partition("Args:")[2]
-        assert not re.search(r"\n {8}", arguments), command.__name__
-    assert "Longer side of the working images, pixels.\n" in (COMMANDS["reconstruct"].__doc__ or "")
+        assert not re.search(r"\n {4}", arguments), command.__name__
+    choices = filter(dataclasses.is_dataclass, vars(options).values())
+    for choice in (MatchingChoice, ModelChoice, *choices):
+        attributes = (choice.__doc__ or "").partition("Attributes:")[2]
+        assert attributes and not re.search(r"\n {4}", attributes), choice.__name__
+    assert "Folder with the photos; sub-folders are included.\n" in COMMANDS["reconstruct"].__doc__
+    assert "Longer side of the working images, pixels.\n" in MatchingChoice.__doc__
+
+
+def test_every_option_has_a_description(capsys, monkeypatch):
+    """Of the commands that read their options from classes."""
+    monkeypatch.setenv("COLUMNS", "100")
+    for command in ("reconstruct", "match", "pairs", "localize", "extend"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        _, *options = re.split(r"\n\W{1,3}(?=--[a-z])", capsys.readouterr().out)
+        assert len(options) >= 6
+        for text in options:
+            words = " ".join(re.sub("[│╰─╯]", " ", text).split())
+            assert re.search(r" [A-Za-z].* .* .* \((default:|required)", words), text
 
 
 # -- matches that somebody else made ------------------------------------------------------------

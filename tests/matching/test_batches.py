@@ -24,9 +24,9 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.features import feature_capacity
 from jaxsfm.io.images import ImageError, read_image
 from jaxsfm.matching import execution
-from jaxsfm.matching.device_cache import Resident, by_tiles
+from jaxsfm.matching.device_cache import ImageCache, tile_order
 from jaxsfm.matching.execution import Execution
-from jaxsfm.matching.extraction import extracted, image_features
+from jaxsfm.matching.extraction import extract_images, image_features
 from jaxsfm.matching.pair_matching import match_features
 
 FIELDS = ("cells", "keypoints0", "keypoints1", "plane", "homographies", "num_tentative")
@@ -153,7 +153,7 @@ def test_a_photo_that_went_away_is_told_and_the_others_are_there(weights, images
     some = [images[0], gone, *images[2:]]
     for at_once in (1, 4):
         found = dict(
-            extracted(
+            extract_images(
                 weights,
                 some,
                 config=preset("paper"),
@@ -170,16 +170,16 @@ def test_a_photo_that_went_away_is_told_and_the_others_are_there(weights, images
 def test_tiles_keep_every_pair_once_and_images_at_hand(count, side, random):
     pairs = list(itertools.combinations(range(count), 2))
     random.shuffle(pairs)
-    ordered = by_tiles(pairs, side)
+    ordered = tile_order(pairs, side)
     assert sorted(ordered) == sorted(pairs)
 
     loads = []
     most = 2 * side
-    resident = Resident(lambda name: loads.append(name) or name, ordered, most)
+    cache = ImageCache(lambda name: loads.append(name) or name, ordered, most)
     for a, b in ordered:
-        assert (resident.take(a), resident.take(b)) == (a, b)
-        assert len(resident) <= most
-    assert len(resident) == 0
+        assert (cache.take(a), cache.take(b)) == (a, b)
+        assert len(cache) <= most
+    assert len(cache) == 0
     blocks = -(-count // side)
     # A tile needs both its blocks; the first of them is still there from the tile before.
     assert len(loads) <= side * (blocks * (blocks + 1) // 2 + blocks)
@@ -190,19 +190,19 @@ def test_tiles_keep_every_pair_once_and_images_at_hand(count, side, random):
 def test_along_a_street_every_image_is_loaded_once_whatever_the_names():
     names = np.random.default_rng(0).permutation(400).tolist()
     near = [(names[k], names[k + d]) for k in range(400) for d in range(1, 8) if k + d < 400]
-    ordered = by_tiles(sorted(tuple(sorted(pair)) for pair in near), 8)
+    ordered = tile_order(sorted(tuple(sorted(pair)) for pair in near), 8)
     loads = []
-    resident = Resident(lambda name: loads.append(name) or name, ordered, 16)
+    cache = ImageCache(lambda name: loads.append(name) or name, ordered, 16)
     for a, b in ordered:
-        resident.take(a)
-        resident.take(b)
+        cache.take(a)
+        cache.take(b)
     assert len(loads) <= 1.1 * 400
 
 
 def test_a_hosts_memory_does_not_grow_with_the_number_of_small_images():
     config = preset("default")
-    assert execution.resident_images(Execution(), MESH, 512, config=config) <= 32
-    large = execution.resident_images(Execution(), MESH, 8192, config=config)
+    assert execution.cached_images(Execution(), MESH, 512, config=config) <= 32
+    large = execution.cached_images(Execution(), MESH, 8192, config=config)
     assert 2 <= large <= 16
 
 
@@ -214,7 +214,7 @@ def test_memory_is_what_the_formula_says(features):
     assert execution.joined_bytes(one.capacity.num_coarse, octaves=4) == size
     for budget, most in ((10.5 * size, 10), (size, 2)):
         chosen = Execution(memory_gb=budget / 1e9)
-        found = execution.resident_images(chosen, MESH, one.capacity.num_coarse, config=config)
+        found = execution.cached_images(chosen, MESH, one.capacity.num_coarse, config=config)
         assert found == most
 
 
@@ -236,7 +236,7 @@ def test_an_accelerator_takes_what_fits(monkeypatch, memory):
     pixels, cells = 1600 * 1200, 8192
     images = execution.images_at_once(Execution(), MESH, pixels, 999)
     pairs = execution.pairs_at_once(Execution(), MESH, cells, 999, config=config)
-    kept = execution.resident_images(Execution(), MESH, cells, config=config)
+    kept = execution.cached_images(Execution(), MESH, cells, config=config)
     joined = execution.joined_bytes(cells, octaves=4)
     assert images == 1 or images * execution.ACCELERATOR_BYTES_PER_PIXEL * pixels <= memory / 2
     batch = pairs * (2 * joined + execution.PAIR_BYTES_PER_CELL * cells)
@@ -262,7 +262,7 @@ def test_the_next_batch_is_loaded_while_one_runs():
         log.append(f"finish {k}")
         yield k
 
-    assert list(execution.one_ahead(batches(), start, finish)) == [0, 1, 2]
+    assert list(execution.overlap_batches(batches(), start, finish)) == [0, 1, 2]
     expected = "load 0, start 0, load 1, start 1, finish 0, load 2, start 2, finish 1, finish 2"
     assert ", ".join(log) == expected
 
@@ -279,4 +279,4 @@ def test_executions_refuse_what_makes_no_sense():
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Execution(**wrong)
     with pytest.raises(UserError, match="--devices 99: there are"):
-        execution.chosen_devices(Execution(devices=99))
+        execution.select_devices(Execution(devices=99))

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 import pytest
 
 from jaxsfm.errors import UserError
-from jaxsfm.matching.ray.cluster import connected, share
+from jaxsfm.matching.ray.cluster import connect, share_cpus
 
 # Not importorskip: it would import Ray before we have told it to be quiet.
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
@@ -13,14 +13,14 @@ pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not ins
 
 def test_an_address_where_nothing_answers_is_told_at_once():
     for address, why in (("127.0.0.1:1", "nothing answers"), ("ray://h:1", "must be HOST:PORT")):
-        with pytest.raises(UserError, match=why), connected(address):
+        with pytest.raises(UserError, match=why), connect(address):
             pass
 
 
 def test_cpus_are_shared_among_workers():
-    assert share([8], None, 8) == (1, 8)
-    assert share([8, 16], None, 8) == (3, 8)
-    assert share([4, 16], None, 8) == (5, 4)
-    assert share([8, 8], 3, 8) == (3, 4)
+    assert share_cpus([8], None, 8) == (1, 8)
+    assert share_cpus([8, 16], None, 8) == (3, 8)
+    assert share_cpus([4, 16], None, 8) == (5, 4)
+    assert share_cpus([8, 8], 3, 8) == (3, 4)
     with pytest.raises(UserError, match="--workers 3"):
-        share([1, 1], 3, 8)
+        share_cpus([1, 1], 3, 8)

@@ -22,8 +22,8 @@ from jaxsfm.cli.main import main
 from jaxsfm.io.pairs import exhaustive_pairs
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.matching.ray import engine
-from jaxsfm.matching.ray.engine import HELD_IMAGES, TILE, RayEngine, cut_pairs
-from jaxsfm.matching.ray.workers import AHEAD
+from jaxsfm.matching.ray.engine import CACHED_IMAGES, TILE, RayEngine, pair_blocks
+from jaxsfm.matching.ray.workers import TASKS_PER_WORKER
 
 # Not importorskip: it would import Ray before we have told it to be quiet.
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
@@ -88,7 +88,7 @@ def test_a_killed_worker_and_a_damaged_photo_change_nothing(scene, tmp_path, mon
 )
 def test_blocks_are_the_pairs_cut_small(numbers, size):
     pairs = [(str(a), str(b)) for a, b in numbers]
-    blocks = cut_pairs(pairs, size)
+    blocks = pair_blocks(pairs, size)
     assert sorted(itertools.chain(*blocks)) == sorted(pairs)
     for block in blocks:
         assert 1 <= len(block) <= size
@@ -99,7 +99,7 @@ class Held:
     """What stands for an image's features, or for a reference to them."""
 
 
-class OtherCrew:
+class OtherPool:
     """Two workers in this process that end their pieces in another order than they got them."""
 
     def __init__(self) -> None:
@@ -117,7 +117,7 @@ class OtherCrew:
     def results(self, pieces):
         todo, given = iter(pieces), deque()
         while True:
-            given.extend(itertools.islice(todo, AHEAD * len(self) - len(given)))
+            given.extend(itertools.islice(todo, TASKS_PER_WORKER * len(self) - len(given)))
             if not given:
                 return
             given.rotate(1)
@@ -127,8 +127,8 @@ class OtherCrew:
 
 @pytest.mark.parametrize("images", [20, 100, 200])
 def test_features_held_do_not_grow_with_the_pairs(images, monkeypatch):
-    crew = OtherCrew()
-    monkeypatch.setattr(engine, "crew", lambda *_, **__: contextlib.nullcontext(crew))
+    pool = OtherPool()
+    monkeypatch.setattr(engine, "worker_pool", lambda *_, **__: contextlib.nullcontext(pool))
     pairs = exhaustive_pairs(f"{k:03}" for k in range(images))
     loads = []
 
@@ -136,8 +136,8 @@ def test_features_held_do_not_grow_with_the_pairs(images, monkeypatch):
         loads.append(name)
         return Held()
 
-    found = RayEngine().matched(load, {}, pairs, config=preset("default"))
+    found = RayEngine().match_pairs(load, {}, pairs, config=preset("default"))
     assert sorted(found) == pairs
     # Of the pieces at the workers, of the next one, and those kept for pieces to come.
-    assert crew.most <= (AHEAD * len(crew) + 1) * 2 * TILE + HELD_IMAGES
+    assert pool.most <= (TASKS_PER_WORKER * len(pool) + 1) * 2 * TILE + CACHED_IMAGES
     assert len(loads) <= 2 * len(pairs) / TILE + images

@@ -15,8 +15,8 @@ from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.matching.ray import workers
-from jaxsfm.matching.ray.cluster import connected, threads
-from jaxsfm.matching.ray.workers import AHEAD, LOSSES, Piece, crew
+from jaxsfm.matching.ray.cluster import connect, xla_threads
+from jaxsfm.matching.ray.workers import MAX_LOSSES, TASKS_PER_WORKER, Task, worker_pool
 
 # Not importorskip: it would import Ray before we have told it to be quiet.
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
@@ -26,7 +26,7 @@ WORKERS = 2
 @pytest.fixture(scope="module")
 def cluster() -> Iterator:
     """Ray on this machine, for all tests here."""
-    with connected("local") as ray:
+    with connect("local") as ray:
         ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
         yield ray
 
@@ -71,13 +71,13 @@ def threads_there(items, objects):
         yield item, os.environ["NPROC"]
 
 
-def pieces(workers, count: int, size: int = 3) -> Iterator[Piece]:
+def pieces(workers, count: int, size: int = 3) -> Iterator[Task]:
     for start in range(0, count, size):
         items = range(start, min(count, start + size))
-        yield Piece(list(items), {f"of {k}": workers.put(k * k) for k in items})
+        yield Task(list(items), {f"of {k}": workers.put(k * k) for k in items})
 
 
-def noted(all_pieces: Iterator[Piece], given: list) -> Iterator[Piece]:
+def noted(all_pieces: Iterator[Task], given: list) -> Iterator[Task]:
     for piece in all_pieces:
         given.append(piece)
         yield piece
@@ -87,7 +87,7 @@ SQUARES = [(k, k * k) for k in range(40)]
 
 
 def results(work, count: int = 40, number: int = WORKERS) -> list:
-    with crew(work, address=None, workers=number) as workers:
+    with worker_pool(work, address=None, workers=number) as workers:
         return sorted(workers.results(pieces(workers, count)))
 
 
@@ -108,7 +108,7 @@ def test_a_killed_worker_is_replaced_and_every_item_still_comes_once(
 @pytest.mark.slow
 def test_workers_compute_with_as_many_threads_as_this_process(cluster, monkeypatch):
     """With one thread instead of two, features differ in their last place."""
-    assert set(results(threads_there, 3)) == {(k, str(threads())) for k in range(3)}
+    assert set(results(threads_there, 3)) == {(k, str(xla_threads())) for k in range(3)}
     monkeypatch.setenv("NPROC", "7")
     assert set(results(threads_there, 3)) == {(k, "7") for k in range(3)}
 
@@ -117,20 +117,20 @@ def test_workers_compute_with_as_many_threads_as_this_process(cluster, monkeypat
 def test_few_pieces_are_out_at_a_time(cluster):
     """However many there are: those at the workers, and none before the first worker is there."""
     come, most = [], 0
-    with crew(echo, address=None, workers=WORKERS) as workers:
+    with worker_pool(echo, address=None, workers=WORKERS) as workers:
         given = []
         for result in workers.results(noted(pieces(workers, 40, size=1), given)):
             most = max(most, len(given) - len(come))
             come.append(result)
-    assert sorted(come) == SQUARES and 2 <= most <= AHEAD * WORKERS
+    assert sorted(come) == SQUARES and 2 <= most <= TASKS_PER_WORKER * WORKERS
 
 
 @pytest.mark.slow
 def test_an_item_that_kills_its_workers_ends_the_run_with_a_sentence(cluster):
     come = []
     with (
-        pytest.raises(UserError, match=f"{LOSSES + 1} times"),
-        crew(dies, address=None, workers=WORKERS) as workers,
+        pytest.raises(UserError, match=f"{MAX_LOSSES + 1} times"),
+        worker_pool(dies, address=None, workers=WORKERS) as workers,
     ):
         come.extend(workers.results(pieces(workers, 12)))
 
@@ -145,14 +145,14 @@ def test_an_error_in_a_worker_is_the_same_error_here(cluster, error):
 @pytest.mark.slow
 def test_what_has_come_is_handed_out_before_an_interrupt(cluster):
     come, given = [], []
-    with crew(echo, address=None, workers=WORKERS) as workers:
+    with worker_pool(echo, address=None, workers=WORKERS) as workers:
         stream = workers.results(noted(pieces(workers, 40), given))
         come.append(next(stream))
         time.sleep(1)  # in which the workers do all that they have
         interrupt._pending.set()
         with pytest.raises(KeyboardInterrupt):
             come.extend(stream)
-    assert len(given) <= AHEAD * WORKERS
+    assert len(given) <= TASKS_PER_WORKER * WORKERS
     assert sorted(k for k, _ in come) == sorted(k for piece in given for k in piece.items)
 
 

@@ -18,7 +18,7 @@ from jaxsfm.io.pairs import read_pairs
 from jaxsfm.io.store import Store
 from jaxsfm.io.weight_files import EXTRAS
 from jaxsfm.matching import global_descriptors
-from jaxsfm.matching.retrieval import described, nearest_pairs
+from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
 
 KINDS = pytest.mark.parametrize("kind", ["gem", "vlad"])
 
@@ -43,7 +43,9 @@ def images(folder):
 def before(weights, images, tmp_path_factory):
     """A store with all descriptors, and them."""
     store = Store(tmp_path_factory.mktemp("store"), {"version": "1", "weights": weights.sha256})
-    return store, {k: described(weights, images, kind=k, store=store) for k in ("gem", "vlad")}
+    return store, {
+        k: describe_photos(weights, images, kind=k, store=store) for k in ("gem", "vlad")
+    }
 
 
 @pytest.fixture
@@ -57,14 +59,14 @@ def again(before, tmp_path) -> Store:
 def computed(monkeypatch) -> list[str]:
     """Names of the photos that go through the network from now on."""
     names: list[str] = []
-    real = global_descriptors.extracted
+    real = global_descriptors.extract_images
 
     def noted(weights, images, **options):
         for image, found in real(weights, images, **options):
             names.append(image.name)
             yield image, found
 
-    monkeypatch.setattr(global_descriptors, "extracted", noted)
+    monkeypatch.setattr(global_descriptors, "extract_images", noted)
     return names
 
 
@@ -89,7 +91,9 @@ def test_the_shortlist_does_not_depend_on_the_order_of_photos(weights, images, b
 
 def test_what_is_stored_is_not_computed_again(weights, images, before, again, computed):
     for kind, wanted in before[1].items():
-        assert_same(described(weights, images, kind=kind, store=again).vectors, wanted.vectors)
+        assert_same(
+            describe_photos(weights, images, kind=kind, store=again).vectors, wanted.vectors
+        )
     assert computed == []
 
 
@@ -99,7 +103,7 @@ def test_what_is_damaged_is_made_again_and_equal(weights, images, before, again,
     for what in ("gem 480", global_descriptors.CELLS, global_descriptors._vlad_kind(images)):
         path = again._file("descriptors", what, image.sha256)
         path.write_bytes(path.read_bytes()[:-30])
-    found = described(weights, images, kind=kind, store=again)
+    found = describe_photos(weights, images, kind=kind, store=again)
     assert computed == [image.name]
     assert_same(found.vectors, before[1][kind].vectors)
 
@@ -117,7 +121,7 @@ def test_local_descriptors_that_went_away_meanwhile_are_made_again(
         return real(work, good)
 
     monkeypatch.setattr(global_descriptors, "_vocabulary", late)
-    found = described(weights, images, kind="vlad", store=again)
+    found = describe_photos(weights, images, kind="vlad", store=again)
     assert len(computed) == len(images) + 1
     assert_same(found.vectors, before[1]["vlad"].vectors)
 
@@ -125,9 +129,9 @@ def test_local_descriptors_that_went_away_meanwhile_are_made_again(
 @pytest.mark.slow
 def test_a_new_photo_is_the_only_one_computed(weights, images, before, computed, tmp_path):
     store = Store(tmp_path, before[0].identity)
-    described(weights, images[:-1], kind="vlad", store=store)
+    describe_photos(weights, images[:-1], kind="vlad", store=store)
     computed.clear()
-    found = described(weights, images, kind="vlad", store=store)
+    found = describe_photos(weights, images, kind="vlad", store=store)
     assert computed == [images[-1].name]
     assert_same(found.vectors, before[1]["vlad"].vectors)
 
@@ -139,7 +143,7 @@ def test_a_photo_that_cannot_be_decoded_is_told_and_changes_nothing(
     path = tmp_path / "bad.png"
     path.write_bytes(images[0].path.read_bytes()[:2000])
     bad = jaxsfm.open_images(tmp_path)[0][0]
-    found = described(weights, [bad, *images], kind=kind, store=again)
+    found = describe_photos(weights, [bad, *images], kind=kind, store=again)
     assert [image.name for image, _ in found.lost] == ["bad.png"]
     assert_same(found.vectors, before[1][kind].vectors)
     with pytest.raises(ImageError, match=r"bad\.png"):
@@ -152,7 +156,7 @@ def test_copies_of_a_photo_are_described_once_and_nearest(
     shutil.copytree(folder, tmp_path / "more")
     shutil.copy(folder / "d.png", tmp_path / "more" / "a copy.png")
     images = jaxsfm.open_images(tmp_path / "more")[0]
-    found = described(weights, images, kind="vlad", store=again)
+    found = describe_photos(weights, images, kind="vlad", store=again)
     assert computed == []
     assert ("a copy.png", "d.png") in nearest_pairs(found.vectors, 1)
 
@@ -164,7 +168,7 @@ def test_netvlad_takes_the_head_of_its_weights(weights, images, monkeypatch, bef
     head = {name: rng.normal(size=s).astype(np.float32) / 10 for name, s in shapes.items()}
     monkeypatch.setattr("jaxsfm.matching.retrieval.check_retrieval", lambda *_: None)
     monkeypatch.setattr(global_descriptors, "read_extras", lambda _: head)
-    describe = functools.partial(described, weights, images[:2], kind="netvlad", store=again)
+    describe = functools.partial(describe_photos, weights, images[:2], kind="netvlad", store=again)
     found = describe().vectors
     assert [v.shape for v in found.values()] == [(8,), (8,)]
     monkeypatch.setattr(global_descriptors, "read_extras", None)
@@ -173,7 +177,7 @@ def test_netvlad_takes_the_head_of_its_weights(weights, images, monkeypatch, bef
 
 def test_netvlad_without_its_head_is_refused_before_the_work(weights, images, again):
     with pytest.raises(UserError, match="--retrieval netvlad: needs NetVLAD's weights"):
-        described(weights, images, kind="netvlad", store=again)
+        describe_photos(weights, images, kind="netvlad", store=again)
 
 
 @pytest.mark.slow

@@ -9,16 +9,18 @@ import numpy as np
 import pycolmap
 import pytest
 from kept_runs import change_report
-from test_localize import POSE, POSITION, SIZE, contents, write
+from test_localize import POSE, POSITION, SIZE, RecordingEngine, contents, write
 
 from jaxsfm.bench.synthetic import render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.poses import model_poses, read_model, read_poses
 from jaxsfm.io.work_folder import RESULTS, lock_folder
+from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.run_report import read_report
 from jaxsfm.runs import extend as extend_module
+from jaxsfm.runs import extended_model
 from jaxsfm.sfm.evaluation import umeyama
 
 OLD = ("view0.png", "view1_night.png", "view2.png")
@@ -52,7 +54,7 @@ def extended(plain, scene, tmp_path_factory) -> Extended:
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(extend_module, "grow", interrupted)
+        patch.setattr(extended_model, "grow", interrupted)
         assert main(["extend", str(run)]) == 130
     assert (run / "report.json").read_text() == report
     assert {n: c for n, c in contents(run).items() if "/sparse/" in n and "stages" not in n} == {
@@ -178,6 +180,16 @@ def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_
             assert model.camera(image.camera_id).params[0] == SIZE[0] + 0.5
     assert model.num_reg_images() == 5 and report["seconds"]["extension"] > 0
     assert "evaluation" not in report and "reference" in report["evaluation_failed"]
+
+
+def test_extend_asks_the_engine_that_was_chosen(copied, monkeypatch):
+    run, photos = copied
+    write(photos / "new.png", render(room(), POSE, SIZE))
+    choices, engine = [], RecordingEngine()
+    monkeypatch.setattr(extend_module, "chosen_engine", lambda c: choices.append(c) or engine)
+    assert main(["extend", str(run), "--engine", "ray", "--workers", "3"]) == 0
+    assert choices == [EngineChoice(engine="ray", workers=3)]
+    assert engine.calls == [("extract", 4), ("match", 3)]
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -18,11 +19,17 @@ from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, inspect_image
 from jaxsfm.io.store import Store
+from jaxsfm.matching.engines import LocalEngine
 from jaxsfm.matching.execution import Execution
+from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
+from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs import localize as localize_module
-from jaxsfm.runs.finished_model import by_similarity, choose_camera, known_model
-from jaxsfm.runs.localize import LocalizeOptions, localize
+from jaxsfm.runs.finished_model import camera_prior, read_working_model
+from jaxsfm.runs.localize import localize
+from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
+from jaxsfm.runs.run_options import LocalizeOptions
+from jaxsfm.runs.similar_photos import similar_photos
 
 SIZE, WIDE = (320, 240), (368, 248)
 """Of one padded size: nothing is compiled twice."""
@@ -40,6 +47,21 @@ def contents(folder: Path) -> dict[str, str]:
 def write(path: Path, rgb: np.ndarray) -> Path:
     cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
     return path
+
+
+class RecordingEngine:
+    """Computes in this process, and records how many items each call has."""
+
+    def __init__(self, *, starts_workers: bool = False) -> None:
+        self.starts_workers, self.calls = starts_workers, []
+
+    def extract_images(self, weights, images, **options):
+        self.calls.append(("extract", len(images)))
+        return LocalEngine.extract_images(weights, images, **options)
+
+    def match_pairs(self, load, capacities, pairs, **options):
+        self.calls.append(("match", len(pairs)))
+        return LocalEngine.match_pairs(load, capacities, pairs, **options)
 
 
 @pytest.fixture(scope="module")
@@ -128,25 +150,56 @@ def test_kept_features_spare_the_next_call_and_change_no_pose(
     localized, plain, photos, tmp_path, monkeypatch
 ):
     run, computed = Path(shutil.copytree(plain[0], tmp_path / "run")), []
-    extracted = localize_module.extracted
+    extract_images = LocalEngine.extract_images
 
     def counted(weights, images, **kwargs):
         computed.append(len(images))
-        return extracted(weights, images, **kwargs)
+        return extract_images(weights, images, **kwargs)
 
-    monkeypatch.setattr(localize_module, "extracted", counted)
+    monkeypatch.setattr(LocalEngine, "extract_images", staticmethod(counted))
     for keep in (True, False):  # the second call neither computes nor deletes
         options = LocalizeOptions(keep_features=keep)
         row = localize([photos / "photos" / "new.png"], run, options=options)["photos"][0]
         assert row["cam_from_world"] == localized["new.png"]["cam_from_world"]
         assert len(list(run.glob("features/*/*.npz"))) == 3
-    assert computed == [3, 0]
+    assert computed == [3, 1, 1]  # the run's photos once, the new one in each call
+
+
+def test_localize_asks_the_engine_that_was_chosen(localized, plain, photos, monkeypatch):
+    """Even one that takes all photos in one call gives every photo what it has alone."""
+    choices, engine = [], RecordingEngine(starts_workers=True)
+    monkeypatch.setattr(localize_module, "chosen_engine", lambda c: choices.append(c) or engine)
+    choice = EngineChoice(engine="ray", workers=3)
+    options = LocalizeOptions(engine=choice, reference=photos / "reference")
+    result = localize([photos / "photos"], plain[0], options=options)
+    assert choices == [choice]
+    assert engine.calls == [("extract", 3), ("extract", 4), ("match", 11)]
+    for row in result["photos"]:
+        assert row | {"photo": ""} == localized[Path(row["photo"]).name] | {"photo": ""}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
+def test_localize_on_ray_gives_what_this_process_gives(localized, plain, photos, tmp_path):
+    out, new = tmp_path / "poses.json", photos / "photos" / "new.png"
+    wide = photos / "photos" / "wide.png"
+    ray = ["--engine", "ray", "--workers", "2", "--ray-address", "local"]
+    command = ["localize", str(new), str(wide), "--model", str(plain[0]), "--out", str(out)]
+    assert main([*command, *ray]) == 0
+    for row in json.loads(out.read_text())["photos"]:
+        wanted = localized[Path(row["photo"]).name]
+        for key in wanted.keys() - {"photo", "error"}:
+            assert row[key] == wanted[key], key
 
 
 @pytest.mark.slow
 def test_the_shortlist_decides_what_a_photo_is_matched_with(plain, photos):
-    options = LocalizeOptions(shortlist=lambda image, names: [n for n in names if n == "view2.png"])
-    result = localize([photos / "photos" / "new.png"], plain[0], options=options)
+    result = localize(
+        [photos / "photos" / "new.png"],
+        plain[0],
+        options=LocalizeOptions(),
+        shortlist=lambda image, names: [n for n in names if n == "view2.png"],
+    )
     assert result["photos"][0]["shortlist"] == ["view2.png"]
     assert result["photos"][0]["status"] in ("localized", "doubtful")
 
@@ -160,7 +213,7 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
     names = ["view0.png", "view1_night.png", "view2.png"]
 
     def shortlist(k: int, names: list[str]) -> list[str]:
-        return list(by_similarity(run, weights, k, {"photo": image}, Execution())(image, names))
+        return list(similar_photos(run, weights, k, {"photo": image}, Execution())(image, names))
 
     assert shortlist(1, names) == ["view0.png"]  # it is that photo
     two = shortlist(2, names)
@@ -174,7 +227,7 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
     cut = tmp_path / "cut.png"
     cut.write_bytes((photos / "photos" / "new.png").read_bytes()[:2000])
     bad = inspect_image(cut, name="bad")
-    choose = by_similarity(run, weights, 1, {"photo": image, "bad": bad}, Execution())
+    choose = similar_photos(run, weights, 1, {"photo": image, "bad": bad}, Execution())
     assert choose(image, [*names, "bad"]) == ["view0.png"]
     with pytest.raises(ImageError):
         choose(bad, names)
@@ -194,7 +247,7 @@ def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
 
     monkeypatch.setattr(Store, "save_descriptor", refused)
     image = inspect_image(photos / "photos" / "again.png", name="photo")
-    choose = by_similarity(run, weights, 1, {"photo": image}, Execution())
+    choose = similar_photos(run, weights, 1, {"photo": image}, Execution())
     assert choose(image, ["view0.png", "view2.png"]) == ["view0.png"]
     assert not list(home.glob("descriptors/*/*"))
 
@@ -210,7 +263,7 @@ def test_features_that_cannot_be_kept_are_one_sentence(plain, photos, tmp_path, 
 
 
 def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, photos):
-    model = known_model(plain[0] / "sparse" / "0", preset("default"))
+    model = read_working_model(plain[0] / "sparse" / "0", preset("default"))
     new = inspect_image(photos / "photos" / "new.png", name="photo")
     odd_one, wide = (
         pycolmap.Camera(
@@ -223,13 +276,13 @@ def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, phot
 
     def chosen(*more):
         views = [*model.views, *(dataclasses.replace(first, camera=camera) for camera in more)]
-        found = choose_camera(new, views, None)
+        found = camera_prior(new, views, None)
         return found.source, found.camera.camera_id
 
     shared = first.camera.camera_id
     assert chosen() == chosen(odd_one) == chosen(odd_one, wide, wide) == ("run", shared)
     assert chosen(odd_one, odd_one)[0] == "guess"  # nobody can tell which
-    assert choose_camera(new, model.views[:1], None).source == "guess"  # nobody else's
+    assert camera_prior(new, model.views[:1], None).source == "guess"  # nobody else's
 
 
 @pytest.mark.slow
@@ -263,8 +316,9 @@ def test_the_command_writes_poses_and_tells_them(plain, photos, tmp_path, capsys
 
 
 def test_nothing_localized_ends_with_1(localized, plain, photos, capsys, monkeypatch):
-    rows = [localized["elsewhere.png"]]
-    monkeypatch.setattr(localize_module, "localize", lambda *args, **kwargs: {"photos": rows})
+    rows = [from_json(LocalizedPhoto, localized["elsewhere.png"])]
+    result = LocalizationReport(version="1", model=str(plain[0]), photos=rows)
+    monkeypatch.setattr(localize_module, "localize_photos", lambda *args, **kwargs: result)
     lost = photos / "photos" / "elsewhere.png"
     assert main(["localize", str(lost), "--model", str(plain[0])]) == 1
     captured = capsys.readouterr()

@@ -34,7 +34,7 @@ from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.typed_json import to_json
-from jaxsfm.runs.finished_model import choose_camera, known_model
+from jaxsfm.runs.finished_model import camera_prior, read_working_model
 from jaxsfm.runs.localize import locate_photo
 from jaxsfm.runs.localize_report import error_against, localized_photo
 from jaxsfm.sfm.refine.passes import refine_model
@@ -113,8 +113,8 @@ def without(
 def localized(run: FinishedRun, name: str, files: dict[str, ImageFile], folder: Path) -> Row:
     """Localize an image in the model without it; returns its row of the table."""
     seed = run.report.options.seed
-    model, image = known_model(folder / "sparse" / "0", run.config, seed=seed), files[name]
-    chosen = choose_camera(image, model.views, None)
+    model, image = read_working_model(folder / "sparse" / "0", run.config, seed=seed), files[name]
+    chosen = camera_prior(image, model.views, None)
     names = [view.name for view in model.views]
     pairs = [row.pair for row in run.report.pairs.each if name in row.pair]
     pairs = [pair for pair in pairs if set(pair) - {name} <= set(names)]

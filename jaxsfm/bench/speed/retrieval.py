@@ -36,12 +36,12 @@ from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
 from jaxsfm.core.vocabulary import fit_vocabulary
 from jaxsfm.io.features import padded_size
 from jaxsfm.io.images import ImageFile, read_image
-from jaxsfm.io.pair_selection import Retrieval
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights, load_weights
 from jaxsfm.matching.global_descriptors import SAMPLE
-from jaxsfm.matching.retrieval import described, nearest_pairs
+from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
+from jaxsfm.options import Retrieval
 
 SETS = {
     "castle-P19": (4, 6, 8),
@@ -132,7 +132,7 @@ def as_in_runs(weights: Weights, images: list[ImageFile], kind: Retrieval) -> Lo
     identity = {"version": "", "weights": weights.sha256}
     with tempfile.TemporaryDirectory() as scratch:
         store = Store(Path(scratch), identity)
-        return described(weights, images, kind=kind, store=store).vectors
+        return describe_photos(weights, images, kind=kind, store=store).vectors
 
 
 def by_gem(local: Local, power: float) -> dict[str, np.ndarray]:

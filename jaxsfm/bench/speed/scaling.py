@@ -20,7 +20,7 @@ from jaxsfm.config import Config, preset
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.weights import load_weights
 from jaxsfm.matching.extraction import image_features
-from jaxsfm.matching.pair_matching import matched
+from jaxsfm.matching.pair_matching import match_pairs
 
 SMALL = 384
 """Longer side, pixels. It is small so that a thousand pairs take a minute."""
@@ -55,7 +55,7 @@ def measure_pairs(data: Path) -> Iterator[Metric]:
     def per_pair(some: list[str]) -> float:
         pairs = list(itertools.combinations(some, 2))
         start = time.perf_counter()
-        for _ in matched(features.__getitem__, capacities, pairs, config=config):
+        for _ in match_pairs(features.__getitem__, capacities, pairs, config=config):
             pass
         return (time.perf_counter() - start) / len(pairs)
 
@@ -103,7 +103,7 @@ weights = jaxsfm.load_weights()
 times = []
 for _ in range(3):
     start = time.time()
-    list(extracted(weights, images[:1], config=jaxsfm.preset("default")))
+    image_features(weights, images[0], config=jaxsfm.preset("default"))
     times.append((start, time.time()))
 print(json.dumps(times))
 """

@@ -1,4 +1,4 @@
-"""A Ray cluster: the one that is there, or one of this process; what a worker takes of it."""
+"""The Ray cluster that is used, how many workers it runs, and what each worker takes of it."""
 
 import contextlib
 import logging
@@ -13,22 +13,22 @@ from jaxsfm.errors import UserError
 if TYPE_CHECKING:
     from types import ModuleType
 
-QUIET = {
+ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_DEDUP_LOGS_SKIP_REGEX": ".",
 }
-"""Ray's reports to its makers, its advice to developers, and what it would print between the
-progress bars when a worker dies (we say so ourselves). To be set before it is imported."""
+"""Set before Ray is imported. Ray then sends no usage reports, gives no advice to developers, and
+does not print between the progress bars when a worker dies (`WorkerPool` reports that itself)."""
 
 
-def imported_ray() -> "ModuleType":
-    """Ray, `QUIET`.
+def import_ray() -> "ModuleType":
+    """Import Ray with `ENVIRONMENT`.
 
     Raises:
-      UserError: it is not installed.
+      UserError: Ray is not installed.
     """
-    for name, value in QUIET.items():
+    for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
         import ray
@@ -38,14 +38,17 @@ def imported_ray() -> "ModuleType":
 
 
 @contextlib.contextmanager
-def connected(address: str | None) -> Iterator["ModuleType"]:
-    """Ray, connected: to what this process is connected to already, to `address`, to a cluster
-    that runs here (RAY_ADDRESS tells another), or to one that lives as long as the block.
+def connect(address: str | None) -> Iterator["ModuleType"]:
+    """Connect to a Ray cluster for the block; yields the module `ray`.
+
+    If this process is connected already, that connection is used. Else it is the cluster at
+    `address`, or at RAY_ADDRESS, or the one that runs on this machine, or a new one that lives as
+    long as the block.
 
     Raises:
       UserError: Ray is not installed, or there is no cluster at the address.
     """
-    ray = imported_ray()
+    ray = import_ray()
     if ray.is_initialized():
         yield ray
         return
@@ -53,9 +56,10 @@ def connected(address: str | None) -> Iterator["ModuleType"]:
     _check_answers(address)
     try:
         with warnings.catch_warnings():
-            # JAX fears forks of its threads; these only become Ray's programs.
+            # JAX warns of forks in a process with threads; these only start Ray's programs.
             warnings.filterwarnings("ignore", r"os\.fork", RuntimeWarning)
-            # Without an address: what `ray start` left on this machine, else a cluster of its own.
+            # Without an address Ray takes the cluster that `ray start` left on this machine, or
+            # starts one.
             ray.init(address=address, logging_level=logging.CRITICAL, log_to_driver=False)
     except (ConnectionError, RuntimeError, ValueError) as error:
         why = str(error).strip().partition("\n")[0]
@@ -70,7 +74,11 @@ def connected(address: str | None) -> Iterator["ModuleType"]:
 
 
 def _check_answers(address: str | None) -> None:
-    """Ray itself would try for minutes, and print about it."""
+    """Check that something listens at an address. Ray itself would try for minutes, and print.
+
+    Raises:
+      UserError: nothing does, or it is no address.
+    """
     if address in (None, "auto", "local"):
         return
     host, _, port = address.rpartition(":")
@@ -84,21 +92,25 @@ def _check_answers(address: str | None) -> None:
         raise UserError(f"--ray-address {address}: nothing answers there ({error})") from error
 
 
-def threads() -> int:
-    """Of XLA in this process. Sums are split among them: a worker with another number would round
-    differently (on CPUs; one thread and two differ in the last place of features, measured)."""
+def xla_threads() -> int:
+    """The number of threads that XLA has in this process.
+
+    Workers get the same number. XLA splits sums among its threads on CPUs, so with another number
+    they would round differently: one thread and two differ in the last place of features.
+    """
     given = os.environ.get("NPROC", "")
     if given.isdecimal():
         return int(given)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def share(cpus: Sequence[int], workers: int | None, usual: int) -> tuple[int, int]:
-    """How many workers, and how many CPUs Ray is asked for each.
+def share_cpus(cpus: Sequence[int], workers: int | None, usual: int) -> tuple[int, int]:
+    """How many workers there are, and how many CPUs Ray reserves for each.
 
     Args:
-      cpus: of each machine.
-      workers: as asked for; None: one for every `usual` CPUs of a machine, at least one.
+      cpus: the number of CPUs of each machine.
+      workers: the number that was asked for; None: one for every `usual` CPUs of a machine, and at
+        least one for each machine.
 
     Raises:
       UserError: there are fewer CPUs than workers.
@@ -112,11 +124,16 @@ def share(cpus: Sequence[int], workers: int | None, usual: int) -> tuple[int, in
     raise UserError(f"--workers {workers}: there are {sum(cpus)} CPUs")
 
 
-def wanted(ray: "ModuleType", workers: int | None) -> tuple[int, dict[str, int]]:
-    """How many workers, and what Ray is asked for each: a GPU where the cluster has any, else CPUs.
+def worker_resources(ray: "ModuleType", workers: int | None) -> tuple[int, dict[str, int]]:
+    """How many workers there are, and what Ray reserves for each (options of `ray.remote`).
+
+    Each worker gets a GPU if the cluster has any, and CPUs otherwise.
+
+    Args:
+      workers: the number that was asked for; None: as many as there is room for.
 
     Raises:
-      UserError: there are not so many.
+      UserError: there are too few GPUs or CPUs.
     """
     machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if gpus := int(sum(machine.get("GPU", 0) for machine in machines)):
@@ -126,5 +143,5 @@ def wanted(ray: "ModuleType", workers: int | None) -> tuple[int, dict[str, int]]
     cpus = [n for machine in machines if (n := int(machine.get("CPU", 0)))]
     if not cpus:
         raise UserError("--engine ray: the cluster has no CPUs for workers")
-    count, each = share(cpus, workers, threads())
+    count, each = share_cpus(cpus, workers, xla_threads())
     return count, {"num_cpus": each}

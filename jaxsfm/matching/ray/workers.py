@@ -1,8 +1,7 @@
-"""Workers on Ray: found or started, given work piece by piece, replaced when they are lost.
+"""A pool of workers on Ray: it hands out tasks, takes results, and replaces lost workers.
 
-Nothing here knows of images or pairs. This process hands out pieces and takes results; a worker
-keeps what all its pieces need (weights on its device, compiled programs). The module is loaded in
-the workers before JAX is, and must not import it.
+Nothing here knows of images or pairs. A worker keeps what all its tasks need (weights on its
+device, compiled programs). Workers load this module before JAX, so it must not import JAX.
 """
 
 import contextlib
@@ -10,36 +9,54 @@ import itertools
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Generic, NamedTuple, Protocol, TypeVar
 
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.compiled_programs import keep_compiled
 from jaxsfm.io.versions import package_versions
-from jaxsfm.matching.ray.cluster import connected, threads, wanted
+from jaxsfm.matching.ray.cluster import connect, worker_resources, xla_threads
 
 if TYPE_CHECKING:
     from types import ModuleType
 
-AHEAD = 2
-"""Pieces that a worker has at most: one to do and the next, so that it need not wait."""
-LOSSES = 3
+TASKS_PER_WORKER = 2
+"""Tasks that a worker has at most: one to do and the next one, so that it need not wait."""
+MAX_LOSSES = 3
 """So many workers may be lost one after the other without a result, or with the same item."""
-PATIENCE = 60
+WARN_AFTER_S = 60
 """Seconds without a result after which a run without any worker says what it waits for."""
 logger = logging.getLogger("jaxsfm")
 
-Work = Callable[[Sequence[Any], Mapping[str, Any]], Iterator[tuple[Any, Any]]]
-"""What workers do: from a piece's items and objects to (item, result) of every item. Sent to each
-worker once; what it keeps in itself stays there from piece to piece."""
+Item = TypeVar("Item", bound=Hashable)
+Result = TypeVar("Result")
+Needed = TypeVar("Needed")
+Work = Callable[[Sequence[Item], Mapping[str, Needed]], Iterator[tuple[Item, Result]]]
+"""What workers do: from a task's items and objects to (item, result) of every item. It is sent to
+each worker once, and what it keeps in itself stays there from task to task."""
 
 
-class Piece(NamedTuple):
+class Task(NamedTuple, Generic[Item]):
     """Some items, and what they need."""
 
-    items: Sequence[Hashable]
-    objects: Mapping[str, Any]
-    """By name references into Ray's object store; they live while somebody holds them."""
+    items: Sequence[Item]
+    objects: Mapping[str, object]
+    """References into Ray's object store, by name; the objects live while somebody holds them."""
+
+
+class _Versions(Protocol):
+    def remote(self) -> object: ...
+
+
+class _Run(Protocol):
+    def remote(self, *arguments: object) -> Iterator[object]: ...
+
+
+class _Actor(Protocol):
+    """Ray's handle of a `_Worker`."""
+
+    versions: _Versions
+    run: _Run
 
 
 class _Worker:
@@ -52,70 +69,82 @@ class _Worker:
     def versions(self) -> dict[str, str]:
         return package_versions()
 
-    def run(self, work: Work, items: Sequence[Any], names: Sequence[str], *objects: Any) -> Any:
-        """A generator of (item, result); the first `work` is kept."""
+    def run(
+        self, work: Work, items: Sequence[Hashable], names: Sequence[str], *objects: object
+    ) -> Iterator[tuple[Hashable, object]]:
+        """Yield (item, result) of every item. The first `work` is kept for all tasks."""
         self._work = self._work or work
         yield from self._work(items, dict(zip(names, objects, strict=True)))
 
 
-class _Slot:
-    """A place for a worker: the one that is there now, and what it has been given."""
+class _Running(NamedTuple, Generic[Item]):
+    """A task that a worker has."""
 
-    def __init__(self, start: Callable[[], Any]) -> None:
+    stream: Iterator[object]
+    """References to its results, as they are made."""
+    task: Task[Item]
+    left: dict[Item, None]
+    """Items without a result, in the order in which they are done."""
+
+
+class _Slot(Generic[Item]):
+    """A place for a worker: the worker that has it now, and the tasks of that worker."""
+
+    def __init__(self, start: Callable[[], _Actor]) -> None:
         self._start = start
         self.begin()
 
     def begin(self) -> None:
-        """With a new worker."""
+        """Start a new worker here."""
         self.worker = self._start()
-        self.greeting = self.worker.versions.remote()
-        self.running: deque[tuple[Any, Piece, dict]] = deque()
-        """Result streams, their pieces, and items without a result; done in this order."""
+        self.versions: object | None = self.worker.versions.remote()
+        """The worker's first answer; None once it has come."""
+        self.running: deque[_Running[Item]] = deque()
 
     @property
-    def awaited(self) -> Any:
-        """What comes from it next; None: nothing."""
-        return self.greeting or (self.running[0][0] if self.running else None)
+    def awaited(self) -> object | None:
+        """What the worker will send next; None: nothing."""
+        return self.versions or (self.running[0].stream if self.running else None)
 
 
-class Crew:
-    """Workers of one kind of work; use `crew`."""
+class WorkerPool(Generic[Item, Result]):
+    """Workers that do one kind of work; made by `worker_pool`."""
 
-    def __init__(self, ray: "ModuleType", slots: list[_Slot], work: Work) -> None:
+    def __init__(self, ray: "ModuleType", slots: list[_Slot[Item]], work: Work) -> None:
         self._ray, self._slots, self._work = ray, slots, ray.put(work)
-        self._again: deque[Piece] = deque()
+        self._again: deque[Task[Item]] = deque()
         self._losses: Counter[Hashable] = Counter()
-        self._all_given = self._warned = False
+        self._all_submitted = self._warned = False
 
     def __len__(self) -> int:
-        """Of workers."""
+        """The number of workers."""
         return len(self._slots)
 
-    def put(self, value: Any) -> Any:
-        """A reference to the value in the object store, for pieces."""
+    def put(self, value: object) -> object:
+        """Put a value into Ray's object store; returns a reference to it, for tasks."""
         return self._ray.put(value)
 
-    def results(self, pieces: Iterable[Piece]) -> Iterator[tuple[Any, Any]]:
-        """(item, result) of all items of all pieces, as they come, each once.
+    def results(self, tasks: Iterable[Task[Item]]) -> Iterator[tuple[Item, Result]]:
+        """Yield (item, result) of all items of all tasks, each once, as they come.
 
-        Pieces are asked for as workers get room. Whatever goes wrong (Ctrl-C, an error in a
-        worker): what has come is handed out first.
+        `tasks` is asked for the next task when a worker has room for it. Whatever goes wrong
+        (Ctrl-C, an error in a worker), the results that have come are yielded first.
 
         Raises:
-          UserError: workers with other packages, or lost too often.
+          UserError: a worker has other versions of packages, or workers are lost too often.
           Exception: whatever the work raised.
         """
-        todo = iter(pieces)
+        todo = iter(tasks)
         while True:
             try:
                 interrupt.check()
-                self._give(todo)
-                if self._all_given and not self._again:
+                self._submit(todo)
+                if self._all_submitted and not self._again:
                     if not any(slot.running for slot in self._slots):
                         return
                 found = self._next()
             except BaseException:
-                yield from self._come()
+                yield from self._take_all()
                 raise
             yield from found
 
@@ -124,81 +153,82 @@ class Crew:
         for slot in self._slots:
             self._ray.kill(slot.worker)
 
-    def _give(self, todo: Iterator[Piece]) -> None:
-        """Pieces to the workers that have room; the one with fewest first."""
-        while able := [s for s in self._slots if s.greeting is None and len(s.running) < AHEAD]:
-            piece = self._again.popleft() if self._again else next(todo, None)
-            if piece is None:
-                self._all_given = True
+    def _submit(self, todo: Iterator[Task[Item]]) -> None:
+        """Give tasks to the workers that have room; the worker with fewest tasks comes first."""
+        while able := [
+            s for s in self._slots if s.versions is None and len(s.running) < TASKS_PER_WORKER
+        ]:
+            task = self._again.popleft() if self._again else next(todo, None)
+            if task is None:
+                self._all_submitted = True
                 return
             slot = min(able, key=lambda s: len(s.running))
             stream = slot.worker.run.remote(
-                self._work, piece.items, list(piece.objects), *piece.objects.values()
+                self._work, task.items, list(task.objects), *task.objects.values()
             )
-            slot.running.append((stream, piece, dict.fromkeys(piece.items)))
+            slot.running.append(_Running(stream, task, dict.fromkeys(task.items)))
 
-    def _next(self) -> list[tuple[Any, Any]]:
-        """Wait until something comes, and take it."""
+    def _next(self) -> list[tuple[Item, Result]]:
+        """Wait until a worker sends something, and take it."""
         awaited = [(slot.awaited, slot) for slot in self._slots if slot.awaited is not None]
-        ready, _ = self._ray.wait([what for what, _ in awaited], timeout=PATIENCE)
+        ready, _ = self._ray.wait([what for what, _ in awaited], timeout=WARN_AFTER_S)
         if ready:
             return self._take(next(slot for what, slot in awaited if what is ready[0]))
-        if not self._warned and all(slot.greeting is not None for slot in self._slots):
+        if not self._warned and all(slot.versions is not None for slot in self._slots):
             logger.warning("waiting for Ray to start workers (are CPUs or GPUs free?)")
             self._warned = True
         return []
 
-    def _take(self, slot: _Slot) -> list[tuple[Any, Any]]:
-        """The next of a worker's results, which is there."""
+    def _take(self, slot: _Slot[Item]) -> list[tuple[Item, Result]]:
+        """Take what a worker has sent: at most one result."""
         errors = self._ray.exceptions
         try:
-            if slot.greeting is not None:
-                _check_versions(self._ray.get(slot.greeting))
-                slot.greeting = None
+            if slot.versions is not None:
+                _check_versions(self._ray.get(slot.versions))
+                slot.versions = None
                 return []
-            stream, _, left = slot.running[0]
-            reference = next(stream, None)
+            reference = next(slot.running[0].stream, None)
             if reference is None:
                 slot.running.popleft()
                 return []
             item, result = self._ray.get(reference)
-            del left[item]
+            del slot.running[0].left[item]
             del self._losses[slot]
             return [(item, result)]
         except errors.RayTaskError as error:
             raise (error.cause or error) from error
         except errors.RayError as error:
-            self._lost(slot, error)
+            self._replace(slot, error)
             return []
 
-    def _lost(self, slot: _Slot, error: Exception) -> None:
-        """Another worker in its place; what it owed is given out again."""
+    def _replace(self, slot: _Slot[Item], error: Exception) -> None:
+        """Start another worker in place of a lost one, and keep its items to submit them again."""
         blamed: list[Hashable] = [slot]
         if slot.running:
-            blamed += itertools.islice(slot.running[0][2], 1)
+            blamed += itertools.islice(slot.running[0].left, 1)
         why = str(error).strip().partition("\n")[0]
         for each in blamed:
             self._losses[each] += 1
-            if self._losses[each] > LOSSES:
+            if self._losses[each] > MAX_LOSSES:
                 raise UserError(
-                    f"Ray lost a worker {LOSSES + 1} times ({why}); what has come is kept. "
+                    f"Ray lost a worker {MAX_LOSSES + 1} times ({why}); what has come is kept. "
                     "Too little memory? Fewer --workers or a smaller --max-size need less"
                 ) from error
         logger.warning("Ray lost a worker, another is started (%s)", why)
-        for _, piece, left in slot.running:
-            if left:
-                self._again.append(piece._replace(items=list(left)))
-        with contextlib.suppress(Exception):  # it may only be out of reach
+        for running in slot.running:
+            if running.left:
+                self._again.append(running.task._replace(items=list(running.left)))
+        with contextlib.suppress(Exception):  # the worker may only be out of reach
             self._ray.kill(slot.worker)
         slot.begin()
 
-    def _come(self) -> Iterator[tuple[Any, Any]]:
-        """All that is there already."""
+    def _take_all(self) -> Iterator[tuple[Item, Result]]:
+        """Yield all results that are there already."""
         for slot in self._slots:
-            while slot.running and self._ray.wait([slot.running[0][0]], timeout=0)[0]:
+            while slot.running and self._ray.wait([slot.running[0].stream], timeout=0)[0]:
                 try:
                     found = self._take(slot)
-                except Exception:  # another failure behind the one that ends the run
+                except Exception:  # another failure, behind the one that ends the run
                     break
                 yield from found
 
@@ -214,22 +244,24 @@ def _check_versions(theirs: dict[str, str]) -> None:
 
 
 @contextlib.contextmanager
-def crew(work: Work, *, address: str | None, workers: int | None) -> Iterator[Crew]:
-    """Workers for the block: one on each GPU of the cluster, or on CPUs as `share` says.
+def worker_pool(
+    work: Work[Item, Needed, Result], *, address: str | None, workers: int | None
+) -> Iterator[WorkerPool[Item, Result]]:
+    """Start workers that live as long as the block (`worker_resources` says how many).
 
     Raises:
-      UserError: as `connected`, or the cluster has no such number of CPUs or GPUs.
+      UserError: Ray cannot be used (`connect`), or the cluster has too few CPUs or GPUs.
     """
-    with connected(address) as ray:
-        count, needs = wanted(ray, workers)
+    with connect(address) as ray:
+        count, needs = worker_resources(ray, workers)
         actor = ray.remote(**needs, max_restarts=0, max_task_retries=0)(_Worker)
-        environment = {"env_vars": {"NPROC": str(threads())}}
+        environment = {"env_vars": {"NPROC": str(xla_threads())}}
 
-        def start() -> Any:
+        def start() -> _Actor:
             return actor.options(runtime_env=environment).remote()
 
-        made = Crew(ray, [_Slot(start) for _ in range(count)], work)
+        pool = WorkerPool(ray, [_Slot(start) for _ in range(count)], work)
         try:
-            yield made
+            yield pool
         finally:
-            made.close()
+            pool.close()
