@@ -154,3 +154,11 @@ def test_configurations_know_the_backbones_there_are():
                 Config(backbone=name, keypoints="learned")  # pyright: ignore[reportArgumentType]
         assert Config(backbone=name).extraction().backbone == name  # pyright: ignore[reportArgumentType]
         assert backbone.fine > 0
+
+
+def test_relocalizers_are_learned_for_vgg16_alone():
+    assert {name: b.learned for name, b in BACKBONES.items()} == {
+        "vgg16": True,
+        "vgg19": False,
+        "alexnet": False,
+    }

@@ -7,6 +7,7 @@ import pytest
 from jaxsfm.config import PRESETS, Config, PairShape, Refinement, preset
 from jaxsfm.core import coarse_to_fine, relocalize
 from jaxsfm.core.octaves import OCTAVE_WEIGHT
+from jaxsfm.core.types import Status
 
 PAPER = {
     # What the paper and the authors' code say: section numbers are the paper's.
@@ -151,3 +152,11 @@ def test_a_refinement_refuses_what_lies_outside_its_range(field, allowed, refuse
     Refinement(**{field: allowed})
     with pytest.raises(ValueError, match=f"Refinement.{field} must .*got {refused}"):
         Refinement(**{field: refused})
+
+
+def test_the_numbers_of_a_status_are_those_in_stored_files():
+    assert {s.name: s.value for s in Status} == {
+        "VERIFIED": 0,
+        "TOO_FEW_MATCHES": 1,
+        "NO_PLANE": 2,
+    }
