@@ -105,6 +105,15 @@ def test_the_chunk_size_changes_nothing(chunk):
     )
 
 
+def test_the_last_chunk_holds_the_last_matches():
+    """Every cell is matched, so that the chunks end where the list does, or past it."""
+    f0, f1, coarse = problem(5, GRIDS[0], GRIDS[0])
+    coarse = jnp.arange(len(coarse), dtype=jnp.int32) % 6
+    whole = c2f.match_windows(f0, f1, coarse, chunk=len(coarse))
+    for chunk in (5, 7, len(coarse) - 1):
+        np.testing.assert_array_equal(c2f.match_windows(f0, f1, coarse, chunk=chunk), whole)
+
+
 @pytest.mark.parametrize("found", [0, 1, 7, 8, 61, 100])
 def test_similarities_are_products_as_far_as_there_are_correspondences(found):
     f0, f1, _ = problem(5, GRIDS[0], GRIDS[2])
