@@ -20,7 +20,7 @@ from jaxsfm.report.run_results import LostPhoto, PairRow
 from jaxsfm.report.summary import component_lines, help_lines
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placed
+from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG, Verdict
 
 edges = st.lists(st.sampled_from(exhaustive_pairs("abcdefg")), max_size=10)
@@ -192,8 +192,8 @@ def test_an_image_that_refinement_took_out_says_what_was_missing():
         ("b", "c"): counts(Status.VERIFIED, 90, 60),
     }
     placed = [
-        Placed(name="a", registered=True, octave_px=None, candidates=9, agreed=1, error_px=None),
-        Placed(
+        Placement(name="a", registered=True, octave_px=None, candidates=9, agreed=1, error_px=None),
+        Placement(
             name="c",
             registered=True,
             octave_px=None,
