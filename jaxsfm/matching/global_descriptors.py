@@ -30,7 +30,7 @@ from jaxsfm.matching.extraction import extract_images
 
 SIDE, NETVLAD_SIDE = 480, 640
 """Longer side of a photo that is described, pixels. GeM and VLAD find no more at 640 than at 480
-(docs/guide/many-photos.md). The authors of NetVLAD describe photos of 640 x 480."""
+(docs/decisions/retrieval.md). The authors of NetVLAD describe photos of 640 x 480."""
 SAMPLE = 1 << 14
 """Number of local descriptors that a vocabulary is fitted on, over all photos (34 MB)."""
 CELLS = f"cells {SIDE}"

@@ -29,7 +29,7 @@ from jaxsfm.core.views import view_pair, warp_points
 
 MATCH_ERROR_PX = 3.0
 """Standard deviation per axis of the error with which descriptors match cells. Training with exact
-cells loses within 3 px what it gains within 1 px (docs/relocalization.md)."""
+cells loses within 3 px what it gains within 1 px (docs/decisions/relocalization.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
