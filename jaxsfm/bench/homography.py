@@ -21,7 +21,7 @@ from jaxsfm.bench.matches import PAIR_METHODS, Matcher, Matches, PairFigures, pa
 from jaxsfm.bench.options import HomographyOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import SUFFIXES, ImageFile
-from jaxsfm.sfm.two_view import homography
+from jaxsfm.sfm.epipolar import homography
 
 ACCURACY_PX = (1, 3, 5, 10)
 CORNER_PX = (3, 5, 10)

@@ -17,7 +17,7 @@ from jaxsfm.bench.options import StrechaOptions
 from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
-from jaxsfm.colmap.models import write_models
+from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import model_poses, read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import read_two_views

@@ -17,7 +17,7 @@ from jaxsfm.bench.matches import PAIR_METHODS, Matcher, Matches, PairFigures, pa
 from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import SUFFIXES, ImageFile
-from jaxsfm.sfm.two_view import epipolar_residuals, fundamental_matrix
+from jaxsfm.sfm.epipolar import epipolar_residuals, fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)
 Means = dict[str, dict[str, Spread]]

@@ -127,12 +127,14 @@ def _export_file(run: Path, to: Format, out: Path) -> None:
         from jaxsfm.colmap.formats.nvm import nvm_text
 
         write_atomic(out, nvm_text(_model(run)).encode())
-        return
-    model = _model(run)
-    with tempfile.TemporaryDirectory() as scratch:
-        made = Path(scratch) / "points.ply"
-        model.export_PLY(made)
-        write_atomic(out, made.read_bytes())
+    elif to == "ply":
+        model = _model(run)
+        with tempfile.TemporaryDirectory() as scratch:
+            made = Path(scratch) / "points.ply"
+            model.export_PLY(made)
+            write_atomic(out, made.read_bytes())
+    else:
+        raise ValueError(f"to must be a format of one file; got {to!r}")
 
 
 def _export_folder(
@@ -159,8 +161,10 @@ def _export_folder(
         write_bundler(folder, _model(run))
     elif to == "openmvg":
         _export_openmvg(run, folder, images)
-    else:
+    elif to == "nerfstudio":
         _export_nerfstudio(run, folder, images, copy_images)
+    else:
+        raise ValueError(f"to must be a format of a folder; got {to!r}")
 
 
 def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -> None:

@@ -64,7 +64,7 @@ def train(what: tyro.conf.Positional[Literal["relocalizer"]], *, training: Train
     from jaxsfm.io.weights import load_weights
     from jaxsfm.matching.pipeline import open_images
     from jaxsfm.training.objective import Objective
-    from jaxsfm.training.posed import posed_pairs
+    from jaxsfm.training.posed_pairs import posed_pairs
     from jaxsfm.training.relocalizer import TrainOptions, train_relocalizer
 
     try:

@@ -24,17 +24,17 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_report import RunReport, write_report
-from jaxsfm.runs.extended_model import PlannedExtension, write_extension
-from jaxsfm.runs.finished_model import (
+from jaxsfm.runs.build_report import NewPhotos
+from jaxsfm.runs.job import Job, images_of, pairs_without
+from jaxsfm.runs.run_options import LocalizeOptions
+from jaxsfm.runs.similar_photos import Shortlist, similar_photos
+from jaxsfm.runs.working_model import (
     camera_prior,
     photos_of_run,
     read_working_model,
     weights_of_run,
 )
-from jaxsfm.runs.job import Job, images_of, pairs_without
-from jaxsfm.runs.report import NewPhotos
-from jaxsfm.runs.run_options import LocalizeOptions
-from jaxsfm.runs.similar_photos import Shortlist, similar_photos
+from jaxsfm.runs.write_extension import PlannedExtension, write_extension
 
 
 def extend(

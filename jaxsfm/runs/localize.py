@@ -22,15 +22,6 @@ from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.report.finished_run import FinishedRun, read_run
-from jaxsfm.runs.finished_model import (
-    CameraPrior,
-    WorkingModel,
-    camera_prior,
-    photos_of_run,
-    read_working_model,
-    view_without_pose,
-    weights_of_run,
-)
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.localize_report import (
     LocalizationReport,
@@ -42,6 +33,15 @@ from jaxsfm.runs.localize_report import (
 from jaxsfm.runs.queries import Query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
+from jaxsfm.runs.working_model import (
+    CameraPrior,
+    WorkingModel,
+    camera_prior,
+    photos_of_run,
+    read_working_model,
+    view_without_pose,
+    weights_of_run,
+)
 from jaxsfm.sfm.register.locate_view import Localization, locate
 
 

@@ -9,8 +9,8 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.store import Store
-from jaxsfm.runs.finished_model import CameraPrior
 from jaxsfm.runs.job import Job
+from jaxsfm.runs.working_model import CameraPrior
 
 PHOTOS_TOGETHER = 64
 """Photos whose features and matches are asked from workers in one call: workers take seconds to

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from jaxsfm.colmap.external_matches import JoinedMatches, read_external_matches
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions
-from jaxsfm.colmap.models import write_models
+from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
@@ -31,8 +31,8 @@ from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json
+from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.job import Job, images_of, pairs_without
-from jaxsfm.runs.report import StageResults, evaluated, run_report
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.sfm.reconstruction import Reconstructed, reconstruct
 from jaxsfm.sfm.stages import StageCache

@@ -15,7 +15,7 @@ from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.global_descriptors import GEM
 from jaxsfm.matching.retrieval import describe_photos
 from jaxsfm.report.finished_run import FinishedRun
-from jaxsfm.runs.finished_model import photos_of_run
+from jaxsfm.runs.working_model import photos_of_run
 
 Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
 """From a photo and the names of other photos to the names of those that it is matched with."""

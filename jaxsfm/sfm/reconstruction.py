@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from jaxsfm.colmap.database import drop_pairs, read_images, write_database
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
 from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
-from jaxsfm.colmap.models import colour_points, read_models, write_models
+from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.colmap.verification import VerificationOptions, verify
 from jaxsfm.config import Config, Refinement

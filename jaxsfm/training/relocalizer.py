@@ -33,7 +33,7 @@ from jaxsfm.training.objective import (
     warped_examples,
 )
 from jaxsfm.training.photos import Crops, split
-from jaxsfm.training.posed import PosedPairs
+from jaxsfm.training.posed_pairs import PosedPairs
 
 EVALUATION_BATCHES = 8
 """The number of batches of held-out views on which the progress is measured."""

@@ -21,7 +21,7 @@ from jaxsfm.core.losses import (
     weighted_mean,
 )
 from jaxsfm.core.relocalize import WalkProbabilities, walk, window_positions
-from jaxsfm.sfm.two_view import sampson_error
+from jaxsfm.sfm.epipolar import sampson_error
 
 IDENTITY = jnp.eye(3)
 

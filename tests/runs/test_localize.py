@@ -25,11 +25,11 @@ from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs import localize as localize_module
-from jaxsfm.runs.finished_model import camera_prior, read_working_model
 from jaxsfm.runs.localize import localize
 from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import similar_photos
+from jaxsfm.runs.working_model import camera_prior, read_working_model
 
 SIZE, WIDE = (320, 240), (368, 248)
 """Of one padded size: nothing is compiled twice."""

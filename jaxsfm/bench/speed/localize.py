@@ -34,9 +34,9 @@ from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.typed_json import to_json
-from jaxsfm.runs.finished_model import camera_prior, read_working_model
 from jaxsfm.runs.localize import locate_photo
 from jaxsfm.runs.localize_report import error_against, localized_photo
+from jaxsfm.runs.working_model import camera_prior, read_working_model
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.view_graph import trusted_pairs
 

@@ -103,7 +103,7 @@ class PhotoTable(NamedTuple):
     @property
     def evaluated(self) -> bool:
         """Whether there are errors against reference poses."""
-        return len(self.columns) > len(COLUMNS)
+        return any(column in self.columns for column in ERROR_COLUMNS)
 
 
 def advice(lost: LostPhoto) -> list[Advice]:

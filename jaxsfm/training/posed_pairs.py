@@ -25,7 +25,7 @@ from jaxsfm.io.images import ImageFile, read_image, working_size
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.pipeline import extract, match
-from jaxsfm.sfm.two_view import sampson_error
+from jaxsfm.sfm.epipolar import sampson_error
 from jaxsfm.training.objective import Examples, walked_maps
 from jaxsfm.training.photos import DECODED, MAX_SIZE
 

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from strategies import rng_of
 
 from jaxsfm.bench.wxbs import symmetric_epipolar_error
-from jaxsfm.sfm.two_view import (
+from jaxsfm.sfm.epipolar import (
     fundamental_matrix,
     homography,
     refine_fundamental_matrix,

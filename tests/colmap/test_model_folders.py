@@ -9,7 +9,7 @@ from mapped import map_database
 
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.mapper import MapOptions
-from jaxsfm.colmap.models import colour_points, write_models
+from jaxsfm.colmap.model_folders import colour_points, write_models
 from jaxsfm.colmap.poses import model_poses
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)

@@ -8,6 +8,7 @@ import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.poses import read_model
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageError
 
@@ -29,17 +30,20 @@ def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
 
 
 def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
-    """Read what `write_models` wrote.
+    """Read what `write_models` wrote. Files are checked before COLMAP reads them.
 
     Args:
       database: of the same cameras. It says which focal lengths were known before mapping, which
         COLMAP's model files do not.
+
+    Raises:
+      UserError: a model is damaged.
     """
     with pycolmap.Database.open(database) as db:
         known = {c.camera_id: c.has_prior_focal_length for c in db.read_all_cameras()}
     models = []
     while (path := folder / str(len(models))).is_dir():
-        model = pycolmap.Reconstruction(path)
+        model = read_model(path)
         for camera_id, camera in model.cameras.items():
             camera.has_prior_focal_length = known[camera_id]
         models.append(model)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
-from jaxsfm.colmap.models import colour_points, read_models, write_models
+from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
 from jaxsfm.colmap.verification import VerificationOptions
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.runs.finished_model import CameraPrior, WorkingModel, view_without_pose
-from jaxsfm.runs.report import NewPhotos, extended_report
+from jaxsfm.runs.build_report import NewPhotos, extended_report
+from jaxsfm.runs.working_model import CameraPrior, WorkingModel, view_without_pose
 from jaxsfm.sfm.register.grow import ExtendedModel, UnregisteredView, grow
 
 if TYPE_CHECKING:
