@@ -20,6 +20,7 @@ from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.run_report import read_report
 from jaxsfm.runs import extend as extend_module
+from jaxsfm.runs import write_extension
 from jaxsfm.sfm.evaluation import umeyama
 
 OLD = ("view0.png", "view1_night.png", "view2.png")

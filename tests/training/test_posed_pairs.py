@@ -8,6 +8,7 @@ from jaxsfm.colmap.poses import read_poses
 from jaxsfm.errors import UserError
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.sfm.epipolar import sampson_error
+from jaxsfm.training import posed_pairs
 from jaxsfm.training.objective import Objective, loss
 from jaxsfm.training.photos import Crops
 from jaxsfm.training.relocalizer import TrainOptions, start_state, train_step, warped_examples

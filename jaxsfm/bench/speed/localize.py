@@ -21,10 +21,10 @@ from typing import Any
 
 os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP tells of every step
 
-from jaxsfm.colmap import database as colmap
-from jaxsfm.colmap import models as colmap_models
+from jaxsfm.colmap.database import drop_pairs, write_database
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.colmap.verification import VerificationOptions, verify
 from jaxsfm.io.atomic import read_json, write_atomic
@@ -58,7 +58,7 @@ def verified(run: FinishedRun, files: dict[str, ImageFile], scratch: Path) -> Pa
         known = Intrinsics(model=camera.model_name, params=tuple(camera.params))
     pairs = [row.pair for row in run.report.pairs.each if row.handed_on]
     partial, options = scratch / "partial.db", map_options(run, files)
-    colmap.write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
+    write_database(partial, list(files.values()), SavedMatches(run.matches, pairs), known)
     verification = VerificationOptions(
         seed=options.seed,
         threads=options.threads,
@@ -95,7 +95,7 @@ def without(
     if run.config.view_graph:
         verdicts = trusted_pairs({pair: view.geometry for pair, view in kept.items()})
         dropped += [pair for pair, verdict in verdicts.items() if not verdict.trusted]
-    colmap.drop_pairs(database, dropped)
+    drop_pairs(database, dropped)
     models, _ = build_models(database, {p: kept[p] for p in kept.keys() - set(dropped)}, options)
     if refined and run.config.refinement:
         models[0], _ = refine_model(
@@ -105,7 +105,7 @@ def without(
             refine_intrinsics=options.refine_intrinsics,
             threads=options.threads,
         )
-    colmap_models.write_models(models[:1], folder / "fresh")
+    write_models(models[:1], folder / "fresh")
     (folder / "fresh").rename(folder / "sparse")
     database.unlink()
 
