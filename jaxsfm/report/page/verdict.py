@@ -72,8 +72,8 @@ def verdict(report: RunReport) -> Verdict:
 def _sentences(report: RunReport, best: ModelRow) -> Iterable[str]:
     yield (
         "On average, the model projects a point "
-        f"{best.reprojection_error_px:.2f} px away from the place where it was seen in a photo. A good "
-        "model has a small value, but a small value alone does not prove that a model is good."
+        f"{best.reprojection_error_px:.2f} px away from the place where it was seen in a photo. A "
+        "good model has a small value, but a small value alone does not prove that a model is good."
     )
     if report.evaluation:
         position, rotation = report.evaluation.position, report.evaluation.rotation_deg
@@ -87,8 +87,8 @@ def _sentences(report: RunReport, best: ModelRow) -> Iterable[str]:
         )
     else:
         yield report.evaluation_failed or (
-            "There are no reference poses to compare with. To judge the model, look at its 3-D view "
-            "and at the refused pairs."
+            "There are no reference poses to compare with. To judge the model, look at its 3-D "
+            "view and at the refused pairs."
         )
 
 
