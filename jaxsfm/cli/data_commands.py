@@ -13,7 +13,7 @@ def list_all(*, to: Path | None = None) -> int:
     """List the data sets with their sizes and terms, and say which of them have been fetched.
 
     Args:
-      to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
+      to: Folder of data sets. Without it, $JAXSFM_DATA; if that is not set, the user's data folder.
     """
     from jaxsfm.bench import datasets
 
@@ -32,14 +32,14 @@ def list_all(*, to: Path | None = None) -> int:
 
 
 def fetch(name: Positional[str], *, to: Path | None = None) -> int:
-    """Download a data set. An interrupted download goes on where it stopped.
+    """Download a data set. If a download is interrupted, the same command continues it.
 
     For example
         $ jaxsfm data fetch wxbs
 
     Args:
       name: Name of the data set (jaxsfm data list).
-      to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
+      to: Folder of data sets. Without it, $JAXSFM_DATA; if that is not set, the user's data folder.
     """
     from jaxsfm.bench import datasets
 
@@ -48,11 +48,11 @@ def fetch(name: Positional[str], *, to: Path | None = None) -> int:
 
 
 def path(name: Positional[str], *, to: Path | None = None) -> int:
-    """Print the folder of a data set, which is the --root of its benchmark.
+    """Print the folder of a data set. The benchmarks take it as --root.
 
     Args:
       name: Name of the data set (jaxsfm data list).
-      to: Folder of data sets; default: $JAXSFM_DATA, or the user's data folder.
+      to: Folder of data sets. Without it, $JAXSFM_DATA; if that is not set, the user's data folder.
     """
     from jaxsfm.bench import datasets
 

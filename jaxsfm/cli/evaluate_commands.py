@@ -19,7 +19,7 @@ def evaluate(
 ) -> int:
     """Compare the cameras of a model with reference poses.
 
-    The model is first moved, turned and scaled onto the reference.
+    The model is first moved, turned and scaled to fit the reference best.
 
     For example
         $ jaxsfm evaluate OUT --reference POSES
@@ -27,9 +27,9 @@ def evaluate(
     Args:
       out: The folder of a run or of a COLMAP model.
       reference: The folder of Strecha .camera files or of a COLMAP model.
-      align_on: A text file with names of images, one on each line: the model is aligned on these
-        images only (as in the paper's comparison of night images).
-      json: The .json file into which all errors are written.
+      align_on: A text file with names of photos, one on each line. The model is fitted to the
+        reference with these photos only, as the paper does for night photos.
+      json: File.json to write, with all errors.
     """
     check_writable(json, "--json", (".json",))
     from jaxsfm.colmap.poses import find_model, model_poses, read_model, read_poses
@@ -55,12 +55,14 @@ def evaluate(
 
 
 def demo(*, out: Path | None = None, seed: int = 0) -> int:
-    """Render a small scene with known cameras, reconstruct it, and compare the result with them.
+    """Render a small scene, reconstruct it, and compare the result with the exact cameras.
 
-    The exit status is 1 if a camera is missing, or if the mean errors are larger than stated.
+    The exit status is 1 if a camera is missing, or if the mean errors are larger than the last line
+    allows.
 
     Args:
-      out: The folder for the scene and the results; default: a new one in the temporary folder.
+      out: The folder for the scene and the results. Without it, a new folder in the system's
+        temporary folder.
       seed: The seed of the scene's noise and of the reconstruction.
     """
     from jaxsfm.bench.demo import run_demo

@@ -39,16 +39,18 @@ def export(
         $ jaxsfm export OUT --to hloc --out HLOC
 
     Args:
-      run: The folder of a run, or, for a format that holds a model, of a COLMAP model.
-      to: hloc: features.h5, matches.h5 and pairs.txt. colmap, colmap-text: the model. ply: its
-        points. bundler, nvm: cameras, points, observations. openmvg: sfm_data.json, features,
-        matches. nerfstudio: transforms.json and points.
-      out: The file (ply, nvm) or the new folder to write.
-      images: The folder of the photos, to which nerfstudio and openmvg refer; default: where the
-        run found them, if they are still there.
-      copy_images: Copy the photos into the folder images next to nerfstudio's transforms.json.
-      matches: The matches that are written for hloc: all that were handed to COLMAP, or those of
-        trusted pairs that COLMAP verified.
+      run: The folder of a run. For formats that hold a model, it can also be the folder of a COLMAP
+        model.
+      to: The format. hloc: features.h5, matches.h5 and pairs.txt. colmap, colmap-text: the model.
+        ply: the points of the model. bundler, nvm: cameras, points and observations. openmvg:
+        sfm_data.json, features and matches. nerfstudio: transforms.json and points.
+      out: The file (for ply and nvm) or the new folder to write.
+      images: The folder of the photos, to which the files of nerfstudio and openmvg refer. Without
+        it, the folder in which the run found them, if it still exists.
+      copy_images: For nerfstudio: copy the photos into a folder named images, next to
+        transforms.json.
+      matches: Which matches are written for hloc. all: those that were handed to COLMAP. verified:
+        those of trusted pairs that COLMAP verified.
     """
     if copy_images and to != "nerfstudio":
         raise UserError("--copy-images: goes with --to nerfstudio")

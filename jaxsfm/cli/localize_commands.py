@@ -18,7 +18,7 @@ def localize(
     network: WeightsChoice,
     engine: EngineChoice,
 ) -> int:
-    """Find where photos were taken, in the model of a finished run. The model does not change.
+    """Find where photos were taken, with the model of a finished run. The model does not change.
 
     The exit status is 1 if no photo could be localized.
 
@@ -28,9 +28,10 @@ def localize(
     Args:
       photos: Photos, or folders with photos.
       model: The folder of a finished run.
-      out: File.json to write: the poses, the matches that they rest on, and their expected errors.
+      out: File.json to write: the poses, the numbers of matches that support them, and their
+        expected errors.
       reference: Reference poses (Strecha .camera files or a COLMAP model) of these photos and of
-        the run's photos; with them the errors of the poses are printed.
+        the run's photos. With them, the errors of the poses are printed.
       network: The files of the network's parameters. They must be those of the run.
     """
     check_writable(out, "--out", (".json",))
@@ -61,9 +62,8 @@ def extend(
 ) -> int:
     """Add photos to the model of a finished run.
 
-    New photos are those that were put into the folder of the run's photos after the run.
-
-    Poses and points that are in the model do not change.
+    Put the new photos into the folder of the run's photos first. Poses and points that are already
+    in the model do not change.
 
     The exit status is 1 if no new photo found its place.
 

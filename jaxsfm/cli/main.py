@@ -45,8 +45,9 @@ For example
     $ jaxsfm demo
     $ jaxsfm reconstruct PHOTOS --out OUT
 
-jaxsfm --version prints versions; jaxsfm --tyro-print-completion bash (or zsh, tcsh) prints a script
-that completes commands and options."""
+jaxsfm --version prints the version of jaxsfm and of the packages that its results depend on.
+jaxsfm --tyro-print-completion bash (or zsh, tcsh) prints a script that lets your shell complete
+commands and options."""
 COMMANDS = {
     "reconstruct": reconstruct,
     "match": match,

@@ -19,7 +19,7 @@ def pairs(
     backbone: BackboneName = "vgg16",
     network: WeightsChoice,
 ) -> int:
-    """Write the pairs that reconstruct would try to a file, which its --pairs takes.
+    """Write the pairs that reconstruct would try to a file. reconstruct --pairs FILE reads it.
 
     For example
         $ jaxsfm pairs PHOTOS --out pairs.txt --pairs retrieval:20
@@ -27,9 +27,9 @@ def pairs(
     Args:
       images: Folder with the photos; sub-folders are included.
       out: File.txt to write, with two image names on each line.
-      pairs: Which pairs; see jaxsfm reconstruct --help.
-      retrieval: How photos are described for retrieval:K; netvlad needs weights of its own, given
-        with --weights.
+      pairs: Which pairs are written. The values are those of --pairs in jaxsfm reconstruct --help.
+      retrieval: How a photo is described by one vector for retrieval:K. netvlad needs NetVLAD's
+        weights, given with --weights.
       backbone: The network that describes the photos.
     """
     check_writable(out, "--out", (".txt",))

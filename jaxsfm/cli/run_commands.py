@@ -58,7 +58,7 @@ def reconstruct(
 
     Args:
       images: Folder with the photos; sub-folders are included.
-      out: Folder for the results. The same command continues an interrupted run there.
+      out: Folder for the results. If a run there was interrupted, the same command continues it.
     """
     chosen = config.config(network.relocalizer)
     from jaxsfm.matching.execution import Execution
@@ -96,19 +96,20 @@ def match(
     matching: MatchingChoice,
     network: WeightsChoice,
 ) -> int:
-    """Match two images, and write keypoints, planes and homographies to a file.
+    """Match two photos, and write the matches and the homographies to a file.
 
     For example
         $ jaxsfm match A.jpg B.jpg --out m.npz --plot m.png
 
     Args:
-      image0: The first image.
-      image1: The second image.
-      out: File.npz to write. It has keypoints0 and keypoints1 (n x 2, pixels of the original
-        images, the centre of the top-left pixel is (0, 0)), aligned (n, whether keypoints1 is
-        sub-pixel), plane (n) and homographies (p x 3 x 3, image 0 to image 1).
-      plot: Picture of the matches to write (.png or .jpg), with a colour for each plane.
-      seed: Seed of the RANSAC draws.
+      image0: The first photo.
+      image1: The second photo.
+      out: File.npz to write. keypoints0 and keypoints1 (n x 2) are the matches, in pixels of the
+        original images; the centre of the top-left pixel is (0, 0). aligned (n) says whether
+        keypoints1 is accurate to a fraction of a pixel. plane (n) is the index of the match's
+        homography. homographies (p x 3 x 3) map the first image to the second.
+      plot: File.png or File.jpg to write: a picture of the matches, with one colour for each plane.
+      seed: Seed of all random choices.
     """
     config = matching.config(network.relocalizer)
     check_writable(out, "--out", (".npz",))

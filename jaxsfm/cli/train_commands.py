@@ -12,7 +12,7 @@ from jaxsfm.errors import UserError
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Training:
-    """What to train on, and the settings of the training."""
+    """The photos and the settings of the training."""
 
     images: Path
     """Folder with the photos; sub-folders are included."""
@@ -21,35 +21,36 @@ class Training:
     steps: int = 400
     """Number of steps; four hundred take ten minutes on two cores."""
     batch: int = 8
-    """Pairs of views in a step."""
+    """Number of pairs of views in a step."""
     hidden: int = 32
-    """Hidden units of the perceptron of each level."""
+    """Number of hidden units of each level's perceptron."""
     learning_rate: float = 0.01
     """Learning rate at the start; it falls to 0."""
     temperature: float = 0.5
     """Temperature of the random walks in training."""
     peakiness: float = 0.0
-    """Weight of the loss that makes the walks more certain of their end."""
+    """Weight of the part of the loss that makes the random walks more certain."""
     reference: Path | None = None
-    """Poses of the photos (Strecha .camera files or a COLMAP model).
-    With them, real pairs of photos and their epipolar lines are trained on, too."""
+    """Reference poses of the photos (Strecha .camera files or a COLMAP model).
+    With them, the training also uses real pairs of photos and their epipolar lines."""
     intrinsics: str | None = None
-    """Camera of all photos, for --reference: K.txt or MODEL:p1,p2,.. without distortion."""
+    """The camera of all photos, needed with --reference. It must have no distortion.
+    It is given as for reconstruct."""
     weights: Path | None = None
-    """File with the weights of VGG-16 (jaxsfm weights convert); default: torchvision's."""
+    """File with weights of VGG-16, made by jaxsfm weights convert. Without it: torchvision's."""
     seed: int = 0
     """Seed of all random choices."""
 
 
 def train(what: tyro.conf.Positional[Literal["relocalizer"]], *, training: Training) -> int:
-    """Learn the scores by which keypoints are relocalized, from any photos.
+    """Learn from any photos the scores that choose keypoints.
 
     For example
         $ jaxsfm train relocalizer --images PHOTOS --out mine.safetensors
 
-    Pairs of views are made of the photos by random homographies and changes of light. Every fifth
-    photo is held out, to measure the progress. An interrupted training goes on when the same
-    command is given again. Use the result with reconstruct --relocalizer FILE.
+    Random homographies and changes of light turn each photo into pairs of views. Every fifth photo
+    is held out to measure the progress. If the training is interrupted, the same command continues
+    it. Use the result with reconstruct --relocalizer FILE.
 
     Args:
       what: What to train: relocalizer.

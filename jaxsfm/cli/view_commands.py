@@ -15,15 +15,15 @@ def report(
 ) -> int:
     """Write the report of a run as one page of HTML.
 
-    Reconstruct writes the page by itself. This command writes it again, for example after the
-    photos have been moved, or with other reference poses.
+    reconstruct writes this page by itself. Use this command to write it again, for example with
+    photos that have moved or with other reference poses.
 
     Args:
       run: The folder of a run.
-      images: The folder of the photos; default: where the run found them.
-      reference: Reference poses (Strecha .camera files or a COLMAP model); default: those of the
+      images: The folder of the photos. Without it, the folder in which the run found them.
+      reference: Reference poses (Strecha .camera files or a COLMAP model). Without it, those of the
         run.
-      out: The .html file to write; default: report.html in the folder of the run.
+      out: File.html to write. Without it, report.html in the folder of the run.
     """
     check_writable(out, "--out", (".html",))
     from jaxsfm.report.page.write import write_page
@@ -42,15 +42,15 @@ def view(
 ) -> int:
     """Show the model of a run in the browser, until Ctrl-C.
 
-    Unlike the page of `jaxsfm report` it shows all points of large models.
+    Unlike the page that jaxsfm report writes, the viewer shows all points of large models.
 
     Args:
       run: The folder of a run.
-      images: The folder of the photos; default: where the run found them.
-      reference: Reference poses (Strecha .camera files or a COLMAP model); default: those of the
+      images: The folder of the photos. Without it, the folder in which the run found them.
+      reference: Reference poses (Strecha .camera files or a COLMAP model). Without it, those of the
         run.
-      port: The port of the server; if it is taken, the next free one.
-      host: The address to listen on; with 0.0.0.0 other machines can connect.
+      port: The port of the server. If it is taken, the next free port is used.
+      host: The address of the server. With 0.0.0.0, other machines can connect too.
     """
     if not 1 <= port <= 65535:
         raise UserError(f"--port must lie in 1 .. 65535; got {port}")

@@ -21,7 +21,7 @@ def show(*, backbone: BackboneName = "vgg16", network: WeightsChoice = USUAL_WEI
 
     Args:
       backbone: The network.
-      network: The files from which the parameters are read.
+      network: Which files the parameters are read from.
     """
     from jaxsfm.io.weights import chosen_weights
 
@@ -55,18 +55,20 @@ def convert(
     family: Family = "auto",
     kernels: Kernels = "auto",
 ) -> int:
-    """Convert weights of VGG-16 (or torchvision's VGG-19) of another framework, for --weights.
+    """Convert weights of VGG-16 from another framework into a file for --weights.
+
+    torchvision's VGG-19 can be converted too.
 
     For example
         $ jaxsfm weights convert vgg16.h5 vgg16.safetensors
 
     Args:
-      source: File of torchvision's vgg16 (.pth, .safetensors), of Keras' VGG16 (.h5), of
-        MatConvNet (imagenet-vgg-verydeep-16.mat) or of NetVLAD (.mat). Nothing in it is executed.
+      source: The file to convert: torchvision's vgg16 (.pth, .safetensors), Keras' VGG16 (.h5),
+        MatConvNet's imagenet-vgg-verydeep-16.mat or NetVLAD's .mat. Nothing in it is executed.
       target: File.safetensors for the converted weights.
-      family: Framework that the file must come from; auto accepts any.
-      kernels: For Keras' files: whether the kernels are turned by 180 degrees (theano) or not
-        (tensorflow); auto asks the file.
+      family: The framework that the file must come from. auto accepts any framework.
+      kernels: Only for Keras' files. theano: the kernels are turned by 180 degrees. tensorflow:
+        they are not. auto: the file says which.
     """
     check_writable(target, "TARGET", (".safetensors",))
     from weights_conversion.convert import read_source, write_converted
@@ -90,13 +92,13 @@ def verify(
 ) -> int:
     """Compare converted weights with their source, layer by layer.
 
-    An independent network, in numpy and float64, runs the source in its own convention. The command
-    ends with status 1 if the results differ.
+    An independent network, written in numpy and float64, runs the source file with the conventions
+    of its framework. The exit status is 1 if the results differ.
 
     Args:
       source: The file that was converted.
       target: The converted file.
-      family: Framework that the source must come from; auto accepts any.
+      family: The framework that the source must come from. auto accepts any framework.
       kernels: For Keras' files: theano or tensorflow, as in convert.
       size: Longer side of the image that both networks see, pixels.
     """
@@ -115,9 +117,9 @@ def fetch(name: Positional[str] = "list", *, out: Path | None = None) -> int:
     """Download public weights, check their hash, and convert them.
 
     Args:
-      name: Name of the weights; list prints the names that there are.
-      out: File.safetensors for the converted weights; default: NAME.safetensors in the user's data
-        folder.
+      name: Name of the weights. The name list prints all names.
+      out: File.safetensors for the converted weights. Without it, NAME.safetensors in the user's
+        data folder.
     """
     check_writable(out, "--out", (".safetensors",))
     from weights_conversion.fetch import fetch_weights, public_lines
@@ -135,7 +137,7 @@ _Action = one_of(ACTIONS)
 
 
 def weights(result: _Action) -> int:  # pyright: ignore[reportInvalidTypeForm]
-    """Show, convert, verify and fetch weights; without an action: show."""
+    """Show, convert, verify or fetch weights. Without an action, jaxsfm weights shows them."""
     return result
 
 

@@ -67,7 +67,7 @@ def without_pose(
     widest = None if model else pairs.widest_deg(own)
     if widest is not None and widest < LEAST_ANGLE_DEG:
         why = f"the rays of its points meet at {widest:.1f} deg at most"
-        return [Advice(option=None, reason=f"{_NO_OPTION}take photos from a step aside: {why}")]
+        return [Advice(option=None, reason=f"{_NO_OPTION}take photos a step to the side: {why}")]
     used = [pair for pair in own if pairs.trusted(pair)]
     best = pairs.best(used)
     assert best is not None, name
@@ -76,7 +76,7 @@ def without_pose(
         inliers = pairs.rows[best].colmap_inliers
         found.append(_camera(f"{inliers} inliers in its best pair, but COLMAP found no pose"))
     other = best[best[0] == name]
-    near = f"take photos near it, a step aside of {shown_name(other)}"
+    near = f"take photos near it, a step to the side of {shown_name(other)}"
     return [*found, Advice(option=None, reason=near if found else _NO_OPTION + near)]
 
 

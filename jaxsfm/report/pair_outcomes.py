@@ -53,8 +53,8 @@ class PairOutcomes:
             return (
                 f"{row.colmap_inliers} inliers, but its rotation differs from that of stronger "
                 f"pairs by {verdict.rotation_error_deg:.0f} deg ({TOLERANCE_DEG:.0f} deg are "
-                f"allowed), and its strength is {verdict.strength:.3f} (from {STRONG} on any "
-                "rotation is allowed)"
+                f"allowed), and its strength is {verdict.strength:.3f} (a pair of strength "
+                f"{STRONG} or more may have any rotation)"
             )
         if row.inliers and row.handed_on:
             return (

@@ -25,7 +25,7 @@ def evaluation_lines(evaluation: EvaluationReport) -> list[str]:
                 ("rotation error  ", evaluation.rotation_deg, "deg"),
             )
         ),
-        f"within (d; 10 deg)  {shares}",
+        f"within 10 deg    and a distance of {shares} (units of the reference)",
     ]
 
 
@@ -45,9 +45,11 @@ def component_lines(view_graph: ViewGraph) -> list[str]:
     alone = len(groups) - len(several)
     sizes = ", ".join(str(len(group.images)) for group in several[:MAX_GROUPS])
     lines = [
-        f"view graph       {len(several)} groups of images that no trusted pair joins, of {sizes}"
+        f"view graph       {len(several)} groups of {sizes}"
         + ", ..." * (len(several) > MAX_GROUPS)
-        + f" images; {alone} images alone" * bool(alone)
+        + " images"
+        + f"; {alone} images alone" * bool(alone)
+        + "; no trusted pair joins two groups"
     ]
     for group in several[1:MAX_GROUPS]:
         near = group.nearest

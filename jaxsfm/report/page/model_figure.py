@@ -93,7 +93,8 @@ def model_figure(scene: Scene, unit: str) -> Figure:
         "model",
         "The 3-D model",
         "Drag to turn the model, scroll to zoom. Points have the colours of the photos. Blue "
-        f"pyramids show where the cameras stand and look.{reference} The axes count {unit}.{notes}",
+        f"pyramids show where the cameras stand and in which direction they look.{reference} "
+        f"The axes are in {unit}.{notes}",
         alt=f"3-D model with {len(some)} points and {len(scene.cameras)} cameras",
         data=data,
         layout={

@@ -42,7 +42,7 @@ def next_steps(folder: Path, images: Path | None, *, model: bool) -> list[tuple[
             ("Look at the model with its photos in the browser", f"jaxsfm view {quoted}"),
             ("Compare it with known poses", f"jaxsfm evaluate {quoted} --reference POSES"),
             (
-                "Go on in COLMAP (viewer, dense reconstruction)",
+                "Open it in COLMAP, to look at it or for a dense reconstruction",
                 f"colmap gui --import_path {shlex.quote(str(out / 'sparse' / '0'))} "
                 f"--database_path {shlex.quote(str(out / 'database.db'))} --image_path {photos}",
             ),
@@ -51,4 +51,4 @@ def next_steps(folder: Path, images: Path | None, *, model: bool) -> list[tuple[
     else:
         again = f"jaxsfm reconstruct {photos} --out NEW --preset robust"
         steps = [("Try again with enlarged photos", again)]
-    return [*steps, ("Make this page again", f"jaxsfm report {quoted} --images {photos}")]
+    return [*steps, ("Write this page again", f"jaxsfm report {quoted} --images {photos}")]

@@ -71,9 +71,9 @@ def verdict(report: RunReport) -> Verdict:
 
 def _sentences(report: RunReport, best: ModelRow) -> Iterable[str]:
     yield (
-        "The points of the model, projected into the photos, lie "
-        f"{best.reprojection_error_px:.2f} px from where they were seen, on average. A good model "
-        "has a small value, but a small value alone does not prove that a model is good."
+        "On average, the model projects a point "
+        f"{best.reprojection_error_px:.2f} px away from the place where it was seen in a photo. A "
+        "good model has a small value, but a small value alone does not prove that a model is good."
     )
     if report.evaluation:
         position, rotation = report.evaluation.position, report.evaluation.rotation_deg
@@ -87,8 +87,8 @@ def _sentences(report: RunReport, best: ModelRow) -> Iterable[str]:
         )
     else:
         yield report.evaluation_failed or (
-            "There are no reference poses to compare with: look at the 3-D model and at the "
-            "refused pairs to judge it."
+            "There are no reference poses to compare with. To judge the model, look at its 3-D "
+            "view and at the refused pairs."
         )
 
 
