@@ -108,8 +108,8 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         print(
-            "jaxsfm: interrupted. Finished work of reconstruct is kept, and the same command continues "
-            "it; finished rows of bench are in the --json file",
+            "jaxsfm: interrupted. Finished work of reconstruct is kept, and the same command "
+            "continues it; finished rows of bench are in the --json file",
             file=sys.stderr,
         )
         if any(thread.name == "jaxsfm-colmap" for thread in threading.enumerate()):
@@ -128,8 +128,8 @@ def main(argv: list[str] | None = None) -> int:
         if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
         print(
-            "jaxsfm: out of memory. A smaller --max-size needs less memory; reconstruct also continues "
-            "with a smaller --memory-gb, --images-at-once or --pairs-at-once",
+            "jaxsfm: out of memory. A smaller --max-size needs less memory; reconstruct also "
+            "continues with a smaller --memory-gb, --images-at-once or --pairs-at-once",
             file=sys.stderr,
         )
         return 1
