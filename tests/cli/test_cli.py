@@ -483,7 +483,7 @@ def test_remapping_without_success_keeps_the_earlier_model(scene, tmp_path, caps
     report = (out / "report.json").read_bytes()
     args = ["reconstruct", scene / "images", "--out", out, "--intrinsics", "SIMPLE_PINHOLE:9,1,1"]
     assert main([str(a) for a in args]) == 1
-    assert "the earlier one stays" in capsys.readouterr().err
+    assert "so the earlier model stays" in capsys.readouterr().err
     assert {p: p.read_bytes() for p in (out / "sparse").rglob("*.bin")} == before
     assert (out / "report.json").read_bytes() == report
     assert json.loads((out / "failed" / "report.json").read_text())["models"] == []
@@ -611,7 +611,7 @@ def test_given_matches_are_mapped_beside_ours_and_another_file_is_another_mappin
     theirs = tmp_path / "theirs.db"
     shutil.copyfile(out / "database.db", theirs)
     both = run(scene, tmp_path / "out", *given, "--with-database", theirs)
-    assert "matches in 3 pairs of 3 images, mapped beside" in capsys.readouterr().out
+    assert "images, mapped together with the run's own" in capsys.readouterr().out
     assert both["given"]["images"] == 3 and both["given"]["pairs"] > 0
     assert both["models"][0]["registered"] == 3 and report["given"] is None
     mine = dict(rows(out, "select image_id, rows from keypoints"))

@@ -6,8 +6,9 @@ import pytest
 from epipolar import two_views
 from strategies import rng_of
 
-from jaxsfm.colmap.database import read_matches, verify
+from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.verification import VerificationOptions, verify
 
 APART = np.repeat([0.0, 6.0, 24.0], [200, 100, 100])
 """Pixels between matches and the geometry: none, between 4 and 8, more than either."""
@@ -41,6 +42,6 @@ def write(path, xy0, xy1, *, zoom):
 def test_the_tolerance_grows_with_the_photos_pixels_per_working_pixel(tmp_path, zoom, scale, kept):
     f, xy0, xy1 = two_views(rng_of(0), n=len(APART))
     write(tmp_path / "d.db", xy0, apart_from_their_lines(f, xy0, xy1, APART), zoom=zoom)
-    verify(tmp_path / "d.db", seed=0, threads=1, scale=scale, relative_poses=False)
+    verify(tmp_path / "d.db", VerificationOptions(threads=1, scale=scale, relative_poses=False))
     found = read_matches(tmp_path / "d.db", ("a", "b"), verified=True)[0]
     assert abs(len(found) - kept) < 20

@@ -53,7 +53,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/blocks": ("tests/core/test_blocks.py", "tests/core/test_vgg.py"),
     "core/features": ("tests/core/test_features.py", BACKBONES),
     "core/grid": (NUMERICS,),
-    "core/night": ("tests/core/test_night.py", "tests/core/test_views.py"),
+    "core/night": ("tests/core/test_night_model.py", "tests/core/test_views.py"),
     "core/numerics": (NUMERICS,),
     "core/octaves": ("tests/core/test_octaves.py",),
     "core/pair_shape": ("tests/core/test_presets.py",),

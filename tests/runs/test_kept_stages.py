@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from jaxsfm.cli.main import main
-from jaxsfm.colmap import models as colmap_models
-from jaxsfm.runs import reconstruct as run
+from jaxsfm.colmap import model_folders
+from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import reconstruction
 
 
@@ -25,8 +25,8 @@ def counted(monkeypatch) -> dict[str, int]:
 
         monkeypatch.setattr(owner, name, wrapped)
 
-    count(run.WorkFolder, "save_features", "extract")
-    count(run.WorkFolder, "save_matches", "match")
+    count(WorkFolder, "save_features", "extract")
+    count(WorkFolder, "save_matches", "match")
     count(reconstruction, "verify", "verify")
     count(reconstruction, "build_models", "map")
     count(reconstruction, "_refined", "refine")
@@ -87,8 +87,8 @@ def test_cameras_keep_what_is_known_of_their_focal_length(tmp_path):
         for camera_id, camera in sorted(model.cameras.items()):
             camera.has_prior_focal_length = camera_id % 2 == 1
             assert db.write_camera(camera) == camera_id
-    colmap_models.write_models([model], tmp_path / "sparse")
-    (back,) = colmap_models.read_models(tmp_path / "sparse", database)
+    model_folders.write_models([model], tmp_path / "sparse")
+    (back,) = model_folders.read_models(tmp_path / "sparse", database)
     known = {k: c.has_prior_focal_length for k, c in back.cameras.items()}
     assert known == {k: k % 2 == 1 for k in model.cameras} and True in known.values()
 
