@@ -75,6 +75,7 @@ def test_every_cell_ends_where_a_plain_loop_ends(seed):
             np.testing.assert_array_equal(np.asarray(walk(some, row, col, children=k)), expected)
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(seeds, st.sampled_from([2, 4]), st.sampled_from([1, 2, 3]), st.floats(0.3, 2.0))
 def test_random_walks_end_where_all_paths_end(seed, k, levels, temperature):
@@ -111,6 +112,7 @@ def test_the_soft_walk_becomes_the_hard_one_as_it_cools(seed, k):
     assert apart[0] > 1e-4 > apart[1] and apart[2] == 0
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(seeds)
 def test_straight_through_has_the_hard_value_and_the_soft_gradient(seed):
@@ -131,7 +133,9 @@ def test_straight_through_has_the_hard_value_and_the_soft_gradient(seed):
 
 
 @pytest.mark.parametrize("k", [2, 4])
-@pytest.mark.parametrize("kind", ["random", "zero", "ties", "one pixel"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("random", marks=pytest.mark.slow), "zero", "ties", "one pixel"]
+)
 def test_gradients_are_finite_and_those_of_central_differences(kind, k):
     """In float64, so that differences tell: through squared norms of features down to zeros."""
     with jax.enable_x64(True):

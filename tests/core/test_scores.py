@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import tolerances
 from hypothesis import given, settings
 from strategies import rng_of, seeds
@@ -84,6 +85,7 @@ def test_scores_stay_finite_whatever_was_learned():
             assert bool(jnp.isfinite(found).all())
 
 
+@pytest.mark.slow
 def test_the_network_scores_strip_by_strip_as_on_whole_maps():
     weights, params = load_weights(), random_scores(3)
     rng = rng_of(0)

@@ -87,7 +87,7 @@ def test_bfloat16_rounds_operands_and_results_and_adds_in_float32(weights, photo
         assert 1e-4 < apart < 0.02, name
 
 
-@pytest.mark.parametrize("rows", [1, 20, 64, 100])
+@pytest.mark.parametrize("rows", [pytest.param(1, marks=pytest.mark.slow), 20, 64, 100])
 def test_strips_of_any_height_give_the_same(weights, photo, monkeypatch, rows):
     def levels():
         jax.clear_caches()  # what was compiled before has other strips
@@ -132,6 +132,7 @@ def test_preprocessing_is_scale_then_mean_then_std():
     np.testing.assert_allclose(np.asarray(out)[0, 0], [4.0, 1.5, 0.5])
 
 
+@pytest.mark.slow
 def test_both_convolutions_give_the_same_maps(weights, photo, monkeypatch):
     """On CPUs; elsewhere it compares the library's with itself."""
     sizes = [photo.shape[:2]]

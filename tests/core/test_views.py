@@ -56,6 +56,7 @@ def test_views_sample_the_photo_where_the_homography_says(photo):
     np.testing.assert_allclose(beyond, jnp.broadcast_to(photo[-1, -1], beyond.shape), atol=0.5)
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(seeds)
 def test_pairs_depend_on_their_key_alone_and_are_whole_numbers(photo, seed):
