@@ -51,6 +51,7 @@ def write_points(path, rng, *, per_plane=60, outliers=30):
     np.savetxt(path, np.concatenate(parts))
 
 
+@pytest.mark.slow
 def test_exact_planes_among_outliers_are_found(tmp_path, capsys):
     write_points(tmp_path / "walls_pts.txt", rng_of(0))
     out = tmp_path / "f.json"

@@ -452,6 +452,7 @@ def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
     assert all(row["help"] for row in report["lost"])
 
 
+@pytest.mark.slow
 def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("jaxsfm.io.features.total_memory", lambda: 920_000_000)
     images = [scene / "images" / n for n in ("view0.png", "view2.png")]

@@ -247,6 +247,7 @@ def test_sampling_is_exact_on_pixels_and_parabolas_and_clamped_outside():
     np.testing.assert_allclose(got, want, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_where_a_keypoint_ends_follows_the_map_and_its_gradient_is_finite():
     """Moving the whole map by t moves the aligned keypoint by t: d xy / d t = identity."""
     f, ref = texture(rng_of(4)), np.asarray([40.0, 32.0])

@@ -69,6 +69,7 @@ def test_tiled_consensus_equals_the_sum_over_shifts(seed, shapes, radius, tile):
     assert decided.mean() >= 0.7
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(seeds, st.sampled_from(SHAPES), st.sampled_from([7, 60]), st.sampled_from([2, 4]))
 def test_products_of_octaves_are_blends_of_their_cells_products(seed, shapes, tile, octaves):

@@ -76,6 +76,7 @@ def cells_of(x, grid):
     return np.asarray(x)[: grid[0] * grid[1]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(256, 192), (250, 181)])
 def test_an_octave_is_the_smaller_image_described_alone(weights, photos, size):
     small = photos[2][: size[1], : size[0]]
@@ -91,6 +92,7 @@ def test_an_octave_is_the_smaller_image_described_alone(weights, photos, size):
         assert not np.asarray(ours)[grid[0] * grid[1] :].any()
 
 
+@pytest.mark.slow
 def test_more_room_changes_no_octave(weights, photos):
     features = of(weights, photos[1][:192, :256], octaves=3, centred=True)
     wide = pad_features(features, 4 * features.coarse[0].shape[0])
@@ -100,6 +102,7 @@ def test_more_room_changes_no_octave(weights, photos):
     assert not np.asarray(far.coarse[len(near.coarse) :]).any()
 
 
+@pytest.mark.slow
 def test_the_smallest_image_has_octaves_without_cells(weights, photos):
     features = of(weights, photos[0][:48, :50], octaves=4, centred=True)
     joined = np.asarray(join(features).coarse)

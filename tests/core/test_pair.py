@@ -87,6 +87,7 @@ def test_matches_follow_the_known_map(features_of, warped, key, preset):
     )
 
 
+@pytest.mark.slow
 def test_relocalization_puts_more_matches_within_a_pixel_than_cell_centres(weights, warped, key):
     first, second, _, h = warped
     share = {}
@@ -165,6 +166,7 @@ def test_a_batch_is_its_pairs_one_by_one_bit_for_bit(features_of):
                 assert abs(int(got.num_inliers[0]) - int(expected.num_inliers[0])) <= 3
 
 
+@pytest.mark.slow
 def test_more_room_changes_nothing(features, key):
     f0, f1, _ = features
     shape = PRESETS["paper"].pair
@@ -217,6 +219,7 @@ def test_one_compilation_serves_all_values(features, key):
     assert pair.match_pair._cache_size() == before + 1
 
 
+@pytest.mark.slow
 def test_the_pipeline_widens_the_votes_for_wide_images(features):
     image = ImageFile(name="a", path=Path("a"), size=SIZE, sha256=64 * "0")
     sides = [ImageFeatures(image, (1.0, 1.0), dense) for dense in features[:2]]

@@ -107,6 +107,7 @@ def test_hard_cases_that_the_true_minimal_solution_solves(key, preset):
     assert (np.asarray(planes.plane)[label == 0] == 0).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_the_capacity_and_the_chunks_change_nothing(key):
     xy0, xy1, _, _ = scene(4, [150, 80])
     planes = run(key, xy0, xy1)

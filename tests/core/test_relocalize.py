@@ -95,6 +95,7 @@ def test_random_walks_end_where_all_paths_end(seed, k, levels, temperature):
         np.testing.assert_allclose(mean[m], centre, atol=1e-3)
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(seeds, st.sampled_from([2, 4]))
 def test_the_soft_walk_becomes_the_hard_one_as_it_cools(seed, k):

@@ -28,6 +28,7 @@ def random_scores(seed: int) -> dict:
     return jax.tree.map(lambda x: x + jnp.asarray(rng.normal(size=x.shape), x.dtype) / 4, params)
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(seeds)
 def test_untrained_scores_are_squared_norms_to_the_last_bit(seed):

@@ -87,7 +87,9 @@ def test_bfloat16_rounds_operands_and_results_and_adds_in_float32(weights, photo
         assert 1e-4 < apart < 0.02, name
 
 
-@pytest.mark.parametrize("rows", [pytest.param(1, marks=pytest.mark.slow), 20, 64, 100])
+@pytest.mark.parametrize(
+    "rows", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 20, 100)), 64]
+)
 def test_strips_of_any_height_give_the_same(weights, photo, monkeypatch, rows):
     def levels():
         jax.clear_caches()  # what was compiled before has other strips
@@ -111,6 +113,7 @@ def test_a_batch_is_its_images_one_by_one(weights, photo):
             assert_maps_equal(a[i], np.asarray(b[0]))
 
 
+@pytest.mark.slow
 def test_jit_equals_eager(weights, photo):
     small = photo[None, :32, :32]
     sizes = jnp.asarray([[32, 32]], jnp.int32)

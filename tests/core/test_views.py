@@ -71,6 +71,7 @@ def test_pairs_depend_on_their_key_alone_and_are_whole_numbers(photo, seed):
         np.testing.assert_array_equal(view, jnp.round(view))
 
 
+@pytest.mark.slow
 def test_no_strength_changes_nothing(photo):
     nothing = jnp.float32(0)
     key = jax.random.key(0)

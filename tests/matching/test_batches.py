@@ -136,6 +136,7 @@ def test_any_number_of_devices_gives_what_one_gives_bit_for_bit(folder):
     assert count > 50 and same == [True, True]
 
 
+@pytest.mark.slow
 def test_features_are_the_programs_rounded_once(weights, images):
     image, config = images[0], preset("default")
     found = image_features(weights, image, config=config)
@@ -148,6 +149,7 @@ def test_features_are_the_programs_rounded_once(weights, images):
     assert found.capacity == feature_capacity(image.size)
 
 
+@pytest.mark.slow
 def test_a_photo_that_went_away_is_told_and_the_others_are_there(weights, images, tmp_path):
     gone = dataclasses.replace(images[1], path=tmp_path / "gone.png")
     some = [images[0], gone, *images[2:]]

@@ -162,6 +162,7 @@ def test_one_thread_gives_the_same_model_to_the_last_bit(rendered):
         assert np.array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_thresholds_refuse_what_makes_no_sense_and_have_effects(rendered):
     for wrong in ({"passes": 0}, {"radius": 0}, {"max_shift_px": 0.0}, {"min_score": 1.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):

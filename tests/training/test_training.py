@@ -44,6 +44,7 @@ def few_measurements(monkeypatch):
     monkeypatch.setattr(relocalizer, "EVALUATION_BATCHES", 1)
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss_on_the_views_it_sees(weights, images, tmp_path, few_measurements):
     """All steps use the same batch."""
     options = dataclasses.replace(SMALL, steps=60, hidden=8, learning_rate=0.05)
@@ -129,6 +130,7 @@ def test_photos_smaller_than_a_crop_are_mirrored(tmp_path, photos):
     assert crops.shape == (1, 200, 200, 3) and crops.std() > 10
 
 
+@pytest.mark.slow
 def test_untrained_scores_give_the_paper_s_keypoints(folder, images, tmp_path):
     path = tmp_path / "untrained.safetensors"
     save_relocalizer(path, jax.device_get(init_scores(jax.random.key(0))), {})

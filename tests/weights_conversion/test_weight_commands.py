@@ -32,6 +32,7 @@ def refused(capsys, *args) -> str:
     return error
 
 
+@pytest.mark.slow
 def test_a_conversion_is_verified_and_shown(other, capsys):
     source, target = other
     assert main(["weights", "verify", str(source), str(target), "--size", "40"]) == 0

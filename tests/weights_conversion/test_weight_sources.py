@@ -253,6 +253,7 @@ def test_a_converted_file_is_no_source_and_no_source_is_overwritten(files, sourc
     assert files["keras_1"].read_bytes() == before
 
 
+@pytest.mark.slow
 def test_vgg19_of_torchvision_is_known_by_its_last_layer(sources, tmp_path):
     """VGG-19 has three more convolutions, so its modules have other numbers than VGG-16's."""
     layers = random_layers({n: (3 if i == 3 else i // 16, o // 16) for n, (i, o) in DEEP.items()})
