@@ -582,7 +582,7 @@ def test_no_description_of_an_option_is_broken_where_the_source_wraps():
         attributes = (choice.__doc__ or "").partition("Attributes:")[2]
         assert attributes and not re.search(r"\n {4}", attributes), choice.__name__
     assert "Folder with the photos; sub-folders are included.\n" in COMMANDS["reconstruct"].__doc__
-    assert "Longer side of the working images, pixels.\n" in MatchingChoice.__doc__
+    assert "convolutions: Number format in which the network multiplies." in MatchingChoice.__doc__
 
 
 def test_every_option_has_a_description(capsys, monkeypatch):

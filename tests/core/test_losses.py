@@ -48,6 +48,7 @@ def random_homography(seed: int) -> np.ndarray:
     return h
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(seeds, st.floats(0.3, 5.0))
 def test_agreement_is_the_probability_that_drawn_walks_agree(seed, sigma):

@@ -109,6 +109,7 @@ def test_the_smallest_image_has_octaves_without_cells(weights, photos):
     assert np.isfinite(joined).all() and joined[:9].any(1).all() and not joined[9:].any()
 
 
+@pytest.mark.slow
 def test_centred_descriptors_have_no_common_part(weights, photos):
     plain = of(weights, photos[3][:384, :512])
     centred = of(weights, photos[3][:384, :512], centred=True)

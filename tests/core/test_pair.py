@@ -71,7 +71,13 @@ def equal(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
+@pytest.mark.parametrize(
+    "preset",
+    [
+        "paper",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in sorted(PRESETS.keys() - {"paper"})),
+    ],
+)
 def test_matches_follow_the_known_map(features_of, warped, key, preset):
     f0, f1, _ = features_of(PRESETS[preset])
     found = match_pair(key, f0, f1, THRESHOLDS, shape=PRESETS[preset].pair)

@@ -93,19 +93,8 @@ def test_the_true_pose_has_no_epipolar_error(seed):
     assert float(epipolar_loss(jnp.eye(30), project(points), project(moved), wrong)) > 0.01
 
 
-SLOW = pytest.mark.slow
-
-
-@pytest.mark.parametrize(
-    "part",
-    [
-        pytest.param("scores", marks=SLOW),
-        pytest.param("conv1_1", marks=SLOW),
-        "conv2_2",
-        "conv3_3",
-        "pose",
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["scores", "conv1_1", "conv2_2", "conv3_3", "pose"])
 def test_gradients_from_the_loss_to_the_parameters_are_those_of_central_differences(part):
     """Two images of 32 x 32 through the network, soft matches and soft keypoints, in float64."""
     shapes = init_shapes()

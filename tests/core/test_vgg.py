@@ -68,6 +68,7 @@ def test_levels_are_the_pyramid_without_its_largest_maps(weights, photo, size):
     assert_maps_equal(levels.pool4, np.asarray(maps.pool4))
 
 
+@pytest.mark.slow
 def test_bfloat16_rounds_operands_and_results_and_adds_in_float32(weights, photo):
     """One layer exactly; the network as bfloat16's eight bits let it."""
     x, layer = jnp.asarray(photo[None]), weights.params["params"]["conv1_1"]

@@ -24,6 +24,7 @@ def photo() -> jax.Array:
     return jnp.asarray(photo_textures()[0][100:300, 100:300], jnp.float32)
 
 
+@pytest.mark.slow
 def test_the_second_view_is_the_first_one_mapped(photo, monkeypatch):
     """Without light: what the first shows, warped by h, is what the second shows."""
     monkeypatch.setattr(views, "change_light", lambda key, rgb, strength: rgb)
