@@ -21,7 +21,7 @@ demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare it with the
 test: $(VENV)/.dev ## run the quick tests: at most 8 minutes on two cores
 	$(PYTEST) -m "not slow"
 
-test-all: $(VENV)/.dev ## run all tests, the slow ones too: at most 20 minutes on two cores
+test-all: $(VENV)/.dev ## run all tests, the slow ones too
 	$(PYTEST)
 
 mutants: $(VENV)/.dev ## make deliberate mistakes in the core and the refinement: do tests fail?

@@ -7,7 +7,6 @@ import numpy as np
 
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile, WorkingImage, read_image, working_size
-from jaxsfm.io.pixels import Pixels
 
 Reader = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
 """A photo's name -> the pixels of its working image, and original pixels per working pixel."""
@@ -47,11 +46,6 @@ class Photos(Mapping[str, ImageFile]):
     def working_size(self, name: str) -> tuple[int, int]:
         """(width, height) of the working image."""
         return working_size(self[name].size, self._config.max_size, self._config.enlarge)
-
-    def pixels(self, name: str) -> Pixels:
-        """How the pixels of the working image lie on those of the photo."""
-        (width, height), (w, h) = self[name].size, self.working_size(name)
-        return Pixels((width / w, height / h))
 
     def median_scale(self) -> float:
         """The median over the photos of original pixels per working pixel, on the longer side."""
