@@ -13,7 +13,7 @@ from pathlib import Path
 def main(compiled: str) -> None:
     os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "true"
     os.environ["JAX_COMPILATION_CACHE_DIR"] = compiled
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     # Everything a run imports late; no JAX computation before the fork.
     import jaxsfm.cli.main  # noqa: I001
     import jaxsfm.report.page.write  # noqa: F401

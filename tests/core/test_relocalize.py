@@ -38,6 +38,9 @@ def cells() -> tuple[np.ndarray, np.ndarray]:
     return row.ravel().astype(np.int32), col.ravel().astype(np.int32)
 
 
+ends = jax.jit(relocalize, static_argnames=("children", "variant"))
+
+
 @functools.partial(jax.jit, static_argnames=("children", "variant"))
 def walk(maps, row, col, children=2, variant="hard", temperature=1.0):
     scores = [squared_norm(jnp.asarray(m)) for m in maps]
@@ -81,11 +84,10 @@ def test_every_cell_ends_where_a_plain_loop_ends(seed):
 def test_random_walks_end_where_all_paths_end(seed, k, levels, temperature):
     scores = [squared_norm(jnp.asarray(m)) for m in random_maps(seed)[:levels]]
     row, col = cells()
-    ends = random_walk(
-        scores, jnp.asarray(row), jnp.asarray(col), temperature=temperature, children=k
-    )
-    places, p = np.asarray(window_positions(ends)), np.asarray(ends.p).reshape(len(row), -1)
-    mean = np.asarray(expectation(ends))
+    walked = jax.jit(random_walk, static_argnames="children")
+    window = walked(scores, jnp.asarray(row), jnp.asarray(col), temperature=temperature, children=k)
+    places, p = np.asarray(window_positions(window)), np.asarray(window.p).reshape(len(row), -1)
+    mean = np.asarray(expectation(window))
     for m in range(len(row)):
         args = (int(row[m]), int(col[m]), temperature, k, LEAST_SCORE)
         expected = oracles.random_walk([np.asarray(s) for s in scores], *args)
@@ -101,16 +103,20 @@ def test_random_walks_end_where_all_paths_end(seed, k, levels, temperature):
 def test_the_soft_walk_becomes_the_hard_one_as_it_cools(seed, k):
     scores = distinct_scores(seed)
     row, col = map(jnp.asarray, cells())
-    hard = relocalize(scores, row, col, children=k)
-    apart = [
-        float(
-            jnp.abs(
-                relocalize(scores, row, col, variant="soft", temperature=t, children=k) - hard
-            ).max()
-        )
+    hard = ends(scores, row, col, children=k)
+    soft = [
+        ends(scores, row, col, variant="soft", temperature=t, children=k)
         for t in (1.0, 1e-4, 1e-37)
     ]
+    apart = [float(jnp.abs(xy - hard).max()) for xy in soft]
     assert apart[0] > 1e-4 > apart[1] and apart[2] == 0
+
+
+@functools.partial(jax.jit, static_argnames="variant")
+@jax.grad
+def slopes_of(scores, row, col, variant):
+    xy = relocalize(scores, row, col, variant=variant, temperature=0.5)
+    return jnp.sum(jnp.sin(jnp.arange(xy.size, dtype=jnp.float32)) * xy.reshape(-1))
 
 
 @pytest.mark.slow
@@ -120,17 +126,26 @@ def test_straight_through_has_the_hard_value_and_the_soft_gradient(seed):
     scores = distinct_scores(seed)
     row, col = map(jnp.asarray, cells())
 
-    def total(scores, variant):
-        xy = relocalize(scores, row, col, variant=variant, temperature=0.5)
-        return jnp.sum(jnp.sin(jnp.arange(xy.size, dtype=jnp.float32)) * xy.reshape(-1))
-
     np.testing.assert_array_equal(
-        relocalize(scores, row, col, variant="straight-through"), relocalize(scores, row, col)
+        ends(scores, row, col, variant="straight-through"), ends(scores, row, col)
     )
-    through, soft = (jax.grad(total)(scores, v) for v in ("straight-through", "soft"))
+    through, soft = (slopes_of(scores, row, col, v) for v in ("straight-through", "soft"))
     for a, b in zip(through, soft, strict=True):
         np.testing.assert_array_equal(a, b)
     assert max(float(jnp.abs(g).max()) for g in soft) > 0
+
+
+def weighted_ends(maps, children):
+    """A sum of the soft walks' coordinates with weights of its own."""
+    scores = [squared_norm(m) for m in maps]
+    row, col = (jnp.asarray(x) for x in cells())
+    xy = relocalize(scores, row, col, variant="soft", temperature=0.7, children=children)
+    return jnp.sum(rng_of(1).normal(size=(len(row), 2)) * xy)
+
+
+# Compiled once for all kinds of maps: four children compile for ten seconds.
+slopes = jax.jit(jax.grad(weighted_ends), static_argnames="children")
+weighted_ends = jax.jit(weighted_ends, static_argnames="children")
 
 
 @pytest.mark.slow
@@ -145,16 +160,8 @@ def test_gradients_are_finite_and_those_of_central_differences(kind, k):
         if kind == "one pixel":
             for m in maps:
                 m[1, 1, 0] = 1.0
-        row, col = (jnp.asarray(x) for x in cells())
-        weights = rng_of(1).normal(size=(len(row), 2))
-
-        def total(maps):
-            scores = [squared_norm(m) for m in maps]
-            xy = relocalize(scores, row, col, variant="soft", temperature=0.7, children=k)
-            return jnp.sum(weights * xy)
-
         maps = [jnp.asarray(m) for m in maps]
-        gradient = jax.grad(total)(maps)
+        gradient = slopes(maps, children=k)
         assert all(bool(jnp.isfinite(g).all()) for g in gradient)
         for seed in range(3):
             rng = rng_of(seed)
@@ -162,7 +169,8 @@ def test_gradients_are_finite_and_those_of_central_differences(kind, k):
             step = 1e-6
 
             def moved(sign, way=way, step=step):
-                return total([m + sign * step * w for m, w in zip(maps, way, strict=True)])
+                there = [m + sign * step * w for m, w in zip(maps, way, strict=True)]
+                return weighted_ends(there, children=k)
 
             difference = (moved(1) - moved(-1)) / (2 * step)
             slope = sum(jnp.sum(g * w) for g, w in zip(gradient, way, strict=True))

@@ -17,7 +17,9 @@ from databases import content
 from jaxsfm.bench.synthetic import write_scene
 from jaxsfm.io.atomic import PARTIAL, load_arrays
 
-KILLS, SEED = 50, 8
+KILLS, SEED = 15, 8
+"""Fifteen kills, one in each fifteenth of a run, meet more different moments than as many at random
+and cost a quarter of the time of fifty."""
 OPTIONS = ("--preset", "paper", "--refine", "1", "--threads", "1", "--pairs", "exhaustive")
 
 
@@ -77,7 +79,7 @@ def assert_whole(out: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_fifty_times_at_random_moments_nothing_is_lost_or_changed(tmp_path, nursery):
+def test_killed_in_every_part_of_a_run_nothing_is_lost_or_changed(tmp_path, nursery):
     write_scene(tmp_path, num_views=4, size=(192, 144))
     command = ["reconstruct", str(tmp_path / "images"), *OPTIONS, "--out"]
     whole = tmp_path / "whole"
@@ -86,10 +88,11 @@ def test_killed_fifty_times_at_random_moments_nothing_is_lost_or_changed(tmp_pat
     status, seconds = nursery.run([*command, str(tmp_path / "again")])
     assert status == 0 and results(tmp_path / "again") == results(whole)
     rng = np.random.default_rng(SEED)
-    killed, finished, steps = 0, 0, set()
-    while killed < KILLS:
+    moments = rng.permutation(seconds * (np.arange(KILLS) + rng.uniform(size=KILLS)) / KILLS)
+    finished, steps = 0, set()
+    for moment in moments:
         out = tmp_path / f"out{finished}"
-        status, _ = nursery.run([*command, str(out)], rng.uniform(0, seconds))
+        status, _ = nursery.run([*command, str(out)], moment)
         assert status in (0, -signal.SIGKILL), nursery.log.read_text(errors="replace")[-2000:]
         if out.exists():
             steps.add(
@@ -99,12 +102,10 @@ def test_killed_fifty_times_at_random_moments_nothing_is_lost_or_changed(tmp_pat
                 )
             )
             assert_whole(out)
-        if status:
-            killed += 1
-        else:
+        if status == 0:
             assert results(out) == results(whole)
             finished += 1
     status, _ = nursery.run([*command, str(out)])
     assert status == 0 and results(out) == results(whole)
     assert not list(tmp_path.glob(f"out*/**/*{PARTIAL}"))
-    assert finished >= 3 and len(steps) >= 5, "the kills must meet different moments"
+    assert finished >= 1 and len(steps) >= 5, "the kills must meet different moments"
