@@ -299,3 +299,17 @@ def test_templates_are_normalised_and_a_patch_weighs_one():
     np.testing.assert_allclose(jnp.einsum("q,nqc->n", w, t.values**2), [1.0], rtol=1e-4)
     with pytest.raises(ValueError, match="radius"):
         square_patch(0)
+
+
+@pytest.mark.parametrize(("radius", "sigma"), [(2, None), (3, 2.0)])
+def test_weights_of_a_patch_fall_like_a_gaussian_around_its_centre(radius, sigma):
+    patch = square_patch(radius, spacing=0.5, sigma=sigma)
+    side = 2 * radius + 1
+    weights = np.asarray(patch.weights, np.float64).reshape(side, side)
+    steps = np.arange(side) - radius
+    square = steps[:, None] ** 2 + steps**2  # in steps of the grid, whatever the spacing
+    expected = np.exp(-square / (2 * (sigma or radius / 2) ** 2))
+    np.testing.assert_allclose(weights, expected / expected.sum(), rtol=1e-5)
+    offsets = np.asarray(patch.offsets).reshape(side, side, 2)
+    np.testing.assert_array_equal(offsets[..., 0], np.broadcast_to(0.5 * steps, (side, side)))
+    np.testing.assert_array_equal(offsets[..., 1], offsets[..., 0].T)

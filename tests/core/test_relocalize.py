@@ -13,7 +13,6 @@ from strategies import rng_of, seeds
 
 from jaxsfm.core.numerics import squared_norm
 from jaxsfm.core.relocalize import (
-    LEAST_SCORE,
     expectation,
     relocalize,
     window_positions,
@@ -21,6 +20,8 @@ from jaxsfm.core.relocalize import (
 from jaxsfm.core.relocalize import walk as random_walk
 
 ROWS, COLS = 3, 5
+LEAST = 1e-3
+"""The score that is added to every pixel of a soft walk (docs/decisions/relocalization.md)."""
 
 
 def random_maps(seed: int, *, ties: bool = False) -> list[np.ndarray]:
@@ -89,7 +90,7 @@ def test_random_walks_end_where_all_paths_end(seed, k, levels, temperature):
     places, p = np.asarray(window_positions(window)), np.asarray(window.p).reshape(len(row), -1)
     mean = np.asarray(expectation(window))
     for m in range(len(row)):
-        args = (int(row[m]), int(col[m]), temperature, k, LEAST_SCORE)
+        args = (int(row[m]), int(col[m]), temperature, k, LEAST)
         expected = oracles.random_walk([np.asarray(s) for s in scores], *args)
         for place, probability in zip(places[m].astype(int), p[m], strict=True):
             assert abs(expected.get(tuple(place), 0.0) - probability) < 1e-5

@@ -72,6 +72,19 @@ def test_pairs_depend_on_their_key_alone_and_are_whole_numbers(photo, seed):
         np.testing.assert_array_equal(view, jnp.round(view))
 
 
+def test_views_lie_around_the_middle_of_the_photo(monkeypatch):
+    """Of a photo whose values are the columns of its pixels: their mean over many first views."""
+    monkeypatch.setattr(views, "change_light", lambda key, rgb, strength: rgb)
+    monkeypatch.setattr(views, "night", lambda key, rgb, severity: rgb)
+    side = 40
+    ramp = jnp.broadcast_to(
+        6.0 * jnp.arange(side, dtype=jnp.float32)[None, :, None], (side, side, 3)
+    )
+    draw = jax.jit(jax.vmap(lambda key: view_pair(key, ramp, size=9).view0[4, 4, 0] / 6))
+    middle = np.asarray(draw(jax.random.split(jax.random.key(1), 400)))
+    assert abs(middle.mean() - (side - 1) / 2) < 0.2  # six times the deviation of the mean
+
+
 @pytest.mark.slow
 def test_no_strength_changes_nothing(photo):
     nothing = jnp.float32(0)

@@ -41,6 +41,8 @@ def test_zero_rows_of_a_sample_do_not_count(key):
     padded = np.r_[x, np.zeros((28, 8), np.float32)]
     words = fit(key, jnp.asarray(padded))
     np.testing.assert_allclose(words.mean, x.mean(0), rtol=1e-5)
+    alone = np.abs(fit(key, jnp.asarray(x)).whitening)  # axes have no sign
+    np.testing.assert_allclose(np.abs(words.whitening), alone, rtol=1e-3, atol=1e-4)
     assert np.all(np.linalg.norm(words.centres, axis=1) > 0.1)
     assert not np.any(whitened(jnp.asarray(padded), words)[100:])
 

@@ -10,6 +10,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.sfm.register import triangulate
 from jaxsfm.sfm.register.grow import UnregisteredView, grow
 from jaxsfm.sfm.register.triangulate import matched_tracks, new_points, triangulated
 
@@ -101,6 +102,21 @@ def test_alignment_takes_the_noise_of_matches_away(rendered, refinement):
     off = np.abs(np.einsum("npk,pk->np", made.points[:, None] - planes[None, :, 0], planes[:, 1]))
     error = np.median(off[np.arange(len(off)), _nearest(made.points, rendered.points)])
     assert error < 0.004 if refinement else error > 0.004
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_as_few_new_points_as_a_model_needs_are_aligned(rendered, monkeypatch, missing):
+    aligned = []
+    blocks = triangulate.align_blocks
+    monkeypatch.setattr(
+        triangulate, "align_blocks", lambda *rest: aligned.append(1) or blocks(*rest)
+    )
+    arguments = half_known(rendered), {NEW}, all_matches(rendered), read_of(rendered)
+    count = len(new_points(*arguments, refinement=None).points)
+    assert not aligned
+    monkeypatch.setattr(triangulate, "MIN_POINTS", count + missing)
+    new_points(*arguments, refinement=Refinement())
+    assert bool(aligned) == (missing == 0)
 
 
 def _nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:

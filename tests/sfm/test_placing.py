@@ -10,6 +10,7 @@ from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine import octave_pose
+from jaxsfm.sfm.refine import pose_doubt as doubts_of_poses
 from jaxsfm.sfm.refine.octave_pose import (
     AlignedPoints,
     OctavePose,
@@ -73,6 +74,16 @@ def test_the_doubt_about_a_pose_is_how_far_off_it_is(rendered, focal):
         errors.append((np.linalg.norm(found.centre - view.centre), turn))
     ratio = np.median(doubts, axis=0) / np.sqrt(np.mean(np.square(errors), axis=0))
     assert (ratio > 0.6).all() and (ratio < 1.4).all(), ratio
+
+
+def test_the_doubt_about_a_pose_adds_the_variances_of_its_three_axes(rendered, monkeypatch):
+    deviations = np.asarray([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) / 100  # of rotation, then of position
+    monkeypatch.setattr(doubts_of_poses, "_covariance", lambda *_: np.diag(deviations**2))
+    monkeypatch.setattr(doubts_of_poses, "_reach", lambda *_: 2.0)
+    points = rendered.points[:10]
+    found = pose_doubt(rendered.views[NIGHT], points, np.zeros((10, 2)), 1.0, 1, focal=False)
+    assert found.rotation_deg == pytest.approx(np.degrees(np.sqrt(1 + 4 + 9) / 100))
+    assert found.centre == pytest.approx(2 * np.sqrt(16 + 25 + 36) / 100)
 
 
 def test_points_in_a_corner_leave_more_doubt_than_fewer_everywhere(rendered):

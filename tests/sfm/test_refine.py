@@ -130,6 +130,35 @@ def test_photos_that_agree_in_nothing_leave_the_model_as_it_was(rendered):
     assert not figures.passes[-1].accepted and errors(after, rendered) == errors(before, rendered)
 
 
+def test_a_pass_that_loses_most_points_is_taken_back(rendered, monkeypatch):
+    from jaxsfm.sfm.refine import passes
+
+    adjust = passes._adjust
+
+    def loses(*arguments):
+        reconstruction, model = adjust(*arguments)
+        for point in list(reconstruction.point3D_ids())[25:]:
+            reconstruction.delete_point3D(point)
+        return reconstruction, model
+
+    monkeypatch.setattr(passes, "_adjust", loses)
+    before = noisy_model(rendered, 1.0)
+    after, figures = refine(before, rendered)
+    assert [f.accepted for f in figures.passes] == [False]
+    assert after.num_points3D() == before.num_points3D() > 50
+    assert errors(after, rendered) == errors(before, rendered)
+
+
+def test_working_sizes_are_widths_and_heights(rendered):
+    from jaxsfm.sfm.refine.passes import NO_EVIDENCE, _working_sizes
+
+    def read(name):
+        return np.zeros((30, 40), np.float32), (2.0, 2.5)
+
+    sizes, _ = _working_sizes(noisy_model(rendered, 1.0), read, NO_EVIDENCE)
+    assert set(sizes.values()) == {((40, 30), (2.0, 2.5))}
+
+
 def test_blocks_of_points_change_nothing(rendered, monkeypatch):
     from jaxsfm.sfm.refine import track_alignment as module
 
@@ -259,3 +288,15 @@ def test_points_move_onto_their_reference_rays_within_their_planes(rendered):
     for k, view in enumerate(rendered.views):
         rows = reference == k
         np.testing.assert_allclose(view.project(moved[rows])[0], moved_xy[rows], atol=1e-6)
+
+
+@pytest.mark.parametrize(("farther", "depth"), [(1.04, 1.04), (1.07, 1.0), (0.96, 0.96), (0.93, 1)])
+def test_a_plane_that_moves_a_point_by_a_twentieth_of_its_depth_is_not_followed(
+    rendered, farther, depth
+):
+    view = dataclasses.replace(rendered.views[0], rotation=np.eye(3), centre=np.zeros(3))
+    # The plane leans by 45 degrees around the point (0, 0, 1); the ray meets it at `farther`.
+    point, normal = np.asarray([[0.0, 0.0, 1.0]]), np.sqrt([[0.5, 0.0, 0.5]])
+    ray = np.asarray([[1 / farther - 1, 0.0, 1.0]])
+    moved = plane_geometry._on_planes(view, view.project(ray)[0], point, normal)
+    np.testing.assert_allclose(moved, depth * ray, atol=1e-6)

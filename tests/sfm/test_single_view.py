@@ -1,6 +1,7 @@
 """Laws of one photo in a finished model, on the rendered room."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
+from jaxsfm.sfm.refine.pose_doubt import PoseDoubt
+from jaxsfm.sfm.register import locate_view
 from jaxsfm.sfm.register.locate_view import Localization, locate
 
 
@@ -54,6 +57,43 @@ def test_a_few_right_matches_are_enough_and_the_error_is_as_expected(rendered):
     assert located.centre_error and located.rotation_error_deg
     assert position < 5 * located.centre_error and degrees < 5 * located.rotation_error_deg
     assert located.centre_error < 0.01 and located.rotation_error_deg < 0.1
+
+
+def test_doubt_counts_patches_of_the_octave_that_the_photo_was_aligned_in(rendered, monkeypatch):
+    sides = []
+
+    def doubt(view, points, xy, error_px, side, *, focal):
+        sides.append(side)
+        return PoseDoubt(0.1, 0.2)
+
+    monkeypatch.setattr(locate_view, "pose_doubt", doubt)
+    located = found(rendered)
+    assert located.octave_px
+    assert sides == [located.octave_px * (2 * Refinement().radius + 1)]
+    assert (located.centre_error, located.rotation_error_deg) == (0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("on_surface", "why"),
+    [(locate_view.MIN_POINTS - 1, "a pose needs"), (locate_view.MIN_POINTS, "no pose agrees")],
+)
+def test_a_photo_without_a_pose_is_told_what_was_missing(rendered, on_surface, why):
+    matches = night_matches(rendered, right=6, wrong=18).matches
+    assert why in (locate_view._nowhere(on_surface, matches).why or "")
+    assert "no plane in common" in (locate_view._nowhere(on_surface, {}).why or "")
+
+
+@pytest.mark.parametrize(
+    ("best", "share", "why"),
+    [
+        (None, 0.0, "alignment finds 3 of the 40 points"),
+        (SimpleNamespace(doubt_px=2.5), 0.001, "at most 0.1 % of the points"),
+        (SimpleNamespace(doubt_px=2.5), 0.9, "leaves 2.50 px of doubt"),
+    ],
+)
+def test_a_pose_that_is_not_trusted_says_what_was_missing(best, share, why):
+    pose = SimpleNamespace(best=best, share=share, agreed=3, candidates=40)
+    assert why in locate_view._doubtful(pose, 12, 30)  # pyright: ignore[reportArgumentType]
 
 
 def test_an_unknown_focal_length_is_found_and_leaves_more_doubt(rendered):
