@@ -91,9 +91,7 @@ class RunReport:
 
     def to_json(self) -> dict[str, Json]:
         """The report as plain JSON."""
-        plain = to_json(self)
-        assert isinstance(plain, dict)
-        return plain
+        return to_json(self)
 
     @classmethod
     def from_json(cls, value: object) -> "RunReport":

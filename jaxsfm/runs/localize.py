@@ -22,13 +22,13 @@ from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.report.finished_run import FinishedRun, read_run
+from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.localize_report import (
     LocalizationReport,
     LocalizedPhoto,
     UnusablePhoto,
     error_against,
-    localized_photo,
 )
 from jaxsfm.runs.queries import Query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
@@ -105,7 +105,7 @@ def localize_photos(
         UnusablePhoto(photo=path, why=why) for path, why in unusable.items()
     ]
     with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-        temporary = Store(Path(scratch), finished.report.identity.to_json())
+        temporary = Store(Path(scratch), to_json(finished.report.identity))
         job = Job(
             store=finished.matches if options.keep_features else temporary,
             earlier=(finished.matches,),
@@ -165,18 +165,17 @@ def _localize_query(
             raise ImageError(matches)
         found = locate_photo(query.image, query.camera, model, query.shortlist, matches, read)
     except ImageError as error:
-        listed = sorted(query.shortlist)
-        return UnusablePhoto(photo=query.path, shortlist=listed, why=str(error))
+        return UnusablePhoto(photo=query.path, shortlist=query.shortlist, why=str(error))
     error = None
     if found.view is not None and run.reference is not None:
         name, reference = Path(query.path).name, run.reference.poses
         error = error_against(name, found.view, model.views, reference)
-    return localized_photo(
-        query.path,
-        found,
-        matches,
-        source=query.camera.source,
+    return LocalizedPhoto(
+        photo=query.path,
         in_run=run.photos.name_of(query.image.sha256),
         shortlist=query.shortlist,
+        matches=sum(result.num_inliers for result in matches.values()),
+        source=query.camera.source,
+        found=found,
         error=error,
     )

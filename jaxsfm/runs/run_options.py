@@ -17,11 +17,11 @@ from jaxsfm.options import (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunOptions(ReconstructionChoice):
-    """What a reconstruction does, beyond its `Config`."""
+class Computation:
+    """With what features and matches are computed."""
 
     network: WeightsChoice = USUAL_WEIGHTS
-    """The files of the network's parameters."""
+    """The files of the network's parameters; `localize` and `extend` need those of the run."""
     execution: Execution = dataclasses.field(default_factory=Execution)
     """Devices, batches and memory."""
     engine: EngineChoice = LOCAL
@@ -31,19 +31,16 @@ class RunOptions(ReconstructionChoice):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LocalizeOptions(NewPhotosChoice):
+class RunOptions(Computation, ReconstructionChoice):
+    """What a reconstruction does, beyond its `Config`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocalizeOptions(Computation, NewPhotosChoice):
     """What `localize` and `extend` do, beyond what the finished run fixes."""
 
     reference: Path | None = None
     """Reference poses of the new photos and of the run's photos."""
-    network: WeightsChoice = USUAL_WEIGHTS
-    """The files of the network's parameters; they must be those of the run."""
-    execution: Execution = dataclasses.field(default_factory=Execution)
-    """Devices, batches and memory."""
-    engine: EngineChoice = LOCAL
-    """This process, or workers on Ray."""
-    progress: bool = False
-    """Whether progress bars are shown on standard error."""
 
 
 def check_options(options: RunOptions) -> None:

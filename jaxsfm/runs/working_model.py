@@ -16,7 +16,7 @@ from jaxsfm.io.images import ImageFile, shown_name, working_size
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.options import WeightsChoice
-from jaxsfm.report.finished_run import FinishedRun
+from jaxsfm.report.finished_run import FinishedRun, sizes_within
 from jaxsfm.report.run_inputs import UsedWeights
 from jaxsfm.report.typed_json import from_json
 
@@ -57,11 +57,7 @@ def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> Workin
       UserError: `folder` has no readable model.
     """
     model = read_model(folder)
-    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    sizes = {}
-    for name, camera in cameras.items():
-        width, height = working_size((camera.width, camera.height), config.max_size, config.enlarge)
-        sizes[name] = (width, height), (camera.width / width, camera.height / height)
+    sizes = sizes_within(model, config.max_size, config.enlarge)
     return WorkingModel(Model.from_colmap(model, sizes), config, seed)
 
 

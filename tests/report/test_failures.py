@@ -9,14 +9,12 @@ from hypothesis import strategies as st
 
 from jaxsfm.config import preset
 from jaxsfm.core.types import Status
-from jaxsfm.io.pairs import Pair, PairCounts, component_of, exhaustive_pairs
-from jaxsfm.report.advice import Circumstances
+from jaxsfm.io.pairs import PairCounts, component_of, exhaustive_pairs
 from jaxsfm.report.lost_photos import Explanation, explain
 from jaxsfm.report.page.pair_table import component_table
-from jaxsfm.report.page.photo_table import advice
 from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, PairOutcomes
 from jaxsfm.report.photo_groups import photo_groups
-from jaxsfm.report.run_results import LostPhoto, PairRow
+from jaxsfm.report.run_results import PairRow
 from jaxsfm.report.summary import component_lines, help_lines
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.sfm.refine.passes import RefinementFigures
@@ -49,9 +47,9 @@ def verdict(trusted: bool, error: float | None = 40.0, strength: float = 0.05) -
     return Verdict(trusted=trusted, strength=strength, rotation_error_deg=error)
 
 
-def pair_rows(results, handed_on, verified, verdicts) -> dict[Pair, PairRow]:
-    return {
-        pair: PairRow(
+def pair_rows(results, handed_on, verified, verdicts) -> list[PairRow]:
+    return [
+        PairRow(
             pair=pair,
             status=each.status,
             tentative=each.num_tentative,
@@ -62,7 +60,7 @@ def pair_rows(results, handed_on, verified, verdicts) -> dict[Pair, PairRow]:
             view_graph=verdicts.get(pair),
         )
         for pair, each in results.items()
-    }
+    ]
 
 
 def explanation(
@@ -86,18 +84,18 @@ def explanation(
     outcomes = PairOutcomes(
         rows=pair_rows(results, handed_on, verified, verdicts or {}),
         angles=angles or {},
-        min_inliers=26,
+        sizes=dict.fromkeys(names, (side, side // 2)),
+        config=config or preset("default"),
+        selection=pairs,
+        known_camera=known_camera,
     )
-    made = Circumstances(
-        config or preset("default"), pairs, known_camera, dict.fromkeys(names, (side, side // 2))
-    )
-    return explain(models, outcomes, made, refinement)
+    return explain(models, outcomes, refinement)
 
 
 def explained(*args, **changes) -> dict:
     """`explanation` as plain JSON."""
-    found = to_json(explanation(*args, **changes)._asdict())
-    assert isinstance(found, dict) and json.loads(json.dumps(found)) == found
+    found = to_json(explanation(*args, **changes))
+    assert json.loads(json.dumps(found)) == found
     return found
 
 
@@ -225,23 +223,15 @@ def test_an_image_that_refinement_took_out_says_what_was_missing():
 def test_components_part_the_images_and_cross_no_trusted_pair(trusted, tried, random):
     tried = [*trusted, *tried]
     random.shuffle(tried)
-    outcomes = PairOutcomes(
-        rows=pair_rows(
-            dict.fromkeys(tried, counts(Status.VERIFIED, 50, 40)),
-            tried,
-            dict.fromkeys(trusted, 30),
-            {},
-        ),
-        angles={},
-        min_inliers=26,
-    )
-    found = photo_groups("abcdefg", outcomes)
+    results = dict.fromkeys(tried, counts(Status.VERIFIED, 50, 40))
+    found = photo_groups("abcdefg", pair_rows(results, tried, dict.fromkeys(trusted, 30), {}))
     assert sorted(name for group in found for name in group.images) == list("abcdefg")
-    assert sum(group.pairs for group in found) == len(set(trusted))
+    assert sum(len(group.inside) for group in found) == len(set(trusted))
     for group in found:
         assert group.images == component_of(group.images, trusted)
-        assert group.crossing == sorted(p for p in set(tried) if len(group.images & set(p)) == 1)
-        assert not set(group.crossing) & set(trusted)
+        crossing = [row.pair for row in group.crossing]
+        assert crossing == sorted(p for p in set(tried) if len(group.images & set(p)) == 1)
+        assert not set(crossing) & set(trusted)
     sizes = [(-len(group.images), min(group.images)) for group in found]
     assert sizes == sorted(sizes)
 
@@ -263,7 +253,7 @@ def test_a_group_names_the_pair_that_comes_nearest_to_the_others_and_what_it_lac
     lines = component_lines(same)
     assert lines[0].startswith("view graph       2 groups") and "of 3, 2 images; 4" in lines[0]
     assert "island0, island1: the pair nearest to the others is island1 - m0: 33 tent" in lines[1]
-    assert [row.names for row in component_table(same)] == ["m0, m1, odd", "island0, island1"]
+    assert component_table(same) == same.components[:2]
     whole = explanation(["m0", "m1"], {("m0", "m1"): RESULTS["m0", "m1"]}, VERIFIED, [["m0", "m1"]])
     assert component_lines(whole.view_graph) == component_table(whole.view_graph) == []
 
@@ -415,6 +405,3 @@ def test_each_option_is_one_line_with_the_images_it_could_help():
     robust, photos = help_lines(lost)
     assert robust.startswith("may help         --preset robust (a, b): a has only 640 px")
     assert photos.startswith("may help         more photos (a, b): ")
-    assert [each.option for each in advice(lost[0])] == ["--preset robust", None]
-    old = LostPhoto(image="a", stage="pairs", detail="")
-    assert advice(old)[0].reason.startswith("name pairs")  # the report of an older version

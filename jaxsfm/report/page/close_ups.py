@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.images import WorkingImage
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.report.finished_run import FinishedModel, FinishedRun
+from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.page.embedded import data_uri
 
 TRACKS, PHOTOS = 5, 6
@@ -49,9 +51,9 @@ class ShownTrack(NamedTuple):
     patches: list[Patch]
 
 
-def _candidates(model: FinishedModel) -> list[int]:
+def _candidates(tracks: Tracks) -> list[int]:
     """Points that were seen in many photos, from all parts of the model."""
-    lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
+    lengths = tracks.num_observations()
     least = min(LEAST, int(lengths.max(initial=0)))
     long = np.flatnonzero((lengths >= least) & (lengths > 0))
     # Points that follow each other in the model are near each other in space.
@@ -129,7 +131,7 @@ def _patch(
 
 
 def _track(
-    run: FinishedRun, model: FinishedModel, load: Callable[[Pair], PairResult | None], point: int
+    run: FinishedRun, model: Model, load: Callable[[Pair], PairResult | None], point: int
 ) -> ShownTrack | None:
     rows = np.flatnonzero(model.tracks.point == point)
     names = [model.views[model.tracks.view[row]].name for row in rows]
@@ -146,16 +148,16 @@ def _track(
     ]
     if sum(patch.cell is not None for patch in patches) < 2:
         return None
-    return ShownTrack(len(rows), float(np.mean(model.errors[rows])), patches)
+    return ShownTrack(len(rows), float(np.mean(run.errors[rows])), patches)
 
 
 def close_ups(run: FinishedRun) -> list[ShownTrack]:
     """A few tracks; none if the model, the photos or the matches are gone."""
     if run.model is None:
         return []
-    load = functools.lru_cache(maxsize=None)(run.load_matches)
+    load = functools.lru_cache(maxsize=None)(run.matches.load_matches)
     shown: list[ShownTrack] = []
-    for point in _candidates(run.model):
+    for point in _candidates(run.model.tracks):
         track = _track(run, run.model, load, point)
         if track is not None:
             shown.append(track)

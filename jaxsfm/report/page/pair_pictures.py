@@ -93,7 +93,7 @@ def _picture(
     run: FinishedRun, heading: str, row: PairRow, seen: dict[str, Embedded]
 ) -> PairPicture | None:
     a, b = row.pair
-    result = run.load_matches((a, b))
+    result = run.matches.load_matches((a, b))
     if result is None:
         return None
     for name in (a, b):

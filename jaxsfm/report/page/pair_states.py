@@ -1,5 +1,6 @@
 """How far a pair of photos came, with the names and colours of the page."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from jaxsfm.report.page.figures import BLUE, GREEN, GREY, ORANGE
@@ -36,6 +37,16 @@ def state(row: PairRow) -> int:
     if not row.colmap_inliers:
         return NOT_VERIFIED
     return USED if row.trusted else NOT_TRUSTED
+
+
+def partners(names: Iterable[str], rows: Iterable[PairRow]) -> dict[str, int]:
+    """The number of used pairs of every photo."""
+    number = dict.fromkeys(names, 0)
+    for row in rows:
+        if state(row) == USED:
+            for name in row.pair:
+                number[name] += 1
+    return number
 
 
 def strength(row: PairRow, most: int) -> float:
