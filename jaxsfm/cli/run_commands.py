@@ -1,4 +1,4 @@
-"""`jaxsfm reconstruct` and `jaxsfm match`.
+"""The commands `jaxsfm reconstruct`, `jaxsfm match` and `jaxsfm demo`.
 
 Heavy modules are imported inside the commands, so that --help is quick.
 """
@@ -159,3 +159,21 @@ def match(
         f"({result.num_tentative} tentative, {aligned.sum()} aligned): {out}"
     )
     return 0
+
+
+def demo(*, out: Path | None = None, seed: int = 0) -> int:
+    """Render a small scene, reconstruct it, and compare the result with the exact cameras.
+
+    The exit status is 1 if a camera is missing, or if the mean errors are larger than the last line
+    allows.
+
+    Args:
+      out: The folder for the scene and the results. Without it, a new folder in the system's
+        temporary folder.
+      seed: The seed of the scene's noise and of the reconstruction.
+    """
+    from jaxsfm.bench.demo import run_demo
+
+    lines, passed = run_demo(out, seed=seed)
+    print("\n".join(lines))
+    return 0 if passed else 1

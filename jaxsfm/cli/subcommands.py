@@ -21,16 +21,13 @@ def unwrapped(command: Command) -> Command:
 
     tyro wraps descriptions itself, but keeps some of the line ends that it finds.
     """
-    _unwrap(command)
-    return command
-
-
-def _unwrap(documented: Callable[..., object]) -> None:
-    documented.__doc__ = _WRAPPED.sub(" ", inspect.cleandoc(documented.__doc__ or ""))
-    for kind in typing.get_type_hints(documented).values():
+    documented: list[Callable[..., object]] = [command]
+    for kind in typing.get_type_hints(command).values():
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            for each in kind.__mro__[:-1]:
-                _unwrap(each)
+            documented += kind.__mro__[:-1]
+    for each in documented:
+        each.__doc__ = _WRAPPED.sub(" ", inspect.cleandoc(each.__doc__ or ""))
+    return command
 
 
 def one_of(commands: Mapping[str, Command]) -> object:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -109,11 +109,7 @@ class FinishedRun:
 
     @property
     def config(self) -> Config:
-        """The config of the run.
-
-        Raises:
-          UserError: the config has fields that this version of jaxsfm does not know.
-        """
+        """The config of the run; UserError if it has fields that this version does not know."""
         try:
             return from_json(Config, to_json(self.report.options.config), exact=True)
         except ValueError as error:
@@ -159,13 +155,11 @@ def _with_reference(
     return report, ReferencePoses(reference, similarity)
 
 
-def evaluation_report(poses: Poses, reference: Poses) -> EvaluationReport:
-    """The errors of a model's poses against reference poses.
-
-    Raises:
-      UserError: the two have too few photos in common.
-    """
-    return from_json(EvaluationReport, evaluate(poses, reference).as_dict())
+def evaluation_report(
+    poses: Poses, reference: Poses, *, align_on: Collection[str] | None = None
+) -> EvaluationReport:
+    """The errors of a model's poses. Arguments and errors are those of `evaluate`."""
+    return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
 
 
 def read_run(

@@ -3,48 +3,60 @@
 A photo is lost if it has no pose in the best model. For each lost photo the report names the stage
 that lost it, the numbers that decided, and what may help:
 
-* `jaxsfm.report.pair_outcomes` says how far each pair of photos came, and what it lacked;
-* `jaxsfm.report.photo_groups` says which photos trusted pairs join;
+* `jaxsfm.report.pair_outcomes` says how far each pair of photos came, what it lacked, and which
+  photos trusted pairs join;
 * this module says at which stage a photo was lost;
 * `jaxsfm.report.advice` says which option, or which further photos, could help.
 """
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
+from jaxsfm.config import Config
 from jaxsfm.core.types import Status
-from jaxsfm.io.pairs import describe
+from jaxsfm.io.pairs import Pair, describe
 from jaxsfm.report.advice import LEAST_ANGLE_DEG, towards_others, without_pose
-from jaxsfm.report.pair_outcomes import PairOutcomes, furthest
-from jaxsfm.report.photo_groups import PhotoGroup, photo_groups, view_graph_report
-from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, Stage, ViewGraph
+from jaxsfm.report.pair_outcomes import (
+    PairOutcomes,
+    PhotoGroup,
+    furthest,
+    photo_groups,
+    view_graph_report,
+)
+from jaxsfm.report.run_report import RunReport
+from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, Stage
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Explanation:
-    """The fields of the report that explain what is missing."""
-
-    view_graph: ViewGraph
-    lost: list[LostPhoto]
-    no_model: str | None
-
-
-def explain(
-    models: Sequence[Collection[str]],
-    pairs: PairOutcomes,
-    refinement: Sequence[RefinementFigures | None] = (),
-) -> Explanation:
-    """The groups of photos, the lost photos, and why there is no model.
+def explained(
+    report: RunReport,
+    config: Config,
+    sizes: Mapping[str, tuple[int, int]],
+    angles: Mapping[Pair, float],
+) -> RunReport:
+    """The report with what follows from its pairs and models: the groups of photos, why photos were
+    lost and what may help them, and why there is no model.
 
     Args:
-      models: the photos of each model, the best model first.
-      refinement: what the refinement of each model did; None for a model that was not refined.
+      sizes: (width, height) of every usable photo that is still there, pixels. Pairs with other
+        photos are left out.
+      angles: the angle at which the rays of a verified pair's points meet (median), degrees; 0
+        where it is unknown.
     """
-    groups = photo_groups(pairs.sizes, pairs.rows)
-    return Explanation(
+    pairs = PairOutcomes(
+        rows=[row for row in report.pairs.each if sizes.keys() >= set(row.pair)],
+        angles=angles,
+        sizes=sizes,
+        config=config,
+        selection=report.options.pairs,
+        known_camera=report.options.intrinsics is not None,
+    )
+    models = [model.images for model in report.models]
+    groups = photo_groups(sizes, pairs.rows)
+    return dataclasses.replace(
+        report,
         view_graph=view_graph_report(groups, models[0] if models else (), pairs),
-        lost=_lost_photos(groups, models, pairs, _taken_out(refinement)),
+        lost=_lost_photos(groups, models, pairs, _taken_out(report.refinement)),
         no_model=None if models else _no_model(pairs),
     )
 

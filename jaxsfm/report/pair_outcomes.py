@@ -1,12 +1,13 @@
-"""How far the pairs of a run came, and what each lacked to be used."""
+"""How far the pairs of a run came, what each lacked, and which photos the trusted ones join."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import dataclasses
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from jaxsfm.config import Config
 from jaxsfm.core.types import Status
-from jaxsfm.io.pairs import Pair
-from jaxsfm.report.run_results import ClosestPair, PairRow
+from jaxsfm.io.pairs import Pair, component_of
+from jaxsfm.report.run_results import ClosestPair, Component, PairRow, ViewGraph
 from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG
 
 COLMAP_MIN_INLIERS = 15
@@ -28,10 +29,8 @@ class PairOutcomes(NamedTuple):
 
     rows: Sequence[PairRow]
     angles: Mapping[Pair, float]
-    """The angle at which the rays of a verified pair's points meet (median), degrees; 0 where it
-    is unknown."""
+    """As `jaxsfm.report.lost_photos.explained` takes them, and so are the `sizes`."""
     sizes: Mapping[str, tuple[int, int]]
-    """(width, height) of every usable photo, pixels. The photos of all `rows` are among them."""
     config: Config
     selection: str
     """The value of `--pairs`."""
@@ -82,3 +81,58 @@ class PairOutcomes(NamedTuple):
             rotation_error_deg=row.view_graph and row.view_graph.rotation_error_deg,
             missed=self.missed(row),
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoGroup:
+    """Photos that chains of trusted pairs join: a connected component of the view graph."""
+
+    images: frozenset[str]
+    inside: list[PairRow] = dataclasses.field(default_factory=list)
+    """The trusted pairs among them."""
+    crossing: list[PairRow] = dataclasses.field(default_factory=list)
+    """The pairs that were tried between them and all other photos; none of these is trusted."""
+
+
+def photo_groups(names: Iterable[str], rows: Sequence[PairRow]) -> list[PhotoGroup]:
+    """All groups of the photos `names`, of which `rows` are pairs; the largest group first. A photo
+    without a trusted pair is a group by itself."""
+    trusted = [row.pair for row in rows if row.trusted]
+    joined = {name for pair in trusted for name in pair}
+    group_of: dict[str, PhotoGroup] = {}
+    groups: list[PhotoGroup] = []
+    for name in sorted(names):
+        if name not in group_of:
+            images = component_of([name], trusted) if name in joined else [name]
+            groups.append(PhotoGroup(frozenset(images)))
+            group_of |= dict.fromkeys(images, groups[-1])
+    for row in sorted(rows, key=lambda row: row.pair):
+        one, other = (group_of[name] for name in row.pair)
+        if one is not other:
+            one.crossing.append(row)
+            other.crossing.append(row)
+        elif row.trusted:
+            one.inside.append(row)
+    return sorted(groups, key=lambda group: (-len(group.images), min(group.images)))
+
+
+def view_graph_report(
+    groups: Sequence[PhotoGroup], best_model: Collection[str], pairs: PairOutcomes
+) -> ViewGraph:
+    """The groups as the report lists them."""
+    index = {name: k for k, group in enumerate(groups) for name in group.images}
+    rows = []
+    for group in groups:
+        best, nearest = furthest(group.crossing), None
+        if best is not None:
+            (other,) = set(best.pair) - group.images
+            nearest = pairs.closest(best, component=index[other])
+        rows.append(
+            Component(
+                images=sorted(group.images),
+                pairs=len(group.inside),
+                registered=len(group.images & set(best_model)),
+                nearest=nearest,
+            )
+        )
+    return ViewGraph(components=rows)

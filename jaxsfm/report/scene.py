@@ -93,11 +93,7 @@ def _depth(centres: np.ndarray, extent: float) -> float:
 
 
 def shown_scene(run: FinishedRun) -> Scene:
-    """The best model of a run.
-
-    Raises:
-      ValueError: the run has no model.
-    """
+    """The best model of a run; ValueError if it has none."""
     if run.model is None:
         raise ValueError("run must have a model; got none")
     model = run.model

@@ -87,13 +87,10 @@ def _plain(value: object) -> Json:
 
 
 def from_json(kind: type[T], value: object, *, exact: bool = False) -> T:
-    """A dataclass from plain JSON.
+    """A dataclass from plain JSON; Misfit if the value is not what the type hints ask for.
 
     Args:
       exact: whether a key that no dataclass names is an error. It is ignored otherwise.
-
-    Raises:
-      Misfit: the value is not what the type hints ask for.
     """
     made = _read(kind, value, exact)
     assert isinstance(made, kind)
@@ -171,23 +168,15 @@ def _read_items(hints: Iterable[object], items: Mapping[K, object], exact: bool)
     return found
 
 
-class _Schema(NamedTuple):
-    """The keys of a dataclass."""
-
-    hints: dict[str, object]
-    required: list[str]
-    others: str | None
-    """The field that holds all other keys."""
-
-
 @functools.cache
-def _schema(kind: "type[DataclassInstance]") -> _Schema:
+def _schema(kind: "type[DataclassInstance]") -> tuple[dict[str, object], list[str], str | None]:
+    """The type hints of a dataclass, the keys that it requires, and the field of all other keys."""
     hints = typing.get_type_hints(kind, include_extras=True)
     fields = dataclasses.fields(kind)
     others = next((field.name for field in fields if field.metadata == OTHERS), None)
     absent = (dataclasses.MISSING, dataclasses.MISSING)
     required = [f.name for f in fields if (f.default, f.default_factory) == absent]
-    return _Schema({f.name: hints[f.name] for f in fields if f.name != others}, required, others)
+    return {f.name: hints[f.name] for f in fields if f.name != others}, required, others
 
 
 def _read_dataclass(

@@ -16,8 +16,7 @@ from jaxsfm.io.pairs import Pair, PairCounts
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
-from jaxsfm.report.lost_photos import explain
-from jaxsfm.report.pair_outcomes import PairOutcomes
+from jaxsfm.report.lost_photos import explained
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     RecordedOptions,
@@ -105,7 +104,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         seconds=stages.seconds,
     )
     sizes = {image.name: image.size for image in stages.usable}
-    return _explained(report, config, sizes, made.angles)
+    return explained(report, config, sizes, made.angles)
 
 
 def extended_report(
@@ -163,7 +162,7 @@ def extended_report(
         evaluation=None,
         evaluation_failed=None,
     )
-    report = _explained(report, run.config, sizes, {})
+    report = explained(report, run.config, sizes, {})
     reasons = {name: found.why for name, found in grown.located.items()}
     lost = [
         dataclasses.replace(photo, detail=reasons.get(photo.image) or photo.detail)
@@ -230,24 +229,3 @@ def _pair_rows(
         )
         for pair, each in sorted(counts.items())
     ]
-
-
-def _explained(
-    report: RunReport,
-    config: Config,
-    sizes: Mapping[str, tuple[int, int]],
-    angles: Mapping[Pair, float],
-) -> RunReport:
-    """The report with what follows from its pairs and models: why photos were lost, and what may
-    help."""
-    pairs = PairOutcomes(
-        rows=[row for row in report.pairs.each if sizes.keys() >= set(row.pair)],
-        angles=angles,
-        sizes=sizes,
-        config=config,
-        selection=report.options.pairs,
-        known_camera=report.options.intrinsics is not None,
-    )
-    models = [model.images for model in report.models]
-    explanation = explain(models, pairs, report.refinement)
-    return dataclasses.replace(report, **vars(explanation))

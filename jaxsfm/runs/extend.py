@@ -12,7 +12,6 @@ from pathlib import Path
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
@@ -28,25 +27,15 @@ from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import NewPhotos
 from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.runs.run_options import LocalizeOptions
-from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
+    Shortlist,
     camera_prior,
     photos_of_run,
     read_working_model,
+    similar_photos,
     weights_of_run,
 )
 from jaxsfm.runs.write_extension import write_extension
-
-
-def extend(
-    run: Path, *, options: LocalizeOptions, shortlist: Shortlist | None = None
-) -> dict[str, Json] | None:
-    """Extend a finished run; returns the content of its new report.json, or None.
-
-    See `extend_run`, which returns the report as an object.
-    """
-    report = extend_run(run, options=options, shortlist=shortlist)
-    return None if report is None else report.to_json()
 
 
 def extend_run(
@@ -150,11 +139,8 @@ def _added_photos(
 def _unchanged_photos(
     run: FinishedRun, usable: list[ImageFile], needed: list[str]
 ) -> dict[str, ImageFile]:
-    """The photos of the run that are still what they were, by name.
-
-    Raises:
-      UserError: one of the needed photos is gone or has changed.
-    """
+    """The photos of the run that are still what they were, by name; UserError if one of the needed
+    photos is not."""
     report = run.report
     used = {n: h for n, h in report.identity.images.items() if n not in report.images.skipped}
     there = {image.name: image for image in usable if used.get(image.name) == image.sha256}
@@ -169,14 +155,11 @@ def _match_new(
     added: Mapping[str, ImageFile],
     shortlist: Shortlist,
 ) -> tuple[SavedMatches, dict[str, str]]:
-    """Match new photos with their shortlists.
+    """Match new photos with their shortlists; returns also why photos cannot be decoded, by name.
 
     Args:
       files: the run's photos and the new ones.
       names: the photos that may be on a shortlist: those of the model, and the new ones.
-
-    Returns:
-      The matches, and for every photo that cannot be decoded the reason.
     """
     shortlists, lost = {}, {}
     for name, image in added.items():

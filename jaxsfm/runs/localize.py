@@ -15,7 +15,6 @@ from tqdm import tqdm
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos, Reader
@@ -32,31 +31,18 @@ from jaxsfm.runs.localize_report import (
 )
 from jaxsfm.runs.queries import Query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
-from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
     CameraPrior,
+    Shortlist,
     WorkingModel,
     camera_prior,
     photos_of_run,
     read_working_model,
+    similar_photos,
     view_without_pose,
     weights_of_run,
 )
 from jaxsfm.sfm.register.locate_view import Localization, locate
-
-
-def localize(
-    photos: Sequence[Path],
-    run: Path,
-    *,
-    options: LocalizeOptions,
-    shortlist: Shortlist | None = None,
-) -> dict[str, Json]:
-    """Localize photos in a finished run; returns plain JSON, with a row for each photo.
-
-    See `localize_photos`, which returns the result as an object.
-    """
-    return localize_photos(photos, run, options=options, shortlist=shortlist).to_json()
 
 
 def localize_photos(

@@ -227,11 +227,7 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 def _retrieve(
     job: Job, images: list[ImageFile], kind: Retrieval, k: int
 ) -> tuple[list[Pair], dict[str, str]]:
-    """Pairs of each image with its k most similar ones; for images without descriptor the reason.
-
-    Args:
-      kind: how images are described.
-    """
+    """Pairs of each image with its k most similar ones, and why images have no descriptor."""
     total, quiet = len(images), not job.progress
     with tqdm(total=total, desc="retrieval", unit="image", disable=quiet) as bar:
         found = describe_photos(

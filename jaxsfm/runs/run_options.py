@@ -44,11 +44,7 @@ class LocalizeOptions(Computation, NewPhotosChoice):
 
 
 def check_options(options: RunOptions) -> None:
-    """Check, before the work, the options that COLMAP or the engine would refuse.
-
-    Raises:
-      UserError: an option that cannot be used.
-    """
+    """Raise UserError, before the work, for options that COLMAP or the engine would refuse."""
     if options.best_pairs is not None and options.best_pairs < 1:
         raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
     check_seed(options.seed)
@@ -57,20 +53,12 @@ def check_options(options: RunOptions) -> None:
 
 
 def check_seed(seed: int) -> None:
-    """Check that COLMAP takes a seed.
-
-    Raises:
-      UserError: it does not.
-    """
+    """Raise UserError for a seed that COLMAP does not take."""
     if not 0 <= seed < 2**31:
         raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
 
 
 def check_threads(threads: int) -> None:
-    """Check that COLMAP takes a number of threads.
-
-    Raises:
-      UserError: it does not.
-    """
+    """Raise UserError for a number of threads that COLMAP does not take."""
     if threads == 0 or threads < -1:
         raise UserError(f"--threads must be positive, or -1 for all; got {threads}")

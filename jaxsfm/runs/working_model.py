@@ -1,9 +1,16 @@
-"""What `localize` and `extend` need of a finished run: its model, its weights and its photos."""
+"""What `localize` and `extend` need of a finished run: its model, its weights and its photos.
 
+New photos are matched with those photos of the run that look most similar (`similar_photos`).
+"""
+
+import contextlib
+import functools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from jaxsfm.colmap.database import camera_for
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
@@ -11,10 +18,15 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
+from jaxsfm.core.pooling import TIE
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageFile, shown_name, working_size
+from jaxsfm.io.images import ImageError, ImageFile, shown_name, working_size
 from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights, chosen_weights
+from jaxsfm.matching.execution import Execution
+from jaxsfm.matching.global_descriptors import GEM
+from jaxsfm.matching.retrieval import describe_photos
 from jaxsfm.options import WeightsChoice
 from jaxsfm.report.finished_run import FinishedRun, sizes_within
 from jaxsfm.report.run_inputs import UsedWeights
@@ -22,6 +34,10 @@ from jaxsfm.report.typed_json import from_json
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
+"""From a photo and the names of other photos to the names of those that it is matched with."""
 
 
 class WorkingModel(NamedTuple):
@@ -51,11 +67,7 @@ class CameraPrior(NamedTuple):
 
 
 def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> WorkingModel:
-    """Read a COLMAP model and convert it to the working pixels of a config.
-
-    Raises:
-      UserError: `folder` has no readable model.
-    """
+    """Read a COLMAP model into working pixels; UserError if `folder` has no readable model."""
     model = read_model(folder)
     sizes = sizes_within(model, config.max_size, config.enlarge)
     return WorkingModel(Model.from_colmap(model, sizes), config, seed)
@@ -68,9 +80,6 @@ def camera_prior(
 
     It is the given one. Without one, it is the camera of the model, if the model has exactly one
     camera of the photo's size that several views share. Else it comes from EXIF, or is a guess.
-
-    Args:
-      intrinsics: given by the user; None: none.
 
     Raises:
       UserError: the given intrinsics do not fit the photo's size.
@@ -96,11 +105,7 @@ def view_without_pose(image: ImageFile, prior: CameraPrior, config: Config) -> V
 
 
 def weights_of_run(run: FinishedRun, choice: WeightsChoice) -> Weights:
-    """Load the weights that a run was made with.
-
-    Raises:
-      UserError: `choice` names other weights.
-    """
+    """Load the weights that a run was made with; UserError if `choice` names others."""
     config = run.config
     weights = chosen_weights(choice, config.backbone)
     made_with, now = run.report.weights, from_json(UsedWeights, weights.described(config))
@@ -117,11 +122,7 @@ def weights_of_run(run: FinishedRun, choice: WeightsChoice) -> Weights:
 
 
 def photos_of_run(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile]:
-    """The files of photos of a run, by name.
-
-    Raises:
-      UserError: a photo is gone or has changed.
-    """
+    """The files of photos of a run, by name; UserError if one is gone or has changed."""
     files = {}
     for name in names:
         image = run.photos.file(name)
@@ -132,3 +133,58 @@ def photos_of_run(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile
             )
         files[name] = image
     return files
+
+
+def similar_photos(
+    run: FinishedRun,
+    weights: Weights,
+    k: int,
+    new: Mapping[str, ImageFile],
+    execution: Execution,
+) -> Shortlist:
+    """A shortlist of the `k` most similar photos; equally similar ones are taken by name.
+
+    Photos are compared by GeM, which describes each photo by itself. The descriptors of the run's
+    photos are kept in its folder, if it can be written. The shortlist raises ImageError if the
+    photo that it is called with cannot be decoded.
+
+    Args:
+      new: photos that are not in the run, by name.
+
+    Raises:
+      UserError: k is less than 1.
+    """
+    if k < 1:
+        raise UserError(f"--shortlist must be at least 1; got {k}")
+
+    def describe(image: ImageFile, store: Store | None = None) -> np.ndarray:
+        found = describe_photos(weights, [image], kind="gem", store=store, execution=execution)
+        for _, error in found.lost:
+            raise error
+        return found.vectors[image.name]
+
+    @functools.cache
+    def descriptor(name: str) -> np.ndarray:
+        if name in new:
+            return describe(new[name])
+        saved = run.matches.load_descriptor(run.photos.recorded(name), GEM)
+        if saved is not None and "array" in saved:
+            return saved["array"]
+        image = photos_of_run(run, [name])[name]
+        try:
+            return describe(image, run.matches)
+        except ImageError:
+            raise
+        except UserError:  # the run's folder cannot be written
+            return describe(image)
+
+    def shortlist(image: ImageFile, names: Sequence[str]) -> Sequence[str]:
+        if k >= len(names):
+            return names
+        own, nearness = descriptor(image.name), {}
+        for name in names:
+            with contextlib.suppress(ImageError):  # the other photo cannot be decoded
+                nearness[name] = round(float(descriptor(name) @ own) / TIE)
+        return sorted(nearness, key=lambda name: (-nearness[name], name))[:k]
+
+    return shortlist

@@ -32,10 +32,6 @@ def write_extension(
     Args:
       photos: the run's photos and the new ones.
       matches: the matches of the new photos with their shortlists.
-      progress: whether a progress bar is shown.
-
-    Returns:
-      The report of the extended run.
     """
     database = target / "database.db"
     count = sum(result.num_inliers for result in matches.values())

@@ -1,6 +1,8 @@
 """Why images were lost: the stage, the numbers, the groups of images and what may help."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import pycolmap
 import pytest
@@ -10,17 +12,20 @@ from hypothesis import strategies as st
 from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import PairCounts, component_of, exhaustive_pairs
-from jaxsfm.report.lost_photos import Explanation, explain
-from jaxsfm.report.page.pair_table import component_table
-from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, PairOutcomes
-from jaxsfm.report.photo_groups import photo_groups
-from jaxsfm.report.run_results import PairRow
+from jaxsfm.report.lost_photos import explained as explained_report
+from jaxsfm.report.page.pair_states import component_table
+from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, photo_groups
+from jaxsfm.report.run_report import RunReport
+from jaxsfm.report.run_results import ModelRow, PairRow
 from jaxsfm.report.summary import component_lines, help_lines
-from jaxsfm.report.typed_json import to_json
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG, Verdict
 
+REPORT = RunReport.from_json(
+    json.loads((Path(__file__).parent / "report_of_format_1.json").read_text())
+)
+"""A finished run, whose pairs, models and refinement are replaced."""
 edges = st.lists(st.sampled_from(exhaustive_pairs("abcdefg")), max_size=10)
 
 
@@ -77,24 +82,34 @@ def explanation(
     known_camera=True,
     side=1600,
     refinement=(),
-) -> Explanation:
-    """`explain` for images of 1600 px with a known camera, all of whose pairs were tried."""
+) -> RunReport:
+    """A report for images of 1600 px with a known camera, all of whose pairs were tried."""
     if handed_on is None:
         handed_on = [pair for pair, each in results.items() if each.num_inliers]
-    outcomes = PairOutcomes(
-        rows=pair_rows(results, handed_on, verified, verdicts or {}),
-        angles=angles or {},
-        sizes=dict.fromkeys(names, (side, side // 2)),
-        config=config or preset("default"),
-        selection=pairs,
-        known_camera=known_camera,
+    intrinsics = "K.txt" if known_camera else None
+    report = replace(
+        REPORT,
+        pairs=replace(REPORT.pairs, each=pair_rows(results, handed_on, verified, verdicts or {})),
+        options=replace(REPORT.options, pairs=pairs, intrinsics=intrinsics),
+        models=[
+            ModelRow(
+                registered=len(images),
+                points=0,
+                track_length=0,
+                reprojection_error_px=0,
+                images=list(images),
+            )
+            for images in models
+        ],
+        refinement=refinement,
     )
-    return explain(models, outcomes, refinement)
+    sizes = dict.fromkeys(names, (side, side // 2))
+    return explained_report(report, config or preset("default"), sizes, angles or {})
 
 
 def explained(*args, **changes) -> dict:
     """`explanation` as plain JSON."""
-    found = to_json(explanation(*args, **changes))
+    found = explanation(*args, **changes).to_json()
     assert json.loads(json.dumps(found)) == found
     return found
 
@@ -159,6 +174,14 @@ def test_a_lost_image_has_the_numbers_of_the_pair_that_came_furthest():
     )
     assert found["never"]["best_pair"] is None
     assert "COLMAP found no geometry that 15" in found["alone"]["best_pair"]["missed"]
+
+
+def test_pairs_with_photos_that_are_gone_explain_nothing():
+    there = [name for name in NAMES if name not in ("alone", "island1")]
+    tried = {pair: each for pair, each in RESULTS.items() if set(pair) <= set(there)}
+    found = explained(there, RESULTS, VERIFIED, [["m0", "m1"]])
+    assert found["lost"] == explained(there, tried, VERIFIED, [["m0", "m1"]])["lost"]
+    assert rows(found)["island0"]["stage"] == "pairs"
 
 
 def test_an_image_of_a_smaller_model_says_which():

@@ -24,11 +24,10 @@ from jaxsfm.matching.execution import Execution
 from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.runs import localize as localize_module
-from jaxsfm.runs.localize import localize
+from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
 from jaxsfm.runs.run_options import LocalizeOptions
-from jaxsfm.runs.similar_photos import similar_photos
-from jaxsfm.runs.working_model import camera_prior, read_working_model
+from jaxsfm.runs.working_model import camera_prior, read_working_model, similar_photos
 from jaxsfm.sfm.register.locate_view import Localization
 
 SIZE, WIDE = (320, 240), (368, 248)
@@ -62,6 +61,11 @@ class RecordingEngine:
     def match_pairs(self, load, capacities, pairs, **options):
         self.calls.append(("match", len(pairs)))
         return LocalEngine.match_pairs(load, capacities, pairs, **options)
+
+
+def localize(photos: list[Path], run: Path, **changes) -> dict:
+    """What the command writes."""
+    return localize_photos(photos, run, **changes).to_json()
 
 
 @pytest.fixture(scope="module")

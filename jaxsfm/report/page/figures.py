@@ -1,7 +1,7 @@
 """Figures of the page, and how names and numbers are written in them."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -59,7 +59,7 @@ def duration(seconds: float) -> str:
 
 
 def figure(
-    data: Sequence[BaseTraceType], layout: dict[str, object], *, alt: str, note: str = ""
+    data: Sequence[BaseTraceType], layout: Mapping[str, object], *, alt: str, note: str = ""
 ) -> Figure:
     """A figure. The page gives it the colours of ground, text and grid."""
     base = {

@@ -23,12 +23,8 @@ def _reduced(matrix: np.ndarray, block: int) -> np.ndarray:
 
 
 def pair_matrices(names: Sequence[str], rows: Sequence[PairRow]) -> tuple[np.ndarray, np.ndarray]:
-    """Two symmetrical matrices int32 (n, n).
-
-    Returns:
-      The number of a pair's matches (COLMAP's inliers if it verified the pair), and the place of
-      the pair's state in STATES.
-    """
+    """Two symmetrical matrices int32 (n, n): the numbers of the pairs' matches (COLMAP's inliers
+    where it verified a pair), and the places of their states in STATES."""
     index = {name: k for k, name in enumerate(names)}
     inliers = np.zeros((len(names), len(names)), np.int32)
     states = np.zeros_like(inliers)
@@ -40,12 +36,8 @@ def pair_matrices(names: Sequence[str], rows: Sequence[PairRow]) -> tuple[np.nda
 
 
 def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> tuple[Figure, Figure]:
-    """Heat maps of the matches and of the states of all pairs.
-
-    Args:
-      names: all photos, in the order of the axes.
-      rows: all pairs that were tried.
-    """
+    """Heat maps of the matches and of the states of all pairs; `names` are all photos, in the order
+    of the axes."""
     block = max(1, -(-len(names) // MAX_SQUARES))
     inliers, states = (_reduced(m, block) for m in pair_matrices(names, rows))
     shown = short(names)

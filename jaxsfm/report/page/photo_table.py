@@ -63,11 +63,7 @@ def _seen_points(run: FinishedRun) -> dict[str, tuple[int, float]]:
 
 
 def photo_table(run: FinishedRun, names: Sequence[str]) -> PhotoTable:
-    """A row for each photo: the lost ones first, then those with the largest errors.
-
-    Args:
-      names: all photos of the run.
-    """
+    """A row for each of the photos: the lost ones first, then those with the largest errors."""
     report = run.report
     lost = {photo.image: photo for photo in report.lost}
     errors = report.evaluation.images if report.evaluation else {}

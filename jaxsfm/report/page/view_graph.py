@@ -43,13 +43,8 @@ def chosen_edges(rows: Sequence[PairRow], limit: int, most: int) -> list[PairRow
 
 
 def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection[str]) -> Figure:
-    """The photos around a circle, in the order of their names, and the verified pairs.
-
-    Args:
-      names: all photos.
-      rows: all pairs that were tried.
-      registered: the photos with a pose in the best model.
-    """
+    """The photos around a circle, in the order of their names, and the verified pairs among `rows`.
+    The photos `registered` have a pose in the best model."""
     by_state = {k: [row for row in rows if state(row) == k] for k in (USED, NOT_TRUSTED)}
     most = max((row.colmap_inliers for row in rows), default=1)
     used = chosen_edges(by_state[USED], MAX_USED, most)

@@ -20,7 +20,7 @@ from jaxsfm.report.page.figures import BLUE, GREEN, Figure, count, duration, fig
 from jaxsfm.report.page.matrices import matrix_figures
 from jaxsfm.report.page.model_figure import model_figure
 from jaxsfm.report.page.pair_pictures import pair_pictures
-from jaxsfm.report.page.pair_table import component_table, pair_table
+from jaxsfm.report.page.pair_states import component_table, pair_table
 from jaxsfm.report.page.photo_table import photo_table
 from jaxsfm.report.page.view_graph import view_graph
 from jaxsfm.report.run_report import RunReport
@@ -45,13 +45,6 @@ _ENVIRONMENT.filters |= {
     "quote": shlex.quote,
     "repr": repr,
 }
-
-
-def _text(file: str) -> str:
-    """The content of a file of this package."""
-    found = _ENVIRONMENT.loader
-    assert found is not None
-    return found.get_source(_ENVIRONMENT, file)[0]
 
 
 def photo_names(report: RunReport) -> list[str]:
@@ -96,8 +89,6 @@ def page(run: FinishedRun) -> str:
     pictures, photos = pair_pictures(run)
     return _ENVIRONMENT.get_template("page.html").render(
         title=shown_name(run.folder.absolute().name),
-        style=Markup(_text("page.css")),
-        script=Markup(_text("page.js")),
         plotly=Markup(plotly.offline.get_plotlyjs()),
         report=report,
         reference=run.reference,
