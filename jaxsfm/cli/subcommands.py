@@ -1,15 +1,18 @@
 """Commands and option classes in the form that tyro expects."""
 
+import contextlib
 import dataclasses
 import functools
 import inspect
 import operator
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated
 
 import tyro
+
+from jaxsfm.errors import UserError
 
 Command = Callable[..., int]
 _WRAPPED = re.compile(r"\n {4,}(?=[^\s$])")
@@ -28,6 +31,18 @@ def unwrapped(command: Command) -> Command:
     for each in documented:
         each.__doc__ = _WRAPPED.sub(" ", inspect.cleandoc(each.__doc__ or ""))
     return command
+
+
+@contextlib.contextmanager
+def named_options() -> Iterator[None]:
+    """Make a ValueError about a field, which its message starts with, a UserError about the option
+    that sets the field."""
+    try:
+        yield
+    except ValueError as error:
+        field, _, problem = str(error).partition(" ")
+        option = field.rpartition(".")[2].replace("_", "-")
+        raise UserError(f"--{option} {problem}") from error
 
 
 def one_of(commands: Mapping[str, Command]) -> object:
