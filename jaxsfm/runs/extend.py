@@ -27,12 +27,11 @@ from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import NewPhotos
 from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.runs.run_options import LocalizeOptions
+from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
-    Shortlist,
     camera_prior,
     photos_of_run,
     read_working_model,
-    similar_photos,
     weights_of_run,
 )
 from jaxsfm.runs.write_extension import write_extension

@@ -31,14 +31,13 @@ from jaxsfm.runs.localize_report import (
 )
 from jaxsfm.runs.queries import Query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
+from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
     CameraPrior,
-    Shortlist,
     WorkingModel,
     camera_prior,
     photos_of_run,
     read_working_model,
-    similar_photos,
     view_without_pose,
     weights_of_run,
 )

@@ -27,7 +27,8 @@ from jaxsfm.runs import localize as localize_module
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
 from jaxsfm.runs.run_options import LocalizeOptions
-from jaxsfm.runs.working_model import camera_prior, read_working_model, similar_photos
+from jaxsfm.runs.similar_photos import similar_photos
+from jaxsfm.runs.working_model import camera_prior, read_working_model
 from jaxsfm.sfm.register.locate_view import Localization
 
 SIZE, WIDE = (320, 240), (368, 248)
