@@ -4,8 +4,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+from jaxsfm.cli.subcommands import named_options
 from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
-from jaxsfm.errors import UserError
 
 Preset = Literal["paper", "default", "robust"]
 
@@ -43,10 +43,8 @@ class MatchingChoice:
         Raises:
           UserError: a setting that cannot be, or settings that contradict each other.
         """
-        try:
+        with named_options():
             return self._config(relocalizer)
-        except ValueError as error:
-            raise UserError(f"--{str(error).replace('_', '-', 1)}") from error
 
     def _config(self, relocalizer: Path | None) -> Config:
         config = dataclasses.replace(

@@ -63,35 +63,46 @@ def export(
         raise UserError(
             f"--copy-images: {run} does not say where its photos are; name them with --images"
         )
-    if to in FILES:
-        check_writable(out, "--out", (FILES[to],))
-        _export_file(run, to, out)
-    else:
-        with _new_folder(out) as folder:
-            _export_folder(run, to, folder, images, copy_images, matches)
+    with _fresh(out, FILES.get(to)) as fresh:
+        if to == "hloc":
+            _write_hloc(fresh, run, matches)
+        elif to == "openmvg":
+            _write_openmvg(fresh, run, images)
+        elif to == "nerfstudio":
+            _write_nerfstudio(fresh, _model(run), images, copy_images)
+        else:
+            _write_model(fresh, _model(run), to)
     print(f"{to}: {out}")
     return 0
 
 
 @contextlib.contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """A new folder to fill. It appears at `path` when it is complete, or not at all.
+def _fresh(path: Path, suffix: str | None) -> Iterator[Path]:
+    """A new folder to fill, or the place of a new file. It appears at `path` when it is complete,
+    or not at all.
+
+    Args:
+      suffix: how the file's name must end; None for a folder.
 
     Raises:
-      UserError: there is a file or a non-empty folder already, or the folder cannot be written.
+      UserError: there is a file or a non-empty folder already where a folder is wanted, or the
+        place cannot be written.
     """
     try:
-        if path.exists() and not path.is_dir():
+        if suffix is not None:
+            check_writable(path, "--out", (suffix,))
+        elif path.exists() and not path.is_dir():
             raise UserError(f"--out {path}: is a file, not a folder")
-        if path.is_dir() and any(path.iterdir()):
+        elif path.is_dir() and any(path.iterdir()):
             raise UserError(f"--out {path}: not empty; choose an empty or new folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = tempfile.TemporaryDirectory(dir=path.parent, prefix=".jaxsfm-")
     except OSError as error:
         raise UserError(f"--out {path}: cannot be written ({error.strerror or error})") from error
     with scratch:
-        fresh = Path(scratch.name) / "export"
-        fresh.mkdir()
+        fresh = Path(scratch.name) / f"export{suffix or ''}"
+        if suffix is None:
+            fresh.mkdir()
         yield fresh
         os.replace(fresh, path)
 
@@ -122,56 +133,28 @@ def _tables(run: Path) -> "Tables | None":
     return read_database(path, where=str(path)) if path.is_file() else None
 
 
-def _export_file(run: Path, to: Format, out: Path) -> None:
-    from jaxsfm.io.atomic import write_atomic
+def _write_model(fresh: Path, model: "pycolmap.Reconstruction", to: Format) -> None:
+    from jaxsfm.colmap.formats.bundler import write_bundler
+    from jaxsfm.colmap.formats.lens import check_no_blanks
+    from jaxsfm.colmap.formats.nvm import nvm_text
 
     if to == "nvm":
-        from jaxsfm.colmap.formats.nvm import nvm_text
-
-        write_atomic(out, nvm_text(_model(run)).encode())
+        fresh.write_bytes(nvm_text(model).encode())
     elif to == "ply":
-        model = _model(run)
-        with tempfile.TemporaryDirectory() as scratch:
-            made = Path(scratch) / "points.ply"
-            model.export_PLY(made)
-            write_atomic(out, made.read_bytes())
-    else:
-        raise ValueError(f"to must be a format of one file; got {to!r}")
-
-
-def _export_folder(
-    run: Path,
-    to: Format,
-    folder: Path,
-    images: Path | None,
-    copy_images: bool,
-    matches: Literal["all", "verified"],
-) -> None:
-    if to == "hloc":
-        _export_hloc(run, folder, matches)
-    elif to == "colmap":
-        _model(run).write_binary(folder)
-    elif to == "colmap-text":
-        from jaxsfm.colmap.formats.lens import check_no_blanks
-
-        model = _model(run)
-        check_no_blanks([image.name for image in model.images.values()], to)
-        model.write_text(folder)
+        model.export_PLY(fresh)
     elif to == "bundler":
-        from jaxsfm.colmap.formats.bundler import write_bundler
-
-        write_bundler(folder, _model(run))
-    elif to == "openmvg":
-        _export_openmvg(run, folder, images)
-    elif to == "nerfstudio":
-        _export_nerfstudio(run, folder, images, copy_images)
+        write_bundler(fresh, model)
+    elif to == "colmap":
+        model.write_binary(fresh)
     else:
-        raise ValueError(f"to must be a format of a folder; got {to!r}")
+        check_no_blanks([image.name for image in model.images.values()], to)
+        model.write_text(fresh)
 
 
-def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -> None:
+def _write_hloc(folder: Path, run: Path, matches: Literal["all", "verified"]) -> None:
     from jaxsfm.colmap.formats.hloc import write_hloc
     from jaxsfm.io.images import working_size
+    from jaxsfm.report.finished_run import ORIGINAL
     from jaxsfm.report.run_inputs import RecordedConfig
     from jaxsfm.report.run_report import read_part
 
@@ -182,13 +165,13 @@ def _export_hloc(run: Path, folder: Path, matches: Literal["all", "verified"]) -
         config = read_part(run, RecordedConfig, "options", "config")
         limits = config.max_size, config.enlarge
     except UserError:  # no run of jaxsfm: keypoints are in original pixels
-        limits = 2**31, 1.0
+        limits = ORIGINAL
     scales = {s: max(s) / max(working_size(s, *limits)) for s in set(tables.sizes.values())}
     chosen = tables.matches if matches == "all" else tables.inliers
     write_hloc(folder, tables, chosen, {name: scales[s] for name, s in tables.sizes.items()})
 
 
-def _export_openmvg(run: Path, folder: Path, images: Path | None) -> None:
+def _write_openmvg(folder: Path, run: Path, images: Path | None) -> None:
     from jaxsfm.colmap.formats.lens import camera_of
     from jaxsfm.colmap.formats.openmvg import sfm_data, write_openmvg
     from jaxsfm.colmap.poses import find_model, read_model
@@ -196,10 +179,9 @@ def _export_openmvg(run: Path, folder: Path, images: Path | None) -> None:
     tables = _tables(run)
     cameras, model = {}, None
     if tables is not None:
-        cameras = {
-            name: camera_of(row, tables.sizes[name], f"{run / 'database.db'}")
-            for name, row in tables.cameras.items()
-        }
+        where = str(run / "database.db")
+        for name, row in tables.cameras.items():
+            cameras[name] = camera_of(row, tables.sizes[name], where)
     try:
         found = find_model(run)
     except UserError:  # OpenMVG can start from views and matches
@@ -212,13 +194,13 @@ def _export_openmvg(run: Path, folder: Path, images: Path | None) -> None:
     write_openmvg(folder, sfm_data(cameras, model, root), tables)
 
 
-def _export_nerfstudio(run: Path, folder: Path, images: Path | None, copy_images: bool) -> None:
+def _write_nerfstudio(
+    folder: Path, model: "pycolmap.Reconstruction", images: Path | None, copy_images: bool
+) -> None:
     from jaxsfm.colmap.formats.lens import registered_images
     from jaxsfm.colmap.formats.nerfstudio import IMAGES, write_nerfstudio
 
-    model = _model(run)
-    referred = None if copy_images or images is None else images.absolute()
-    write_nerfstudio(folder, model, referred)
+    write_nerfstudio(folder, model, None if copy_images or images is None else images.absolute())
     if not copy_images or images is None:
         return
     for image in registered_images(model):

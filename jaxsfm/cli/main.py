@@ -9,14 +9,13 @@ import tyro
 
 from jaxsfm.cli.bench_commands import daynight, homography, planes, strecha, warps, wxbs
 from jaxsfm.cli.data_commands import data
-from jaxsfm.cli.evaluate_commands import demo, evaluate
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.localize_commands import extend, localize
 from jaxsfm.cli.pairs_command import pairs
-from jaxsfm.cli.run_commands import match, reconstruct
+from jaxsfm.cli.result_commands import evaluate, report, view
+from jaxsfm.cli.run_commands import demo, match, reconstruct
 from jaxsfm.cli.subcommands import one_of, unwrapped
 from jaxsfm.cli.train_commands import train
-from jaxsfm.cli.view_commands import report, view
 from jaxsfm.cli.weights_commands import weights, with_action
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt

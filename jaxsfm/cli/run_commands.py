@@ -1,4 +1,4 @@
-"""`jaxsfm reconstruct` and `jaxsfm match`.
+"""The commands `jaxsfm reconstruct`, `jaxsfm match` and `jaxsfm demo`.
 
 Heavy modules are imported inside the commands, so that --help is quick.
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 import tyro
 
 from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
+from jaxsfm.cli.subcommands import named_options
 from jaxsfm.errors import UserError
 from jaxsfm.options import EngineChoice, ExecutionChoice, ReconstructionChoice, WeightsChoice
 
@@ -18,15 +19,11 @@ Positional = tyro.conf.Positional
 
 
 def check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
-    """Check that a file can be written, before the work is done and not after it.
-
-    Args:
-      path: the file; None passes.
-      option: the option that names it, for the error.
-      suffixes: of which its name must end in one.
+    """Check that a file can be written, before the work is done and not after it. None passes.
 
     Raises:
-      UserError: another suffix, or a place that cannot be written to.
+      UserError: the name ends in none of the suffixes, or the place cannot be written to. The
+        message starts with the option.
     """
     if path is None:
         return
@@ -66,10 +63,8 @@ def reconstruct(
     from jaxsfm.runs.reconstruct import reconstruct_folder
     from jaxsfm.runs.run_options import RunOptions
 
-    try:
+    with named_options():
         checked = Execution(**vars(execution))
-    except ValueError as error:
-        raise UserError(f"--{str(error).replace('_', '-')}") from error
     options = RunOptions(
         **vars(run), network=network, execution=checked, engine=engine, progress=True
     )
@@ -159,3 +154,21 @@ def match(
         f"({result.num_tentative} tentative, {aligned.sum()} aligned): {out}"
     )
     return 0
+
+
+def demo(*, out: Path | None = None, seed: int = 0) -> int:
+    """Render a small scene, reconstruct it, and compare the result with the exact cameras.
+
+    The exit status is 1 if a camera is missing, or if the mean errors are larger than the last line
+    allows.
+
+    Args:
+      out: The folder for the scene and the results. Without it, a new folder in the system's
+        temporary folder.
+      seed: The seed of the scene's noise and of the reconstruction.
+    """
+    from jaxsfm.bench.demo import run_demo
+
+    lines, passed = run_demo(out, seed=seed)
+    print("\n".join(lines))
+    return 0 if passed else 1

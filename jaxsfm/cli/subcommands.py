@@ -1,15 +1,18 @@
 """Commands and option classes in the form that tyro expects."""
 
+import contextlib
 import dataclasses
 import functools
 import inspect
 import operator
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated
 
 import tyro
+
+from jaxsfm.errors import UserError
 
 Command = Callable[..., int]
 _WRAPPED = re.compile(r"\n {4,}(?=[^\s$])")
@@ -21,16 +24,25 @@ def unwrapped(command: Command) -> Command:
 
     tyro wraps descriptions itself, but keeps some of the line ends that it finds.
     """
-    _unwrap(command)
+    documented: list[Callable[..., object]] = [command]
+    for kind in typing.get_type_hints(command).values():
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            documented += kind.__mro__[:-1]
+    for each in documented:
+        each.__doc__ = _WRAPPED.sub(" ", inspect.cleandoc(each.__doc__ or ""))
     return command
 
 
-def _unwrap(documented: Callable[..., object]) -> None:
-    documented.__doc__ = _WRAPPED.sub(" ", inspect.cleandoc(documented.__doc__ or ""))
-    for kind in typing.get_type_hints(documented).values():
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            for each in kind.__mro__[:-1]:
-                _unwrap(each)
+@contextlib.contextmanager
+def named_options() -> Iterator[None]:
+    """Make a ValueError about a field, which its message starts with, a UserError about the option
+    that sets the field."""
+    try:
+        yield
+    except ValueError as error:
+        field, _, problem = str(error).partition(" ")
+        option = field.rpartition(".")[2].replace("_", "-")
+        raise UserError(f"--{option} {problem}") from error
 
 
 def one_of(commands: Mapping[str, Command]) -> object:

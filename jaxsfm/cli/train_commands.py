@@ -7,6 +7,7 @@ from typing import Literal
 import tyro
 
 from jaxsfm.cli.run_commands import check_writable
+from jaxsfm.cli.subcommands import named_options
 from jaxsfm.errors import UserError
 
 
@@ -68,7 +69,7 @@ def train(what: tyro.conf.Positional[Literal["relocalizer"]], *, training: Train
     from jaxsfm.training.posed_pairs import posed_pairs
     from jaxsfm.training.relocalizer import TrainOptions, train_relocalizer
 
-    try:
+    with named_options():
         options = TrainOptions(
             steps=training.steps,
             batch=training.batch,
@@ -77,9 +78,6 @@ def train(what: tyro.conf.Positional[Literal["relocalizer"]], *, training: Train
             seed=training.seed,
             objective=Objective(temperature=training.temperature, peakiness=training.peakiness),
         )
-    except ValueError as error:
-        named = str(error).removeprefix("Objective.")
-        raise UserError(f"--{named.replace('_', '-', 1)}") from error
     poses = read_poses(training.reference) if training.reference else None
     camera = parse_intrinsics(training.intrinsics) if training.intrinsics else None
     usable, unusable = open_images(training.images, progress=True)

@@ -1,14 +1,12 @@
 """What may help a lost photo: options or further photos that the numbers of the run speak for."""
 
 import re
-from collections.abc import Collection, Mapping
-from typing import NamedTuple
+from collections.abc import Collection, Iterable
 
-from jaxsfm.config import Config
 from jaxsfm.io.images import shown_name
-from jaxsfm.io.pairs import Pair, describe
-from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, PairOutcomes
-from jaxsfm.report.run_results import Advice
+from jaxsfm.io.pairs import describe
+from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, PairOutcomes, furthest
+from jaxsfm.report.run_results import Advice, PairRow
 
 LEAST_ANGLE_DEG = 4.0
 """The least angle at which the rays of a pair's points must meet to give the mapper depth to start
@@ -17,20 +15,8 @@ _SHORTLIST = re.compile(r"\b(retrieval|sequential):(\d+)")
 _NO_OPTION = "no option would help; "
 
 
-class Circumstances(NamedTuple):
-    """What a run was made with, as far as advice depends on it."""
-
-    config: Config
-    pairs: str
-    """The value of `--pairs`."""
-    known_camera: bool
-    """Whether `--intrinsics` were given."""
-    sizes: Mapping[str, tuple[int, int]]
-    """(width, height) of every usable photo, pixels."""
-
-
 def towards_others(
-    group: Collection[str], crossing: Collection[Pair], pairs: PairOutcomes, made: Circumstances
+    group: Collection[str], crossing: Collection[PairRow], pairs: PairOutcomes
 ) -> list[Advice]:
     """What could connect some photos to the others.
 
@@ -39,24 +25,22 @@ def towards_others(
       crossing: the pairs that were tried between the group and all other photos. If some of them
         are trusted, the mapper did not use them all the same.
     """
-    best = pairs.best(crossing)
+    best = furthest(crossing)
     found = [
-        *_more_pairs(group, crossing, made),
-        *_more_handed_on(crossing, pairs),
-        *_more_trusted(crossing, pairs),
+        *_more_pairs(group, crossing, pairs),
+        *_more_handed_on(crossing),
+        *_more_trusted(crossing),
     ]
-    if best is not None and not pairs.verified(best):
-        row = pairs.rows[best]
-        if row.inliers >= COLMAP_MIN_INLIERS and row.handed_on and not made.known_camera:
-            found.append(
-                _camera(f"COLMAP verified none of the {row.inliers} matches of {describe(best)}")
-            )
-        found += _resolution(best, made)
+    if best is not None and not best.verified:
+        if best.inliers >= COLMAP_MIN_INLIERS and best.handed_on and not pairs.known_camera:
+            matches = f"{best.inliers} matches of {describe(best.pair)}"
+            found.append(_camera(f"COLMAP verified none of the {matches}"))
+        found += _resolution(best, pairs)
     return [*found, _photos(best, pairs, alone=not found)]
 
 
 def without_pose(
-    name: str, own: Collection[Pair], pairs: PairOutcomes, made: Circumstances, *, model: bool
+    name: str, own: Collection[PairRow], pairs: PairOutcomes, *, model: bool
 ) -> list[Advice]:
     """What could give a pose to a photo that trusted pairs connect, but the mapper left out.
 
@@ -68,14 +52,13 @@ def without_pose(
     if widest is not None and widest < LEAST_ANGLE_DEG:
         why = f"the rays of its points meet at {widest:.1f} deg at most"
         return [Advice(option=None, reason=f"{_NO_OPTION}take photos a step to the side: {why}")]
-    used = [pair for pair in own if pairs.trusted(pair)]
-    best = pairs.best(used)
+    best = furthest(row for row in own if row.trusted)
     assert best is not None, name
-    found = [*_more_pairs([name], own, made), *_more_handed_on(own, pairs)]
-    if not made.known_camera:
-        inliers = pairs.rows[best].colmap_inliers
-        found.append(_camera(f"{inliers} inliers in its best pair, but COLMAP found no pose"))
-    other = best[best[0] == name]
+    found = [*_more_pairs([name], own, pairs), *_more_handed_on(own)]
+    if not pairs.known_camera:
+        inliers = f"{best.colmap_inliers} inliers in its best pair"
+        found.append(_camera(f"{inliers}, but COLMAP found no pose"))
+    (other,) = set(best.pair) - {name}
     near = f"take photos near it, a step to the side of {shown_name(other)}"
     return [*found, Advice(option=None, reason=near if found else _NO_OPTION + near)]
 
@@ -85,82 +68,72 @@ def _camera(why: str) -> Advice:
 
 
 def _more_pairs(
-    group: Collection[str], tried: Collection[Pair], made: Circumstances
-) -> list[Advice]:
+    group: Collection[str], tried: Collection[PairRow], pairs: PairOutcomes
+) -> Iterable[Advice]:
     """A longer list of pairs, if some pairs of the group with other photos were not tried."""
-    possible = len(group) * (len(made.sizes) - len(group))
+    photos = len(pairs.sizes)
+    possible = len(group) * (photos - len(group))
     if len(tried) >= possible:
-        return []
-    why = f"{len(tried)} of its {possible} pairs with others were tried"
-    if made.pairs == "exhaustive":  # extend tries only the shortlist of a new photo
-        return [
-            Advice(
-                option="jaxsfm reconstruct", reason=f"run it again into the same folder: only {why}"
-            )
-        ]
-    most = len(made.sizes) - 1
-    longer = _SHORTLIST.sub(lambda m: f"{m[1]}:{min(2 * int(m[2]), most)}", made.pairs)
-    if longer == made.pairs:  # a file of pairs, or a shortlist that cannot be longer
+        return
+    why = f"only {len(tried)} of its {possible} pairs with others were tried"
+    if pairs.selection == "exhaustive":  # extend tries only the shortlist of a new photo
+        why = f"run it again into the same folder: {why}"
+        yield Advice(option="jaxsfm reconstruct", reason=why)
+        return
+    longer = _SHORTLIST.sub(lambda m: f"{m[1]}:{min(2 * int(m[2]), photos - 1)}", pairs.selection)
+    if longer == pairs.selection:  # a file of pairs, or a shortlist that cannot be longer
         longer = "exhaustive"
-    return [Advice(option=f"--pairs {longer}", reason=f"only {why}")]
+    yield Advice(option=f"--pairs {longer}", reason=why)
 
 
-def _more_handed_on(tried: Collection[Pair], pairs: PairOutcomes) -> list[Advice]:
-    left = [p for p in tried if pairs.rows[p].inliers and not pairs.rows[p].handed_on]
-    best = pairs.best(left)
-    if best is None:
-        return []
-    why = (
-        f"choose a larger number, or leave the option out: {len(left)} of its pairs with matches "
-        f"were left out, the best, {describe(best)}, with {pairs.rows[best].inliers} matches"
-    )
-    return [Advice(option="--best-pairs", reason=why)]
+def _more_handed_on(tried: Collection[PairRow]) -> Iterable[Advice]:
+    left = [row for row in tried if row.inliers and not row.handed_on]
+    best = furthest(left)
+    if best is not None:
+        why = (
+            f"choose a larger number, or leave the option out: {len(left)} of its pairs with "
+            f"matches were left out, the best, {describe(best.pair)}, with {best.inliers} matches"
+        )
+        yield Advice(option="--best-pairs", reason=why)
 
 
-def _more_trusted(crossing: Collection[Pair], pairs: PairOutcomes) -> list[Advice]:
-    dropped = [p for p in crossing if pairs.verified(p) and not pairs.trusted(p)]
-    best = pairs.best(dropped)
-    if best is None:
-        return []
-    why = (
-        f"the view graph dropped {len(dropped)} of its pairs, the best, {describe(best)}, with "
-        f"{pairs.rows[best].colmap_inliers} inliers; check that both show the same place"
-    )
-    return [Advice(option="--view-graph no", reason=why)]
+def _more_trusted(crossing: Collection[PairRow]) -> Iterable[Advice]:
+    dropped = [row for row in crossing if row.verified and not row.trusted]
+    best = furthest(dropped)
+    if best is not None:
+        why = (
+            f"the view graph dropped {len(dropped)} of its pairs, the best, "
+            f"{describe(best.pair)}, with {best.colmap_inliers} inliers; check that both show the "
+            "same place"
+        )
+        yield Advice(option="--view-graph no", reason=why)
 
 
-def _resolution(best: Pair, made: Circumstances) -> list[Advice]:
+def _resolution(best: PairRow, pairs: PairOutcomes) -> Iterable[Advice]:
     """Larger working images, if the photos are larger or can be enlarged."""
-    config = made.config
-    found = []
+    config = pairs.config
     if config.octaves == 1:
         why = (
             "the preset paper describes photos at one size only; four sizes find more matches at "
             "night and between photos from different distances"
         )
-        found.append(Advice(option="--preset default", reason=why))
-    sides = {name: max(made.sizes[name]) for name in best}
-    large, small = max(best, key=sides.__getitem__), min(best, key=sides.__getitem__)
+        yield Advice(option="--preset default", reason=why)
+    sides = {name: max(pairs.sizes[name]) for name in best.pair}
+    large, small = max(best.pair, key=sides.__getitem__), min(best.pair, key=sides.__getitem__)
     if sides[large] > config.max_size:
         size = min(2 * config.max_size, sides[large])
         why = f"{shown_name(large)} was reduced from {sides[large]} to {config.max_size} px"
-        found.append(Advice(option=f"--max-size {size}", reason=why))
+        yield Advice(option=f"--max-size {size}", reason=why)
     if sides[small] < config.max_size and config.enlarge == 1:
         why = f"{shown_name(small)} has only {sides[small]} px; it would be enlarged, up to twice"
-        found.append(Advice(option="--preset robust", reason=why))
-    return found
+        yield Advice(option="--preset robust", reason=why)
 
 
-def _photos(best: Pair | None, pairs: PairOutcomes, *, alone: bool) -> Advice:
+def _photos(best: PairRow | None, pairs: PairOutcomes, *, alone: bool) -> Advice:
     """Which photos would help; `alone`: no option would."""
-    start = _NO_OPTION * alone
     if best is None:
-        return Advice(
-            option=None, reason=f"{start}take photos that show it together with the others"
-        )
-    colmap = pairs.rows[best].colmap_inliers
-    lack = pairs.missed(best) or f"{colmap} inliers, too few for the mapper"
-    return Advice(
-        option=None,
-        reason=f"{start}take photos between {describe(best)}, the pair that came closest ({lack})",
-    )
+        where = "that show it together with the others"
+    else:
+        lack = pairs.missed(best) or f"{best.colmap_inliers} inliers, too few for the mapper"
+        where = f"between {describe(best.pair)}, the pair that came closest ({lack})"
+    return Advice(option=None, reason=f"{_NO_OPTION * alone}take photos {where}")

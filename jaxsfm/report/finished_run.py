@@ -3,21 +3,24 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model import Model, point_colours
+from jaxsfm.colmap.model import Model, Sizes, point_colours
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
-from jaxsfm.colmap.tracks import Tracks
-from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, inspect_image, read_image
-from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.images import (
+    ImageError,
+    ImageFile,
+    WorkingImage,
+    inspect_image,
+    read_image,
+    working_size,
+)
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
 from jaxsfm.report.run_inputs import RecordedConfig
@@ -26,18 +29,13 @@ from jaxsfm.report.run_results import EvaluationReport
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.sfm.evaluation import Similarity, common_alignment, evaluate
 
+if TYPE_CHECKING:
+    import pycolmap
+
 logger = logging.getLogger(__name__)
 
-
-class FinishedModel(NamedTuple):
-    """The best model of a run, in original pixels (`View.pixels` are theirs)."""
-
-    views: Sequence[View]
-    tracks: Tracks
-    colours: np.ndarray
-    """uint8 (n, 3): RGB of each point."""
-    errors: np.ndarray
-    """float64 (m,): the reprojection error of each observation, original pixels."""
+ORIGINAL = (2**31, 1.0)
+"""The limits of `jaxsfm.io.images.working_size` that leave every photo as it is."""
 
 
 class ReferencePoses(NamedTuple):
@@ -97,59 +95,38 @@ class FinishedRun:
     report: RunReport
     """The content of report.json; its `evaluation` is against `reference`."""
     photos: RecordedPhotos
-    model: FinishedModel | None
+    model: Model | None
+    """The best model, in original pixels."""
+    colours: np.ndarray
+    """uint8 (n, 3): RGB of each point of the model."""
     reference: ReferencePoses | None
     matches: Store
 
+    @functools.cached_property
+    def errors(self) -> np.ndarray:
+        """float64 (m,): the reprojection error of each observation, original pixels."""
+        return self.model.errors_px() if self.model is not None else np.zeros(0)
+
     @property
     def config(self) -> Config:
-        """The config of the run.
-
-        Raises:
-          UserError: the config has fields that this version of jaxsfm does not know.
-        """
+        """The config of the run; UserError if it has fields that this version does not know."""
         try:
-            return _config(self.report.options.config)
+            return from_json(Config, to_json(self.report.options.config), exact=True)
         except ValueError as error:
             raise UserError(
                 f"{self.folder}: was made by jaxsfm {self.report.version}, whose options "
                 "this version does not know; run reconstruct again"
             ) from error
 
-    def load_matches(self, pair: Pair) -> PairResult | None:
-        """The matches of a pair, original pixels; None if there are none or the file is gone."""
-        return self.matches.load_matches(pair)
 
-
-def _config(recorded: RecordedConfig) -> Config:
-    """The config of a run.
-
-    Raises:
-      ValueError: it is not one of this version.
-    """
-    plain = to_json(recorded)
-    config = from_json(Config, plain)
-    if not _names(plain) <= _names(to_json(config)):
-        raise ValueError("the config has fields that this version does not know")
-    return config
-
-
-def _names(value: Json, place: str = "") -> set[str]:
-    """The places of all keys in plain JSON."""
-    if not isinstance(value, Mapping):
-        return {place}
-    return set().union(*(_names(each, f"{place}.{key}") for key, each in value.items()))
-
-
-def _model(folder: Path) -> tuple[FinishedModel, Poses] | None:
-    if not (folder / "sparse" / "0").is_dir():
-        return None
-    model = read_model(folder / "sparse" / "0")
-    cameras = {model.image(i).name: model.camera(model.image(i).camera_id) for i in model.images}
-    sizes = {name: ((c.width, c.height), (1.0, 1.0)) for name, c in cameras.items()}
-    arrays = Model.from_colmap(model, sizes)
-    shown = FinishedModel(arrays.views, arrays.tracks, point_colours(model), arrays.errors_px())
-    return shown, model_poses(model)
+def sizes_within(reconstruction: "pycolmap.Reconstruction", max_size: int, enlarge: float) -> Sizes:
+    """The working sizes of a model's images, for limits as in `jaxsfm.io.images.working_size`."""
+    sizes = {}
+    for image in reconstruction.images.values():
+        camera = reconstruction.camera(image.camera_id)
+        width, height = working_size((camera.width, camera.height), max_size, enlarge)
+        sizes[image.name] = (width, height), (camera.width / width, camera.height / height)
+    return sizes
 
 
 def _with_reference(
@@ -178,13 +155,11 @@ def _with_reference(
     return report, ReferencePoses(reference, similarity)
 
 
-def evaluation_report(poses: Poses, reference: Poses) -> EvaluationReport:
-    """The errors of a model's poses against reference poses.
-
-    Raises:
-      UserError: the two have too few photos in common.
-    """
-    return from_json(EvaluationReport, evaluate(poses, reference).as_dict())
+def evaluation_report(
+    poses: Poses, reference: Poses, *, align_on: Collection[str] | None = None
+) -> EvaluationReport:
+    """The errors of a model's poses. Arguments and errors are those of `evaluate`."""
+    return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
 
 
 def read_run(
@@ -206,16 +181,20 @@ def read_run(
     home = folder if (folder / RECORD).exists() else folder.parent
     recorded = report.images.folder
     where = images or (Path(recorded) if recorded else None)
-    found = _model(folder) if report.models else None
-    model, poses = found if found else (None, {})
-    if reference is not None and not poses:
+    model, known, colours = None, None, np.zeros((0, 3), np.uint8)
+    if report.models and (folder / "sparse" / "0").is_dir():
+        found = read_model(folder / "sparse" / "0")
+        model = Model.from_colmap(found, sizes_within(found, *ORIGINAL))
+        colours = point_colours(found)
+        report, known = _with_reference(report, model_poses(found), reference)
+    elif reference is not None:
         raise UserError(f"--reference {reference}: {folder} has no model to compare with it")
-    report, known = _with_reference(report, poses, reference) if poses else (report, None)
     return FinishedRun(
         folder=folder,
         report=report,
         photos=RecordedPhotos(where, report.identity.images, report.options.config),
         model=model,
+        colours=colours,
         reference=known,
-        matches=Store(home, report.identity.to_json()),
+        matches=Store(home, to_json(report.identity)),
     )

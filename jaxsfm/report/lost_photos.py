@@ -3,58 +3,69 @@
 A photo is lost if it has no pose in the best model. For each lost photo the report names the stage
 that lost it, the numbers that decided, and what may help:
 
-* `jaxsfm.report.pair_outcomes` says how far each pair of photos came, and what it lacked;
-* `jaxsfm.report.photo_groups` says which photos trusted pairs join;
+* `jaxsfm.report.pair_outcomes` says how far each pair of photos came, what it lacked, and which
+  photos trusted pairs join;
 * this module says at which stage a photo was lost;
 * `jaxsfm.report.advice` says which option, or which further photos, could help.
 """
 
+import dataclasses
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
+from jaxsfm.config import Config
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, describe
-from jaxsfm.report.advice import LEAST_ANGLE_DEG, Circumstances, towards_others, without_pose
-from jaxsfm.report.pair_outcomes import PairOutcomes
-from jaxsfm.report.photo_groups import PhotoGroup, photo_groups, view_graph_report
-from jaxsfm.report.run_results import Advice, LostPhoto, Stage, ViewGraph
+from jaxsfm.report.advice import LEAST_ANGLE_DEG, towards_others, without_pose
+from jaxsfm.report.pair_outcomes import (
+    PairOutcomes,
+    PhotoGroup,
+    furthest,
+    photo_groups,
+    view_graph_report,
+)
+from jaxsfm.report.run_report import RunReport
+from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, Stage
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 
-class Explanation(NamedTuple):
-    """The fields of the report that explain what is missing."""
-
-    view_graph: ViewGraph
-    lost: list[LostPhoto]
-    no_model: str | None
-
-
-def explain(
-    models: Sequence[Collection[str]],
-    pairs: PairOutcomes,
-    made: Circumstances,
-    refinement: Sequence[RefinementFigures | None] = (),
-) -> Explanation:
-    """The groups of photos, the lost photos, and why there is no model.
+def explained(
+    report: RunReport,
+    config: Config,
+    sizes: Mapping[str, tuple[int, int]],
+    angles: Mapping[Pair, float],
+) -> RunReport:
+    """The report with what follows from its pairs and models: the groups of photos, why photos were
+    lost and what may help them, and why there is no model.
 
     Args:
-      models: the photos of each model, the best model first.
-      refinement: what the refinement of each model did; None for a model that was not refined.
+      sizes: (width, height) of every usable photo that is still there, pixels. Pairs with other
+        photos are left out.
+      angles: the angle at which the rays of a verified pair's points meet (median), degrees; 0
+        where it is unknown.
     """
-    groups = photo_groups(made.sizes, pairs)
-    return Explanation(
+    pairs = PairOutcomes(
+        rows=[row for row in report.pairs.each if sizes.keys() >= set(row.pair)],
+        angles=angles,
+        sizes=sizes,
+        config=config,
+        selection=report.options.pairs,
+        known_camera=report.options.intrinsics is not None,
+    )
+    models = [model.images for model in report.models]
+    groups = photo_groups(sizes, pairs.rows)
+    return dataclasses.replace(
+        report,
         view_graph=view_graph_report(groups, models[0] if models else (), pairs),
-        lost=lost_photos(groups, models, pairs, made, _taken_out(refinement)),
-        no_model=None if models else no_model(pairs),
+        lost=_lost_photos(groups, models, pairs, _taken_out(report.refinement)),
+        no_model=None if models else _no_model(pairs),
     )
 
 
-def lost_photos(
+def _lost_photos(
     groups: Sequence[PhotoGroup],
     models: Sequence[Collection[str]],
     pairs: PairOutcomes,
-    made: Circumstances,
-    taken_out: Mapping[str, str],
+    taken_out: dict[str, str],
 ) -> list[LostPhoto]:
     """Every photo without a pose in the best model, with the stage that lost it.
 
@@ -67,21 +78,19 @@ def lost_photos(
     * `no pose`: trusted pairs lead to the model, but COLMAP found no pose;
     * `not confirmed`: COLMAP found a pose, but refinement took the photo out of the model again;
     * `other model`: trusted pairs lead to the best model, but the photo is in a smaller one.
-
-    Args:
-      taken_out: why refinement took a photo out of a model, by name.
     """
     best_model = set(models[0]) if models else set()
-    own: dict[str, list[Pair]] = {name: [] for name in made.sizes}
-    for pair in pairs.rows:
-        for name in own.keys() & set(pair):
-            own[name].append(pair)
+    own_rows: dict[str, list[PairRow]] = {name: [] for name in pairs.sizes}
+    for row in pairs.rows:
+        for name in row.pair:
+            own_rows[name].append(row)
     lost = []
     for index, group in enumerate(groups):
         connected = bool(group.images & best_model) or not best_model
         shared: list[Advice] | None = None  # all photos of an unconnected group get the same
-        for name in sorted(group.images - best_model):
-            stage, detail = _stage(name, own[name], connected, pairs)
+        for name in group.images - best_model:
+            own = own_rows[name]
+            stage, detail = _stage(own, connected)
             smaller = next((k for k, images in enumerate(models) if k and name in images), None)
             if smaller is not None:
                 stage = "other model" if stage == "no pose" else stage
@@ -89,16 +98,17 @@ def lost_photos(
             elif name in taken_out:
                 stage, detail = "not confirmed", f"{detail}; {taken_out[name]}"
             if stage == "no pose":
-                advice = without_pose(name, own[name], pairs, made, model=bool(models))
+                advice = without_pose(name, own, pairs, model=bool(models))
             elif stage == "not confirmed":
-                advice = towards_others([name], own[name], pairs, made)
+                advice = towards_others([name], own, pairs)
             elif stage == "other model":
                 island = set(models[smaller or 0]) - best_model
-                advice = towards_others(island, _leaving(island, pairs), pairs, made)
+                leaving = [row for row in pairs.rows if len(island & set(row.pair)) == 1]
+                advice = towards_others(island, leaving, pairs)
             else:
-                shared = shared or towards_others(group.images, group.crossing, pairs, made)
+                shared = shared or towards_others(group.images, group.crossing, pairs)
                 advice = shared
-            best = pairs.best(own[name])
+            best = furthest(own)
             lost.append(
                 LostPhoto(
                     image=name,
@@ -127,36 +137,28 @@ def _taken_out(refinement: Sequence[RefinementFigures | None]) -> dict[str, str]
     }
 
 
-def _leaving(images: Collection[str], pairs: PairOutcomes) -> list[Pair]:
-    """The pairs that were tried between some photos and all others."""
-    return [pair for pair in pairs.rows if (pair[0] in images) != (pair[1] in images)]
-
-
-def _stage(
-    name: str, own: Sequence[Pair], connected: bool, pairs: PairOutcomes
-) -> tuple[Stage, str]:
+def _stage(own: Sequence[PairRow], connected: bool) -> tuple[Stage, str]:
     """The stage that lost a photo, and the numbers in words.
 
     Args:
       own: the pairs that were tried with the photo.
       connected: whether trusted pairs join the photo's group to the model.
     """
-    rows = [pairs.rows[pair] for pair in own]
-    tentative = max((row.tentative for row in rows), default=0)
     if not own:
         return "pairs", "it is in no pair that was tried"
-    if all(row.status == Status.TOO_FEW_MATCHES for row in rows):
+    tentative = max(row.tentative for row in own)
+    if all(row.status == Status.TOO_FEW_MATCHES for row in own):
         return "too few matches", f"at most {tentative} tentative matches in a pair"
-    if not any(row.status == Status.VERIFIED for row in rows):
+    if not any(row.status == Status.VERIFIED for row in own):
         return "no plane", (
             f"{tentative} tentative matches, but no homography agrees with enough of them"
         )
-    used = [row.colmap_inliers for row in rows if row.trusted]
+    used = [row.colmap_inliers for row in own if row.trusted]
     if used and connected:
         return "no pose", f"{len(used)} verified pairs with up to {max(used)} inliers"
-    dropped = sum(row.colmap_inliers > 0 for row in rows) - len(used)
+    dropped = sum(row.verified for row in own) - len(used)
     detail = (
-        f"{max(row.inliers for row in rows)} inliers in its best pair, {len(used)} pairs verified "
+        f"{max(row.inliers for row in own)} inliers in its best pair, {len(used)} pairs verified "
         "by COLMAP, none of which leads to the model"
     )
     if dropped:
@@ -164,22 +166,23 @@ def _stage(
     return "not connected", detail
 
 
-def no_model(pairs: PairOutcomes) -> str:
+def _no_model(pairs: PairOutcomes) -> str:
     """The one reason why there is no model: the stage that no pair got past, with the numbers."""
-    best = pairs.best(pairs.rows)
+    rows = pairs.rows
+    best = furthest(rows)
     if best is None:
         return "no pair of photos was tried"
-    lack = f"the best, {describe(best)}, has {pairs.missed(best)}"
-    rows = pairs.rows.values()
+    lack = f"the best, {describe(best.pair)}, has {pairs.missed(best)}"
     if not any(row.inliers for row in rows):
         return f"none of the {len(rows)} pairs tried has matches on a plane: {lack}"
-    verified = [pair for pair in pairs.rows if pairs.verified(pair)]
+    verified = sum(row.verified for row in rows)
     if not verified:
         handed_on = sum(row.handed_on for row in rows)
         return f"COLMAP verified none of the {handed_on} pairs handed to it: {lack}"
-    used = [pair for pair in verified if pairs.trusted(pair)]
-    if not used:
-        return f"the view graph trusts none of the {len(verified)} verified pairs: {lack}"
+    used = [row for row in rows if row.trusted]
+    best = furthest(used)
+    if best is None:
+        return f"the view graph trusts none of the {verified} verified pairs: {lack}"
     start = f"the mapper found no pair to start from among {len(used)}"
     widest = pairs.widest_deg(used)
     if widest is not None and widest < LEAST_ANGLE_DEG:
@@ -187,6 +190,4 @@ def no_model(pairs: PairOutcomes) -> str:
             f"{start}: the rays of their points meet at {widest:.1f} deg at most, so nothing "
             "gives depth; move sideways between photos"
         )
-    best = pairs.best(used)
-    assert best is not None
-    return f"{start}; the best, {describe(best)}, has {pairs.rows[best].colmap_inliers} inliers"
+    return f"{start}; the best, {describe(best.pair)}, has {best.colmap_inliers} inliers"

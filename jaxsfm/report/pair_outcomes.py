@@ -1,52 +1,47 @@
-"""How far every pair of a run came, and what it lacked."""
+"""How far the pairs of a run came, what each lacked, and which photos the trusted ones join."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
+from jaxsfm.config import Config
 from jaxsfm.core.types import Status
-from jaxsfm.io.pairs import Pair
-from jaxsfm.report.run_results import ClosestPair, PairRow
+from jaxsfm.io.pairs import Pair, component_of
+from jaxsfm.report.run_results import ClosestPair, Component, PairRow, ViewGraph
 from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG
 
 COLMAP_MIN_INLIERS = 15
 """The fewest inliers of a pair that COLMAP verifies: its default, which this package keeps."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PairOutcomes:
-    """The numbers of every pair that was tried."""
+def furthest(rows: Iterable[PairRow]) -> PairRow | None:
+    """The pair that came furthest: the one with most inliers of COLMAP, then of homographies, then
+    tentative matches, then the first by name. None if there are no pairs."""
+    return min(
+        rows,
+        key=lambda row: (-row.colmap_inliers, -row.inliers, -row.tentative, row.pair),
+        default=None,
+    )
 
-    rows: Mapping[Pair, PairRow]
+
+class PairOutcomes(NamedTuple):
+    """The pairs that a run tried, and the options that explanations and advice depend on."""
+
+    rows: Sequence[PairRow]
     angles: Mapping[Pair, float]
-    """The angle at which the rays of a verified pair's points meet (median), degrees; 0 where it
-    is unknown."""
-    min_inliers: int
-    """The fewest tentative matches of a pair that is looked at, and inliers of a homography."""
+    """As `jaxsfm.report.lost_photos.explained` takes them, and so are the `sizes`."""
+    sizes: Mapping[str, tuple[int, int]]
+    config: Config
+    selection: str
+    """The value of `--pairs`."""
+    known_camera: bool
+    """Whether `--intrinsics` were given."""
 
-    def trusted(self, pair: Pair) -> bool:
-        """Whether the pair was given to the mapper."""
-        return self.rows[pair].trusted
-
-    def verified(self, pair: Pair) -> bool:
-        """Whether COLMAP verified the pair."""
-        return self.rows[pair].colmap_inliers > 0
-
-    def best(self, pairs: Iterable[Pair]) -> Pair | None:
-        """The pair that came furthest: the one with most inliers of COLMAP, then of homographies,
-        then tentative matches, then the first by name."""
-
-        def nearest_first(pair: Pair) -> tuple[int, int, int, Pair]:
-            row = self.rows[pair]
-            return -row.colmap_inliers, -row.inliers, -row.tentative, pair
-
-        return min(pairs, key=nearest_first, default=None)
-
-    def missed(self, pair: Pair) -> str:
+    def missed(self, row: PairRow) -> str:
         """What a pair lacks to be used, in words and numbers; empty if it was used."""
-        row = self.rows[pair]
         if row.trusted:
             return ""
-        if row.view_graph is not None and self.verified(pair):
+        if row.verified and row.view_graph is not None:
             verdict = row.view_graph
             if verdict.rotation_error_deg is None:
                 return f"{row.colmap_inliers} inliers, but they give no relative pose"
@@ -63,29 +58,81 @@ class PairOutcomes:
             )
         if row.inliers:
             return f"{row.inliers} matches on planes, but --best-pairs left it out"
+        needed = self.config.min_inliers
         if row.status == Status.TOO_FEW_MATCHES:
-            return f"{row.tentative} tentative matches, {self.min_inliers} are needed"
-        return (
-            f"{row.tentative} tentative matches, but no homography agrees with "
-            f"{self.min_inliers} of them"
-        )
+            return f"{row.tentative} tentative matches, {needed} are needed"
+        return f"{row.tentative} tentative matches, but no homography agrees with {needed} of them"
 
-    def widest_deg(self, pairs: Iterable[Pair]) -> float | None:
-        """The largest angle of the trusted ones among `pairs`, degrees; None if none is known."""
-        known = [angle for p in pairs if self.trusted(p) and (angle := self.angles.get(p))]
+    def widest_deg(self, rows: Iterable[PairRow]) -> float | None:
+        """The largest angle of the trusted ones among `rows`, degrees; None if none is known."""
+        known = [angle for row in rows if row.trusted and (angle := self.angles.get(row.pair))]
         return max(known, default=None)
 
-    def closest(self, pair: Pair, *, component: int | None = None) -> ClosestPair:
+    def closest(self, row: PairRow, *, component: int | None = None) -> ClosestPair:
         """A pair as the report names it: with its numbers and what it lacks."""
-        row = self.rows[pair]
         return ClosestPair(
             component=component,
-            pair=pair,
+            pair=row.pair,
             tentative=row.tentative,
             inliers=row.inliers,
             colmap_inliers=row.colmap_inliers,
             trusted=row.trusted,
             strength=row.view_graph and row.view_graph.strength,
             rotation_error_deg=row.view_graph and row.view_graph.rotation_error_deg,
-            missed=self.missed(pair),
+            missed=self.missed(row),
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoGroup:
+    """Photos that chains of trusted pairs join: a connected component of the view graph."""
+
+    images: frozenset[str]
+    inside: list[PairRow] = dataclasses.field(default_factory=list)
+    """The trusted pairs among them."""
+    crossing: list[PairRow] = dataclasses.field(default_factory=list)
+    """The pairs that were tried between them and all other photos; none of these is trusted."""
+
+
+def photo_groups(names: Iterable[str], rows: Sequence[PairRow]) -> list[PhotoGroup]:
+    """All groups of the photos `names`, of which `rows` are pairs; the largest group first. A photo
+    without a trusted pair is a group by itself."""
+    trusted = [row.pair for row in rows if row.trusted]
+    joined = {name for pair in trusted for name in pair}
+    group_of: dict[str, PhotoGroup] = {}
+    groups: list[PhotoGroup] = []
+    for name in sorted(names):
+        if name not in group_of:
+            images = component_of([name], trusted) if name in joined else [name]
+            groups.append(PhotoGroup(frozenset(images)))
+            group_of |= dict.fromkeys(images, groups[-1])
+    for row in sorted(rows, key=lambda row: row.pair):
+        one, other = (group_of[name] for name in row.pair)
+        if one is not other:
+            one.crossing.append(row)
+            other.crossing.append(row)
+        elif row.trusted:
+            one.inside.append(row)
+    return sorted(groups, key=lambda group: (-len(group.images), min(group.images)))
+
+
+def view_graph_report(
+    groups: Sequence[PhotoGroup], best_model: Collection[str], pairs: PairOutcomes
+) -> ViewGraph:
+    """The groups as the report lists them."""
+    index = {name: k for k, group in enumerate(groups) for name in group.images}
+    rows = []
+    for group in groups:
+        best, nearest = furthest(group.crossing), None
+        if best is not None:
+            (other,) = set(best.pair) - group.images
+            nearest = pairs.closest(best, component=index[other])
+        rows.append(
+            Component(
+                images=sorted(group.images),
+                pairs=len(group.inside),
+                registered=len(group.images & set(best_model)),
+                nearest=nearest,
+            )
+        )
+    return ViewGraph(components=rows)

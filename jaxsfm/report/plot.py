@@ -66,14 +66,7 @@ def draw_matches(
 
 
 def encode_figure(figure: Figure, suffix: str, *, jpeg_quality: int = 95) -> bytes:
-    """A figure as the content of an image file.
-
-    Args:
-      suffix: .png or .jpg.
-
-    Raises:
-      ValueError: OpenCV cannot write the format.
-    """
+    """A figure as the content of an image file; ValueError for a suffix other than .png or .jpg."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     bgr = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
@@ -89,11 +82,7 @@ def encode_figure(figure: Figure, suffix: str, *, jpeg_quality: int = 95) -> byt
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure; the suffix of the path, .png or .jpg, is the format.
-
-    Raises:
-      UserError: the suffix is another one, or the file cannot be written.
-    """
+    """Write a figure as .png or .jpg; UserError for another suffix, or if it cannot be written."""
     try:
         path.write_bytes(encode_figure(figure, path.suffix))
     except ValueError as error:

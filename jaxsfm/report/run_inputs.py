@@ -4,13 +4,12 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated
 
-from jaxsfm.io.atomic import Json
-from jaxsfm.report.typed_json import OTHERS, Count, Range, to_json
+from jaxsfm.report.typed_json import OTHERS, Count, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunIdentity:
-    """What the matches of a run depend on (`jaxsfm.io.store.Identity`)."""
+    """What the matches of a run depend on: as JSON it is a `jaxsfm.io.store.Identity`."""
 
     version: str
     """The version of jaxsfm."""
@@ -23,12 +22,6 @@ class RunIdentity:
     seed: Count = 0
     images: dict[str, str]
     """The SHA-256 of every usable photo, by name."""
-
-    def to_json(self) -> dict[str, Json]:
-        """The identity as `jaxsfm.io.store.Store` takes it."""
-        plain = to_json(self)
-        assert isinstance(plain, dict)
-        return plain
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

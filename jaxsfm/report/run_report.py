@@ -91,17 +91,11 @@ class RunReport:
 
     def to_json(self) -> dict[str, Json]:
         """The report as plain JSON."""
-        plain = to_json(self)
-        assert isinstance(plain, dict)
-        return plain
+        return to_json(self)
 
     @classmethod
     def from_json(cls, value: object) -> "RunReport":
-        """A report from plain JSON.
-
-        Raises:
-          Misfit: the value is not a report that this version can read.
-        """
+        """A report from plain JSON; Misfit if this version cannot read it."""
         return from_json(cls, value)
 
 
@@ -111,20 +105,12 @@ def write_report(folder: Path, report: RunReport) -> None:
 
 
 def read_report(folder: Path) -> RunReport:
-    """Read a run's report.json.
-
-    Raises:
-      UserError: there is no report, or it is damaged or of another version.
-    """
+    """Read a run's report.json; errors are those of `read_part`."""
     return read_part(folder, RunReport)
 
 
 def read_part(folder: Path, kind: type[T], *keys: str) -> T:
-    """Read one part of a run's report.json, whatever the rest of the file is.
-
-    Args:
-      kind: the dataclass that the part becomes.
-      keys: they lead to the part.
+    """Read the part of a run's report.json that `keys` lead to, whatever the rest of the file is.
 
     Raises:
       UserError: there is no report, or the part is damaged or of another version.

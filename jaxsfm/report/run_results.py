@@ -43,9 +43,14 @@ class PairRow:
     """What the view graph says of the pair; None if it did not judge the pair."""
 
     @property
+    def verified(self) -> bool:
+        """Whether COLMAP verified the pair."""
+        return self.colmap_inliers > 0
+
+    @property
     def trusted(self) -> bool:
         """Whether the pair was given to the mapper."""
-        return self.colmap_inliers > 0 and (self.view_graph is None or self.view_graph.trusted)
+        return self.verified and (self.view_graph is None or self.view_graph.trusted)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jaxsfm.colmap.poses import CameraPose
-from jaxsfm.report.finished_run import FinishedModel, FinishedRun
+from jaxsfm.colmap.view import View
+from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.sfm.evaluation import Similarity
 
 FAR = 0.5
@@ -56,14 +57,11 @@ class Scene(NamedTuple):
         return np.asarray([0.0, 0.0, 0.4]) - 0.9 * ahead
 
 
-def _corners(model: FinishedModel) -> dict[str, np.ndarray]:
-    """The corners float64 (4, 3) of every view's image at depth 1, in the frame of the camera."""
-    found = {}
-    for view in model.views:
-        w, h = view.size
-        xy = np.asarray([[0, 0], [w, 0], [w, h], [0, h]], float) - 0.5
-        found[view.name] = view.rays(xy) @ view.rotation.T
-    return found
+def _corners(view: View) -> np.ndarray:
+    """The corners float64 (4, 3) of a view's image at depth 1, in the frame of the camera."""
+    w, h = view.size
+    xy = np.asarray([[0, 0], [w, 0], [w, h], [0, h]], float) - 0.5
+    return view.rays(xy) @ view.rotation.T
 
 
 def _upright(poses: list[CameraPose]) -> np.ndarray:
@@ -95,11 +93,7 @@ def _depth(centres: np.ndarray, extent: float) -> float:
 
 
 def shown_scene(run: FinishedRun) -> Scene:
-    """The best model of a run.
-
-    Raises:
-      ValueError: the run has no model.
-    """
+    """The best model of a run; ValueError if it has none."""
     if run.model is None:
         raise ValueError("run must have a model; got none")
     model = run.model
@@ -109,17 +103,17 @@ def shown_scene(run: FinishedRun) -> Scene:
     # The float32 of a browser has too few digits for geographic coordinates: move to the origin.
     upright = _upright(poses)
     turn = Similarity(1.0, upright, -upright @ np.mean([p.centre for p in poses], axis=0))
-    corners = _corners(model)
+    corners = [_corners(view) for view in model.views]
 
     def camera(name: str, pose: CameraPose, at: np.ndarray) -> ShownCamera:
         turned = _moved(pose, turn)
         return ShownCamera(name, turned, at @ turned.rotation)
 
     cameras = [
-        camera(view.name, pose, corners[view.name])
-        for view, pose in zip(model.views, poses, strict=True)
+        camera(view.name, pose, at)
+        for view, pose, at in zip(model.views, poses, corners, strict=True)
     ]
-    usual = np.median(list(corners.values()), axis=0)
+    usual = np.median(corners, axis=0)
     reference = [
         camera(name, pose, usual)
         for name, pose in sorted(run.reference.poses.items() if run.reference else ())
@@ -133,7 +127,7 @@ def shown_scene(run: FinishedRun) -> Scene:
     near = ((points >= low - margin) & (points <= high + margin)).all(1)
     return Scene(
         points=points[near],
-        colours=model.colours[near],
+        colours=run.colours[near],
         cameras=cameras,
         reference=reference,
         frustum_depth=_depth(centres, float(np.linalg.norm(high - low))),

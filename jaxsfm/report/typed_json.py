@@ -9,11 +9,12 @@ dataclass does not name is ignored, unless the dataclass has a field marked with
 import dataclasses
 import enum
 import functools
+import itertools
 import reprlib
 import types
 import typing
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
 
 from jaxsfm.io.atomic import Json
 
@@ -21,17 +22,14 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
-Read = Callable[[object], object]
-"""Checks a JSON value and converts it; raises Misfit."""
-
+K = TypeVar("K")
 OMITTED = {"omitted": True}
 """Metadata of a field that is left out of the JSON where it is None."""
 OTHERS = {"others": True}
 """Metadata of a field dict[str, object] that holds the keys which the dataclass does not name."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Range:
+class Range(NamedTuple):
     """Bounds of a number: low <= number < high."""
 
     low: float
@@ -62,160 +60,137 @@ class Misfit(ValueError):
         return f"{self.place or 'the whole'!r} must be {self.required}; got {self.got}"
 
 
-def to_json(value: object) -> Json:
-    """A dataclass, or lists and dicts of dataclasses, as plain JSON."""
-    if dataclasses.is_dataclass(value):
-        plain: dict[str, Json] = {}
-        for field in dataclasses.fields(value):
-            each = getattr(value, field.name)
-            if field.metadata == OTHERS:
-                plain.update(each)
-            elif each is not None or field.metadata != OMITTED:
-                plain[field.name] = to_json(each)
-        return plain
+def to_json(value: "DataclassInstance") -> dict[str, Json]:
+    """A dataclass as plain JSON."""
+    plain: dict[str, Json] = {}
+    for field in dataclasses.fields(value):
+        each = getattr(value, field.name)
+        if field.metadata == OTHERS:
+            plain.update(each)
+        elif each is not None or field.metadata != OMITTED:
+            plain[field.name] = _plain(each)
+    return plain
+
+
+def _plain(value: object) -> Json:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return to_json(value)
     if isinstance(value, enum.Enum):
         return value.name.lower()
     if isinstance(value, Mapping):
-        return {str(key): to_json(each) for key, each in value.items()}
+        return {str(key): _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [to_json(each) for each in value]
+        return [_plain(each) for each in value]
     if value is None or isinstance(value, str | int | float):
         return value
     raise TypeError(f"value must be plain or a dataclass; got {type(value).__name__}")
 
 
-def from_json(kind: type[T], value: object) -> T:
-    """A dataclass from plain JSON.
+def from_json(kind: type[T], value: object, *, exact: bool = False) -> T:
+    """A dataclass from plain JSON; Misfit if the value is not what the type hints ask for.
 
-    Raises:
-      Misfit: the value is not what the type hints ask for.
+    Args:
+      exact: whether a key that no dataclass names is an error. It is ignored otherwise.
     """
-    made = _reader(kind)(value)
+    made = _read(kind, value, exact)
     assert isinstance(made, kind)
     return made
 
 
-@functools.cache
-def _reader(hint: object) -> Read:
-    """The function that reads the values of a type hint."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if hint is object:
-        return lambda value: value
-    if origin is Annotated:
-        return _in_range(_reader(args[0]), *(mark for mark in args[1:] if isinstance(mark, Range)))
+def _read(hint: object, value: object, exact: bool) -> object:
+    """The value that a type hint asks for."""
+    if isinstance(hint, type):
+        return _read_type(hint, value, exact)
+    origin, args = _parts(hint)
     if origin in (typing.Union, types.UnionType):
         (other,) = (arg for arg in args if arg is not types.NoneType)
-        read = _reader(other)
-        return lambda value: None if value is None else read(value)
-    if origin is typing.Literal:
-        one_of = ", ".join(map(repr, args))
-        return _checked(lambda value: isinstance(value, str) and value in args, f"one of {one_of}")
-    if origin is list:
-        return _list(_reader(args[0]))
-    if origin is tuple:
-        read = _list(*map(_reader, args))
-        return lambda value: tuple(typing.cast(list, read(value)))
-    if origin is dict:
-        return _dict(_reader(args[1]))
-    assert isinstance(hint, type), hint
-    if dataclasses.is_dataclass(hint):
-        return _dataclass(hint)
-    if issubclass(hint, enum.Enum):
-        return _enumeration(hint)
-    if hint is float:
-        return _float
-    return _checked(lambda value: type(value) is hint, f"of type {hint.__name__}")
-
-
-def _checked(accepts: Callable[[object], bool], required: str) -> Read:
-    def read(value: object) -> object:
-        if not accepts(value):
-            raise Misfit(required, value)
-        return value
-
-    return read
-
-
-def _float(value: object) -> float:
-    try:
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
-    except OverflowError:
-        pass
-    raise Misfit("a number", value)
-
-
-def _in_range(read: Read, bounds: Range) -> Read:
-    def read_in_range(value: object) -> object:
-        number = read(value)
+        return None if value is None else _read(other, value, exact)
+    if origin is Annotated:
+        number, (low, high) = _read(args[0], value, exact), args[1]
         assert isinstance(number, int | float)
-        if not bounds.low <= number < bounds.high:
-            raise Misfit(f"at least {bounds.low:g} and less than {bounds.high:g}", value)
+        if not low <= number < high:
+            raise Misfit(f"at least {low:g} and less than {high:g}", value)
         return number
+    if origin is typing.Literal:
+        if not isinstance(value, str) or value not in args:
+            raise Misfit("one of " + ", ".join(map(repr, args)), value)
+        return value
+    if origin is dict:
+        return _read_items(itertools.repeat(args[1]), _object(value), exact)
+    assert origin in (list, tuple), hint
+    if not isinstance(value, list):
+        raise Misfit("a list", value)
+    if origin is tuple and len(value) != len(args):
+        raise Misfit(f"a list of {len(args)}", value)
+    hints = args if origin is tuple else itertools.repeat(args[0])
+    items = _read_items(hints, dict(enumerate(value)), exact)
+    return origin(items.values())
 
-    return read_in_range
+
+_parts = functools.cache(lambda hint: (typing.get_origin(hint), typing.get_args(hint)))
 
 
-def _enumeration(kind: type[enum.Enum]) -> Read:
-    members = {name.lower(): member for name, member in kind.__members__.items()}
-
-    def read(value: object) -> object:
+def _read_type(kind: type, value: object, exact: bool) -> object:
+    if dataclasses.is_dataclass(kind):
+        return _read_dataclass(kind, _object(value), exact)
+    if issubclass(kind, enum.Enum):
+        members = {name.lower(): member for name, member in kind.__members__.items()}
         if not isinstance(value, str) or value not in members:
             raise Misfit("one of " + ", ".join(map(repr, members)), value)
         return members[value]
-
-    return read
-
-
-def _inside(read: Read, key: object, value: object) -> object:
-    """Read a part of a value; an error says where the part is."""
-    try:
-        return read(value)
-    except Misfit as misfit:
-        misfit.path.append(str(key))
-        raise
-
-
-def _list(*each: Read) -> Read:
-    """A list of any length for one reader, else a list with one item for each reader."""
-
-    def read(value: object) -> object:
-        if not isinstance(value, list):
-            raise Misfit("a list", value)
-        readers = each * len(value) if len(each) == 1 else each
-        if len(readers) != len(value):
-            raise Misfit(f"a list of {len(each)}", value)
-        return [_inside(one, k, item) for k, (one, item) in enumerate(zip(readers, value))]  # noqa: B905
-
-    return read
+    if kind is float:
+        try:
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                return float(value)
+        except OverflowError:
+            pass
+        raise Misfit("a number", value)
+    if kind is not object and type(value) is not kind:
+        raise Misfit(f"of type {kind.__name__}", value)
+    return value
 
 
-def _dict(each: Read) -> Read:
-    def read(value: object) -> object:
-        if not isinstance(value, dict):
-            raise Misfit("an object", value)
-        return {key: _inside(each, key, item) for key, item in value.items()}
-
-    return read
+def _object(value: object) -> dict[str, object]:
+    if not isinstance(value, dict):
+        raise Misfit("an object", value)
+    return value
 
 
-def _dataclass(kind: "type[DataclassInstance]") -> Read:
+def _read_items(hints: Iterable[object], items: Mapping[K, object], exact: bool) -> dict[K, object]:
+    """Read the parts of a value; an error says where the part is."""
+    found = {}
+    for hint, (key, item) in zip(hints, items.items(), strict=False):
+        try:
+            found[key] = _read(hint, item, exact)
+        except Misfit as misfit:
+            misfit.path.append(str(key))
+            raise
+    return found
+
+
+@functools.cache
+def _schema(kind: "type[DataclassInstance]") -> tuple[dict[str, object], list[str], str | None]:
+    """The type hints of a dataclass, the keys that it requires, and the field of all other keys."""
     hints = typing.get_type_hints(kind, include_extras=True)
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    others = next((name for name, field in fields.items() if field.metadata == OTHERS), None)
-    readers = {name: _reader(hints[name]) for name in fields if name != others}
+    fields = dataclasses.fields(kind)
+    others = next((field.name for field in fields if field.metadata == OTHERS), None)
     absent = (dataclasses.MISSING, dataclasses.MISSING)
-    required = [n for n in readers if (fields[n].default, fields[n].default_factory) == absent]
+    required = [f.name for f in fields if (f.default, f.default_factory) == absent]
+    return {f.name: hints[f.name] for f in fields if f.name != others}, required, others
 
-    def read(value: object) -> object:
-        if not isinstance(value, dict):
-            raise Misfit("an object", value)
-        missing = next((name for name in required if name not in value), None)
-        if missing is not None:
-            raise Misfit(f"an object with the key {missing!r}", value)
-        made = {n: _inside(one, n, value[n]) for n, one in readers.items() if n in value}
-        if others is not None:
-            made[others] = {key: each for key, each in value.items() if key not in readers}
-        return kind(**made)
 
-    return read
+def _read_dataclass(
+    kind: "type[DataclassInstance]", value: dict[str, object], exact: bool
+) -> object:
+    hints, required, others = _schema(kind)
+    for name in required:
+        if name not in value:
+            raise Misfit(f"an object with the key {name!r}", value)
+    known = {name: value[name] for name in hints if name in value}
+    made = _read_items((hints[name] for name in known), known, exact)
+    left = {key: each for key, each in value.items() if key not in hints}
+    if others is not None:
+        made[others] = left
+    elif exact and left:
+        raise Misfit(f"an object without the key {next(iter(left))!r}", value)
+    return kind(**made)

@@ -2,7 +2,6 @@
 
 import socket
 import time
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import cv2
@@ -22,14 +21,6 @@ THUMBNAIL = 240
 MAX_THUMBNAILS = 500
 """The most cameras that show their photo: to read a thousand photos takes minutes."""
 BLUE, ORANGE = (59, 130, 196), (224, 123, 57)
-
-
-def _viser() -> ModuleType:
-    try:
-        import viser
-    except ImportError as error:
-        raise UserError("jaxsfm view needs viser: pip install 'jaxsfm[view]'") from error
-    return viser
 
 
 def _thumbnail(run: FinishedRun, name: str) -> np.ndarray | None:
@@ -159,7 +150,10 @@ def serve(run: FinishedRun, *, host: str, port: int) -> None:
     Raises:
       UserError: viser is not installed, the run has no model, or the address cannot be used.
     """
-    viser = _viser()
+    try:
+        import viser
+    except ImportError as error:
+        raise UserError("jaxsfm view needs viser: pip install 'jaxsfm[view]'") from error
     if run.model is None:
         raise UserError(f"{run.folder}: no model to show (sparse/0)")
     _check_address(host)

@@ -15,10 +15,8 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairCounts
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
-from jaxsfm.report.advice import Circumstances
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
-from jaxsfm.report.lost_photos import explain
-from jaxsfm.report.pair_outcomes import PairOutcomes
+from jaxsfm.report.lost_photos import explained
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     RecordedOptions,
@@ -30,6 +28,7 @@ from jaxsfm.report.run_report import FORMAT, Extension, RunReport
 from jaxsfm.report.run_results import ModelRow, PairRow, TriedPairs
 from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.runs.working_model import CameraPrior
 from jaxsfm.sfm.reconstruction import Reconstructed
 from jaxsfm.sfm.register.grow import ExtendedModel
 from jaxsfm.sfm.view_graph import Verdict
@@ -64,6 +63,8 @@ class NewPhotos(NamedTuple):
     """The photos that were added to the folder of a run since."""
 
     images: dict[str, ImageFile]
+    cameras: dict[str, CameraPrior]
+    """The cameras that `images` start with."""
     skipped: dict[str, str]
     """Why a new file cannot be used, by name."""
 
@@ -72,7 +73,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
     """The report of a new run, without the evaluation."""
     made, results = stages.reconstructed, stages.results
     about, counts = stages.external.about, stages.external.counts(results)
-    untrusted = [pair for pair, v in made.verdicts.items() if not v.trusted]
+    untrusted = sum(not verdict.trusted for verdict in made.verdicts.values())
     report = RunReport(
         format=FORMAT,
         version=stages.identity.version,
@@ -91,28 +92,19 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
             tried=len(results),
             verified=sum(r.num_inliers > 0 for r in results.values()),
             handed_on=len(stages.handed_on),
-            trusted=len(made.verified) - len(untrusted) if made.verdicts else None,
+            trusted=len(made.verified) - untrusted if made.verdicts else None,
             overflowed=sum(r.num_dropped > 0 for r in results.values()),
-            each=[
-                _pair_row(
-                    pair,
-                    each,
-                    pair in stages.handed_on,
-                    made.verified.get(pair, 0),
-                    made.verdicts.get(pair),
-                )
-                for pair, each in sorted(counts.items())
-            ],
+            each=_pair_rows(counts, stages.handed_on, made.verified, made.verdicts),
         ),
         given=None if about is None else from_json(UsedExternalMatches, about),
-        models=[model_row(model) for model in made.models],
+        models=[_model_row(model) for model in made.models],
         mapping=made.attempts,
         refinement=made.refinement,
         lost=[],
         seconds=stages.seconds,
     )
     sizes = {image.name: image.size for image in stages.usable}
-    return _explained(report, config, sizes, made.angles)
+    return explained(report, config, sizes, made.angles)
 
 
 def extended_report(
@@ -133,12 +125,9 @@ def extended_report(
       verified: the number of inliers that COLMAP found in these pairs.
       sizes: (width, height) of every usable photo that is still there, old and new.
     """
-    old = run.report
+    old, pairs, before = run.report, run.report.pairs, run.report.images.skipped
     counts = {pair: result.counts for pair, result in matches.items()}
     good = {pair for pair, each in counts.items() if each.num_inliers}
-    rows = [_pair_row(p, c, p in good, verified.get(p, 0), None) for p, c in counts.items()]
-    before = old.images.skipped
-    skipped = {n: why for n, why in before.items() if n not in new.images} | new.skipped
     extension = Extension(
         finished=_now(),
         added=sorted(new.images),
@@ -147,18 +136,15 @@ def extended_report(
         rounds=grown.rounds,
         pairs=len(counts),
     )
-    pairs = old.pairs
     report = dataclasses.replace(
         old,
         format=FORMAT,
         finished=extension.finished,
         images=FoundPhotos(
             folder=run.photos.folder and str(run.photos.folder.absolute()),
-            found=old.images.found
-            + len(before.keys() | new.images.keys() | new.skipped.keys())
-            - len(before),
+            found=old.images.found + len((new.images.keys() | new.skipped.keys()) - before.keys()),
             usable=old.images.usable + len(new.images),
-            skipped=skipped,
+            skipped={n: w for n, w in before.items() if n not in new.images} | new.skipped,
         ),
         pairs=TriedPairs(
             tried=pairs.tried + len(counts),
@@ -167,18 +153,22 @@ def extended_report(
             overflowed=pairs.overflowed + sum(c.num_dropped > 0 for c in counts.values()),
             # The view graph does not judge the new pairs.
             trusted=None if pairs.trusted is None else pairs.trusted + len(verified),
-            each=sorted([*pairs.each, *rows], key=lambda row: row.pair),
+            each=sorted(
+                [*pairs.each, *_pair_rows(counts, good, verified, {})], key=lambda row: row.pair
+            ),
         ),
-        models=[model_row(model) for model in models],
+        models=[_model_row(model) for model in models],
         extended=[*(old.extended or ()), extension],
+        evaluation=None,
+        evaluation_failed=None,
     )
-    report = _explained(report, run.config, sizes, {})
-    lost = []
-    for photo in report.lost:
-        found = grown.located.get(photo.image)
-        why = found.why if found is not None else None
-        lost.append(dataclasses.replace(photo, detail=why or photo.detail))
-    report = dataclasses.replace(report, lost=lost, evaluation=None, evaluation_failed=None)
+    report = explained(report, run.config, sizes, {})
+    reasons = {name: found.why for name, found in grown.located.items()}
+    lost = [
+        dataclasses.replace(photo, detail=reasons.get(photo.image) or photo.detail)
+        for photo in report.lost
+    ]
+    report = dataclasses.replace(report, lost=lost)
     if run.reference is not None:
         return evaluated(report, model_poses(models[0]), run.reference.poses)
     if old.options.reference is not None:
@@ -195,7 +185,7 @@ def evaluated(report: RunReport, poses: Poses, reference: Poses) -> RunReport:
         return dataclasses.replace(report, evaluation_failed=str(error))
 
 
-def model_row(model: "pycolmap.Reconstruction") -> ModelRow:
+def _model_row(model: "pycolmap.Reconstruction") -> ModelRow:
     """The numbers of one COLMAP model."""
     return ModelRow(
         registered=model.num_reg_images(),
@@ -219,42 +209,23 @@ def _recorded_options(config: Config, options: RunOptions) -> RecordedOptions:
     return from_json(RecordedOptions, json.loads(json.dumps(plain, default=str)))
 
 
-def _pair_row(
-    pair: Pair, counts: PairCounts, handed_on: bool, colmap_inliers: int, verdict: Verdict | None
-) -> PairRow:
-    return PairRow(
-        pair=pair,
-        status=counts.status,
-        tentative=counts.num_tentative,
-        inliers=counts.num_inliers,
-        planes=counts.num_planes,
-        handed_on=handed_on,
-        colmap_inliers=colmap_inliers,
-        view_graph=verdict,
-    )
-
-
-def _explained(
-    report: RunReport,
-    config: Config,
-    sizes: Mapping[str, tuple[int, int]],
-    angles: Mapping[Pair, float],
-) -> RunReport:
-    """The report with what follows from its pairs and models: why photos were lost, and what may
-    help."""
-    explanation = explain(
-        [model.images for model in report.models],
-        PairOutcomes(
-            rows={row.pair: row for row in report.pairs.each},
-            angles=angles,
-            min_inliers=config.min_inliers,
-        ),
-        Circumstances(
-            config=config,
-            pairs=report.options.pairs,
-            known_camera=report.options.intrinsics is not None,
-            sizes=sizes,
-        ),
-        report.refinement,
-    )
-    return dataclasses.replace(report, **explanation._asdict())
+def _pair_rows(
+    counts: Mapping[Pair, PairCounts],
+    handed_on: Collection[Pair],
+    verified: Mapping[Pair, int],
+    verdicts: Mapping[Pair, Verdict],
+) -> list[PairRow]:
+    """The rows of pairs, sorted. `verified` are the inliers that COLMAP found, by pair."""
+    return [
+        PairRow(
+            pair=pair,
+            status=each.status,
+            tentative=each.num_tentative,
+            inliers=each.num_inliers,
+            planes=each.num_planes,
+            handed_on=pair in handed_on,
+            colmap_inliers=verified.get(pair, 0),
+            view_graph=verdicts.get(pair),
+        )
+        for pair, each in sorted(counts.items())
+    ]

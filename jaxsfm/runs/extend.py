@@ -12,7 +12,6 @@ from pathlib import Path
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
@@ -24,6 +23,7 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_report import RunReport, write_report
+from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import NewPhotos
 from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.runs.run_options import LocalizeOptions
@@ -34,18 +34,7 @@ from jaxsfm.runs.working_model import (
     read_working_model,
     weights_of_run,
 )
-from jaxsfm.runs.write_extension import PlannedExtension, write_extension
-
-
-def extend(
-    run: Path, *, options: LocalizeOptions, shortlist: Shortlist | None = None
-) -> dict[str, Json] | None:
-    """Extend a finished run; returns the content of its new report.json, or None.
-
-    See `extend_run`, which returns the report as an object.
-    """
-    report = extend_run(run, options=options, shortlist=shortlist)
-    return None if report is None else report.to_json()
+from jaxsfm.runs.write_extension import write_extension
 
 
 def extend_run(
@@ -88,18 +77,18 @@ def _extend(
             "run reconstruct again"
         )
     usable, broken = open_images(finished.photos.folder, progress=options.progress)
-    added = _added_photos(finished, usable, broken)
-    if not added.images and not added.skipped:
+    images, skipped = _added_photos(finished, usable, broken)
+    if not images and not skipped:
         return None
     seed = finished.report.options.seed
     model = read_working_model(run / "sparse" / "0", finished.config, seed=seed)
     names = [view.name for view in model.views]
-    files = _unchanged_photos(finished, usable, names) | added.images
+    files = _unchanged_photos(finished, usable, names) | images
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
-    cameras = {n: camera_prior(i, model.views, intrinsics) for n, i in added.images.items()}
-    hashes = {name: image.sha256 for name, image in added.images.items()}
+    cameras = {n: camera_prior(image, model.views, intrinsics) for n, image in images.items()}
+    hashes = {name: image.sha256 for name, image in images.items()}
     identity = dataclasses.replace(identity, images=identity.images | hashes)
-    folder = open_locked_folder(run, identity.to_json())
+    folder = open_locked_folder(run, to_json(identity))
     job = Job(
         store=folder,
         weights=weights,
@@ -110,25 +99,18 @@ def _extend(
         progress=options.progress,
     )
     shortlist = shortlist or similar_photos(
-        finished, weights, options.shortlist, added.images, options.execution
+        finished, weights, options.shortlist, images, options.execution
     )
-    matches, lost = _match_new(job, files, [*names, *added.images], added, shortlist)
+    matches, lost = _match_new(job, files, [*names, *images], images, shortlist)
     if lost_by_run := lost.keys() & set(names):
         raise UserError(lost[min(lost_by_run)])
-    extension = PlannedExtension(
-        run=finished,
-        model=model,
-        new=NewPhotos(
-            {name: image for name, image in added.images.items() if name not in lost},
-            added.skipped | lost,
-        ),
-        cameras=cameras,
-        photos=Photos(files.values(), model.config),
-        matches=matches,
-        progress=options.progress,
-    )
+    images = {name: image for name, image in images.items() if name not in lost}
+    new = NewPhotos(images, cameras, skipped | lost)
+    photos = Photos(files.values(), model.config)
     with folder.publish() as target:
-        report = write_extension(extension, target)
+        report = write_extension(
+            target, finished, model, new, photos, matches, progress=options.progress
+        )
         took = report.seconds.get("extension", 0.0) + time.monotonic() - start
         seconds = report.seconds | {"extension": took}
         report = dataclasses.replace(report, identity=identity, seconds=seconds)
@@ -139,28 +121,25 @@ def _extend(
     return report
 
 
-def _added_photos(run: FinishedRun, usable: list[ImageFile], broken: dict[str, str]) -> NewPhotos:
-    """The photos in the folder that the run has not used.
+def _added_photos(
+    run: FinishedRun, usable: list[ImageFile], broken: dict[str, str]
+) -> tuple[dict[str, ImageFile], dict[str, str]]:
+    """The photos in the folder that the run has not used, and why others cannot be used, by name.
 
     A photo that the run skipped is new if its file has changed, or if it was not damaged.
     """
     skipped = run.report.images.skipped
     used = run.report.identity.images.keys() - skipped.keys()
     fresh = [i for i in usable if i.name not in used and not run.matches.why_unusable(i)]
-    return NewPhotos(
-        {image.name: image for image in fresh},
-        {n: why for n, why in broken.items() if n not in used and n not in skipped},
-    )
+    unusable = {n: why for n, why in broken.items() if n not in used and n not in skipped}
+    return {image.name: image for image in fresh}, unusable
 
 
 def _unchanged_photos(
     run: FinishedRun, usable: list[ImageFile], needed: list[str]
 ) -> dict[str, ImageFile]:
-    """The photos of the run that are still what they were, by name.
-
-    Raises:
-      UserError: one of the needed photos is gone or has changed.
-    """
+    """The photos of the run that are still what they were, by name; UserError if one of the needed
+    photos is not."""
     report = run.report
     used = {n: h for n, h in report.identity.images.items() if n not in report.images.skipped}
     there = {image.name: image for image in usable if used.get(image.name) == image.sha256}
@@ -172,20 +151,17 @@ def _match_new(
     job: Job,
     files: Mapping[str, ImageFile],
     names: list[str],
-    added: NewPhotos,
+    added: Mapping[str, ImageFile],
     shortlist: Shortlist,
 ) -> tuple[SavedMatches, dict[str, str]]:
-    """Match new photos with their shortlists.
+    """Match new photos with their shortlists; returns also why photos cannot be decoded, by name.
 
     Args:
       files: the run's photos and the new ones.
       names: the photos that may be on a shortlist: those of the model, and the new ones.
-
-    Returns:
-      The matches, and for every photo that cannot be decoded the reason.
     """
     shortlists, lost = {}, {}
-    for name, image in added.images.items():
+    for name, image in added.items():
         try:
             shortlists[name] = shortlist(image, [n for n in sorted(names) if n != name])
         except ImageError as error:
@@ -194,7 +170,7 @@ def _match_new(
     pairs = sorted({make_pair(a, b) for a, others in shortlists.items() for b in others})
     missing = [pair for pair in pairs if job.store.load_matches(pair) is None]
     lost |= job.extract_missing(images_of(missing, files))
-    if not lost.keys() - added.images.keys():
+    if not lost.keys() - added.keys():
         for _ in job.match_missing(files, pairs_without(missing, lost)):
             pass
     return SavedMatches(job.store, pairs_without(pairs, lost)), lost

@@ -49,11 +49,8 @@ class Job:
         return None
 
     def extract_missing(self, images: Iterable[ImageFile]) -> dict[str, str]:
-        """Extract the images whose features no store has.
-
-        Returns:
-          For every image that cannot be decoded, by its name, the reason.
-        """
+        """Extract the images whose features no store has; returns why others cannot be decoded, by
+        name."""
         stores = (self.store, *self.earlier)
         todo = [i for i in images if not any(store.has_features(i) for store in stores)]
         lost: dict[str, str] = {}

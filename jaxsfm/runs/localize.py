@@ -15,20 +15,19 @@ from tqdm import tqdm
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos, Reader
 from jaxsfm.io.store import Store
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.report.finished_run import FinishedRun, read_run
+from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.localize_report import (
     LocalizationReport,
     LocalizedPhoto,
     UnusablePhoto,
     error_against,
-    localized_photo,
 )
 from jaxsfm.runs.queries import Query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
@@ -43,20 +42,6 @@ from jaxsfm.runs.working_model import (
     weights_of_run,
 )
 from jaxsfm.sfm.register.locate_view import Localization, locate
-
-
-def localize(
-    photos: Sequence[Path],
-    run: Path,
-    *,
-    options: LocalizeOptions,
-    shortlist: Shortlist | None = None,
-) -> dict[str, Json]:
-    """Localize photos in a finished run; returns plain JSON, with a row for each photo.
-
-    See `localize_photos`, which returns the result as an object.
-    """
-    return localize_photos(photos, run, options=options, shortlist=shortlist).to_json()
 
 
 def localize_photos(
@@ -105,7 +90,7 @@ def localize_photos(
         UnusablePhoto(photo=path, why=why) for path, why in unusable.items()
     ]
     with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
-        temporary = Store(Path(scratch), finished.report.identity.to_json())
+        temporary = Store(Path(scratch), to_json(finished.report.identity))
         job = Job(
             store=finished.matches if options.keep_features else temporary,
             earlier=(finished.matches,),
@@ -165,18 +150,17 @@ def _localize_query(
             raise ImageError(matches)
         found = locate_photo(query.image, query.camera, model, query.shortlist, matches, read)
     except ImageError as error:
-        listed = sorted(query.shortlist)
-        return UnusablePhoto(photo=query.path, shortlist=listed, why=str(error))
+        return UnusablePhoto(photo=query.path, shortlist=query.shortlist, why=str(error))
     error = None
     if found.view is not None and run.reference is not None:
         name, reference = Path(query.path).name, run.reference.poses
         error = error_against(name, found.view, model.views, reference)
-    return localized_photo(
-        query.path,
-        found,
-        matches,
-        source=query.camera.source,
+    return LocalizedPhoto(
+        photo=query.path,
         in_run=run.photos.name_of(query.image.sha256),
         shortlist=query.shortlist,
+        matches=sum(result.num_inliers for result in matches.values()),
+        source=query.camera.source,
+        found=found,
         error=error,
     )

@@ -30,7 +30,7 @@ from jaxsfm.options import Retrieval
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
-from jaxsfm.report.typed_json import from_json
+from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.runs.run_options import RunOptions, check_options
@@ -89,7 +89,7 @@ def reconstruct_folder(
         images={image.name: image.sha256 for image in usable},
     )
     seconds: dict[str, float] = {}
-    with open_folder(out, identity.to_json()) as folder:
+    with open_folder(out, to_json(identity)) as folder:
         job = Job(
             store=folder,
             weights=weights,
@@ -227,11 +227,7 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 def _retrieve(
     job: Job, images: list[ImageFile], kind: Retrieval, k: int
 ) -> tuple[list[Pair], dict[str, str]]:
-    """Pairs of each image with its k most similar ones; for images without descriptor the reason.
-
-    Args:
-      kind: how images are described.
-    """
+    """Pairs of each image with its k most similar ones, and why images have no descriptor."""
     total, quiet = len(images), not job.progress
     with tqdm(total=total, desc="retrieval", unit="image", disable=quiet) as bar:
         found = describe_photos(

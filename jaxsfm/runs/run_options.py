@@ -17,11 +17,11 @@ from jaxsfm.options import (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunOptions(ReconstructionChoice):
-    """What a reconstruction does, beyond its `Config`."""
+class Computation:
+    """With what features and matches are computed."""
 
     network: WeightsChoice = USUAL_WEIGHTS
-    """The files of the network's parameters."""
+    """The files of the network's parameters; `localize` and `extend` need those of the run."""
     execution: Execution = dataclasses.field(default_factory=Execution)
     """Devices, batches and memory."""
     engine: EngineChoice = LOCAL
@@ -31,27 +31,20 @@ class RunOptions(ReconstructionChoice):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LocalizeOptions(NewPhotosChoice):
+class RunOptions(Computation, ReconstructionChoice):
+    """What a reconstruction does, beyond its `Config`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LocalizeOptions(Computation, NewPhotosChoice):
     """What `localize` and `extend` do, beyond what the finished run fixes."""
 
     reference: Path | None = None
     """Reference poses of the new photos and of the run's photos."""
-    network: WeightsChoice = USUAL_WEIGHTS
-    """The files of the network's parameters; they must be those of the run."""
-    execution: Execution = dataclasses.field(default_factory=Execution)
-    """Devices, batches and memory."""
-    engine: EngineChoice = LOCAL
-    """This process, or workers on Ray."""
-    progress: bool = False
-    """Whether progress bars are shown on standard error."""
 
 
 def check_options(options: RunOptions) -> None:
-    """Check, before the work, the options that COLMAP or the engine would refuse.
-
-    Raises:
-      UserError: an option that cannot be used.
-    """
+    """Raise UserError, before the work, for options that COLMAP or the engine would refuse."""
     if options.best_pairs is not None and options.best_pairs < 1:
         raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
     check_seed(options.seed)
@@ -60,20 +53,12 @@ def check_options(options: RunOptions) -> None:
 
 
 def check_seed(seed: int) -> None:
-    """Check that COLMAP takes a seed.
-
-    Raises:
-      UserError: it does not.
-    """
+    """Raise UserError for a seed that COLMAP does not take."""
     if not 0 <= seed < 2**31:
         raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
 
 
 def check_threads(threads: int) -> None:
-    """Check that COLMAP takes a number of threads.
-
-    Raises:
-      UserError: it does not.
-    """
+    """Raise UserError for a number of threads that COLMAP does not take."""
     if threads == 0 or threads < -1:
         raise UserError(f"--threads must be positive, or -1 for all; got {threads}")

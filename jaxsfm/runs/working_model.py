@@ -16,7 +16,7 @@ from jaxsfm.io.images import ImageFile, shown_name, working_size
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.options import WeightsChoice
-from jaxsfm.report.finished_run import FinishedRun
+from jaxsfm.report.finished_run import FinishedRun, sizes_within
 from jaxsfm.report.run_inputs import UsedWeights
 from jaxsfm.report.typed_json import from_json
 
@@ -51,17 +51,9 @@ class CameraPrior(NamedTuple):
 
 
 def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> WorkingModel:
-    """Read a COLMAP model and convert it to the working pixels of a config.
-
-    Raises:
-      UserError: `folder` has no readable model.
-    """
+    """Read a COLMAP model into working pixels; UserError if `folder` has no readable model."""
     model = read_model(folder)
-    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    sizes = {}
-    for name, camera in cameras.items():
-        width, height = working_size((camera.width, camera.height), config.max_size, config.enlarge)
-        sizes[name] = (width, height), (camera.width / width, camera.height / height)
+    sizes = sizes_within(model, config.max_size, config.enlarge)
     return WorkingModel(Model.from_colmap(model, sizes), config, seed)
 
 
@@ -72,9 +64,6 @@ def camera_prior(
 
     It is the given one. Without one, it is the camera of the model, if the model has exactly one
     camera of the photo's size that several views share. Else it comes from EXIF, or is a guess.
-
-    Args:
-      intrinsics: given by the user; None: none.
 
     Raises:
       UserError: the given intrinsics do not fit the photo's size.
@@ -100,11 +89,7 @@ def view_without_pose(image: ImageFile, prior: CameraPrior, config: Config) -> V
 
 
 def weights_of_run(run: FinishedRun, choice: WeightsChoice) -> Weights:
-    """Load the weights that a run was made with.
-
-    Raises:
-      UserError: `choice` names other weights.
-    """
+    """Load the weights that a run was made with; UserError if `choice` names others."""
     config = run.config
     weights = chosen_weights(choice, config.backbone)
     made_with, now = run.report.weights, from_json(UsedWeights, weights.described(config))
@@ -121,11 +106,7 @@ def weights_of_run(run: FinishedRun, choice: WeightsChoice) -> Weights:
 
 
 def photos_of_run(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile]:
-    """The files of photos of a run, by name.
-
-    Raises:
-      UserError: a photo is gone or has changed.
-    """
+    """The files of photos of a run, by name; UserError if one is gone or has changed."""
     files = {}
     for name in names:
         image = run.photos.file(name)

@@ -195,11 +195,11 @@ def test_points_beyond_the_limit_are_drawn_in_part_and_the_page_says_so(plain, m
 
     scene = shown_scene(read_run(plain[0]))
     n = len(scene.points)
-    whole = model_figure.model_figure(scene, "units")
+    whole = model_figure.model_figure(scene)
     monkeypatch.setattr(model_figure, "MAX_POINTS", n // 2)
-    part = model_figure.model_figure(scene, "units")
-    assert f"{n // 2} of {n} points are drawn" in part.caption
-    assert "points are drawn" not in whole.caption
+    part = model_figure.model_figure(scene)
+    assert f"{n // 2} of {n} points are drawn" in part.note
+    assert "points are drawn" not in whole.note
     assert len(json.loads(part.spec)["data"][0]["marker"]["color"]) == n // 2
 
 
@@ -369,7 +369,7 @@ def test_far_points_are_left_out_and_counted(plain):
     few = len(points) // 200
     points[:few] += 1e4
     tracks = run.model.tracks._replace(points=points)
-    shown = shown_scene(dataclasses.replace(run, model=run.model._replace(tracks=tracks)))
+    shown = shown_scene(dataclasses.replace(run, model=run.model.with_tracks(tracks)))
     near = shown_scene(run)
     assert shown.far == near.far + few
     assert len(shown.points) + shown.far == len(points) and np.abs(shown.points).max() < 1e3

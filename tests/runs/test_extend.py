@@ -113,7 +113,7 @@ def test_the_database_has_the_new_images_and_their_matches(extended, plain):
     kept = read_run(extended.run)
     for row in extended.report["pairs"]["each"]:
         pair = tuple(row["pair"])
-        result = kept.load_matches(pair)
+        result = kept.matches.load_matches(pair)
         assert result is not None and result.num_inliers == row["inliers"]
         xy = read_matches(extended.run / "database.db", pair, verified=False)
         ours = {

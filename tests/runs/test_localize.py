@@ -23,13 +23,13 @@ from jaxsfm.matching.engines import LocalEngine
 from jaxsfm.matching.execution import Execution
 from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
-from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs import localize as localize_module
-from jaxsfm.runs.localize import localize
+from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import similar_photos
 from jaxsfm.runs.working_model import camera_prior, read_working_model
+from jaxsfm.sfm.register.locate_view import Localization
 
 SIZE, WIDE = (320, 240), (368, 248)
 """Of one padded size: nothing is compiled twice."""
@@ -62,6 +62,11 @@ class RecordingEngine:
     def match_pairs(self, load, capacities, pairs, **options):
         self.calls.append(("match", len(pairs)))
         return LocalEngine.match_pairs(load, capacities, pairs, **options)
+
+
+def localize(photos: list[Path], run: Path, **changes) -> dict:
+    """What the command writes."""
+    return localize_photos(photos, run, **changes).to_json()
 
 
 @pytest.fixture(scope="module")
@@ -316,9 +321,15 @@ def test_the_command_writes_poses_and_tells_them(plain, photos, tmp_path, capsys
     assert row["photo"] == str(new) and row["cam_from_world"]
 
 
-def test_nothing_localized_ends_with_1(localized, plain, photos, capsys, monkeypatch):
-    rows = [from_json(LocalizedPhoto, localized["elsewhere.png"])]
-    result = LocalizationReport(version="1", model=str(plain[0]), photos=rows)
+def test_nothing_localized_ends_with_1(plain, photos, capsys, monkeypatch):
+    numbers = dict.fromkeys(("on_surface", "inliers", "candidates", "agreed"), 0)
+    errors = dict.fromkeys(("octave_px", "error_px", "doubt_px"))
+    errors |= dict.fromkeys(("centre_error", "rotation_error_deg"))
+    found = Localization(view=None, trusted=False, why="no plane", **numbers, **errors)
+    row = LocalizedPhoto(
+        photo="a.png", in_run=None, shortlist=[], matches=0, source="run", found=found
+    )
+    result = LocalizationReport(version="1", model=str(plain[0]), photos=[row])
     monkeypatch.setattr(localize_module, "localize_photos", lambda *args, **kwargs: result)
     lost = photos / "photos" / "elsewhere.png"
     assert main(["localize", str(lost), "--model", str(plain[0])]) == 1

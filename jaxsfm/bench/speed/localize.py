@@ -35,7 +35,7 @@ from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.localize import locate_photo
-from jaxsfm.runs.localize_report import error_against, localized_photo
+from jaxsfm.runs.localize_report import LocalizedPhoto, error_against
 from jaxsfm.runs.working_model import camera_prior, read_working_model
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.view_graph import trusted_pairs
@@ -126,19 +126,16 @@ def localized(run: FinishedRun, name: str, files: dict[str, ImageFile], folder: 
     seconds, error = time.monotonic() - start, None
     if found.view is not None and run.reference is not None:
         error = error_against(name, found.view, model.views, run.reference.poses)
-    row = to_json(
-        localized_photo(
-            name,
-            found,
-            matches,
-            source=chosen.source,
-            in_run=name,
-            shortlist=names,
-            error=error,
-        )
+    row = LocalizedPhoto(
+        photo=name,
+        in_run=name,
+        shortlist=names,
+        matches=sum(result.num_inliers for result in matches.values()),
+        source=chosen.source,
+        found=found,
+        error=error,
     )
-    assert isinstance(row, dict)
-    return row | {"seconds": seconds, "registered": len(names)}
+    return row.to_json() | {"seconds": seconds, "registered": len(names)}
 
 
 def line(row: Row) -> str:
@@ -187,7 +184,7 @@ def main() -> int:
         assert found is not None, f"{view.name} is gone"
         files[view.name] = found
     key = {
-        "run": digest(run.report.identity.to_json(), to_json(run.report.options)),
+        "run": digest(to_json(run.report.identity), to_json(run.report.options)),
         "reference": str(args.reference.absolute()),
         "version": versions(),
         "unrefined": args.unrefined,

@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.images import WorkingImage
-from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.report.finished_run import FinishedModel, FinishedRun
+from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.page.embedded import data_uri
 
 TRACKS, PHOTOS = 5, 6
@@ -49,9 +51,9 @@ class ShownTrack(NamedTuple):
     patches: list[Patch]
 
 
-def _candidates(model: FinishedModel) -> list[int]:
+def _candidates(tracks: Tracks) -> list[int]:
     """Points that were seen in many photos, from all parts of the model."""
-    lengths = np.bincount(model.tracks.point, minlength=len(model.tracks.points))
+    lengths = tracks.num_observations()
     least = min(LEAST, int(lengths.max(initial=0)))
     long = np.flatnonzero((lengths >= least) & (lengths > 0))
     # Points that follow each other in the model are near each other in space.
@@ -64,7 +66,8 @@ def _cells(
     """The cells and keypoints of the matches that the observations of a track were made of.
 
     Args:
-      xy: float (n, 2), the observations in the photos `names`, original pixels.
+      names: the photos, sorted.
+      xy: float (n, 2), the observations in them, original pixels.
       radius: the largest distance between a keypoint and its observation, original pixels.
 
     Returns:
@@ -72,21 +75,18 @@ def _cells(
     """
     found = []
     for i, j in itertools.combinations(range(len(names)), 2):
-        pair = make_pair(names[i], names[j])
-        result = load(pair)
+        result = load((names[i], names[j]))
         if result is None or not result.num_inliers:
             continue
-        first, second = (i, j) if pair[0] == names[i] else (j, i)
         off = np.maximum(
-            np.linalg.norm(result.keypoints0 - xy[first], axis=1),
-            np.linalg.norm(result.keypoints1 - xy[second], axis=1),
+            np.linalg.norm(result.keypoints0 - xy[i], axis=1),
+            np.linalg.norm(result.keypoints1 - xy[j], axis=1),
         )
         k = int(np.argmin(off))
         if off[k] < radius:
-            ends = zip((first, second), (result.keypoints0[k], result.keypoints1[k]), strict=True)
-            found += [
-                (float(off[k]), v, int(result.cells[k, s]), p) for s, (v, p) in enumerate(ends)
-            ]
+            first, second = result.cells[k].tolist()
+            found.append((float(off[k]), i, first, result.keypoints0[k]))
+            found.append((float(off[k]), j, second, result.keypoints1[k]))
     cells: dict[int, tuple[int, np.ndarray]] = {}
     for _, view, cell, place in sorted(found, key=lambda f: f[:2]):
         cells.setdefault(view, (cell, place))
@@ -129,36 +129,29 @@ def _patch(
 
 
 def _track(
-    run: FinishedRun, model: FinishedModel, load: Callable[[Pair], PairResult | None], point: int
+    run: FinishedRun, model: Model, load: Callable[[Pair], PairResult | None], point: int
 ) -> ShownTrack | None:
-    rows = np.flatnonzero(model.tracks.point == point)
-    names = [model.views[model.tracks.view[row]].name for row in rows]
+    tracks = model.tracks
+    seen = [(model.views[tracks.view[k]].name, k) for k in np.flatnonzero(tracks.point == point)]
+    names, rows = map(list, zip(*sorted(seen), strict=True))
     shown = [
         (k, image) for k, name in enumerate(names[:PHOTOS]) if (image := run.photos.read(name))
     ]
     if len(shown) < 2:
         return None
-    names, some = names[:MATCHED], rows[:MATCHED]
-    scale = max(max(image.scale) for _, image in shown)
-    cells = _cells(load, names, model.tracks.xy[some], NEAR_PX * scale)
-    patches = [
-        _patch(names[k], image, model.tracks.xy[rows[k]], cells.get(k)) for k, image in shown
-    ]
+    radius = NEAR_PX * max(max(image.scale) for _, image in shown)
+    cells = _cells(load, names[:MATCHED], tracks.xy[rows[:MATCHED]], radius)
+    patches = [_patch(names[k], image, tracks.xy[rows[k]], cells.get(k)) for k, image in shown]
     if sum(patch.cell is not None for patch in patches) < 2:
         return None
-    return ShownTrack(len(rows), float(np.mean(model.errors[rows])), patches)
+    return ShownTrack(len(rows), float(np.mean(run.errors[rows])), patches)
 
 
 def close_ups(run: FinishedRun) -> list[ShownTrack]:
     """A few tracks; none if the model, the photos or the matches are gone."""
-    if run.model is None:
+    model = run.model
+    if model is None:
         return []
-    load = functools.lru_cache(maxsize=None)(run.load_matches)
-    shown: list[ShownTrack] = []
-    for point in _candidates(run.model):
-        track = _track(run, run.model, load, point)
-        if track is not None:
-            shown.append(track)
-        if len(shown) == TRACKS:
-            break
-    return shown
+    load = functools.cache(run.matches.load_matches)
+    found = (_track(run, model, load, point) for point in _candidates(model.tracks))
+    return list(itertools.islice((track for track in found if track), TRACKS))

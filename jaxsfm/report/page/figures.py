@@ -1,7 +1,7 @@
 """Figures of the page, and how names and numbers are written in them."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,15 +18,13 @@ apart."""
 class Figure(NamedTuple):
     """A figure that plotly draws in the browser."""
 
-    id: str
-    title: str
-    caption: str
-    """What the figure shows and how to read it."""
-    alt: str
     spec: str
     """Data and layout as JSON, with numbers in base64. plotly escapes < and > in it, so that no
     name can end the <script> that holds it."""
-    tall: bool = False
+    alt: str
+    """The figure in a few words, for readers who cannot see it."""
+    note: str
+    """What the figure leaves out, for the end of its caption."""
 
 
 def text(name: str) -> str:
@@ -52,15 +50,16 @@ def short(names: list[str]) -> list[str]:
     return names
 
 
+def duration(seconds: float) -> str:
+    """A time in its two largest units."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
 def figure(
-    id: str,
-    title: str,
-    caption: str,
-    *,
-    alt: str,
-    data: Sequence[BaseTraceType],
-    layout: dict[str, object],
-    tall: bool = False,
+    data: Sequence[BaseTraceType], layout: Mapping[str, object], *, alt: str, note: str = ""
 ) -> Figure:
     """A figure. The page gives it the colours of ground, text and grid."""
     base = {
@@ -72,4 +71,4 @@ def figure(
     made = go.Figure(data=list(data), layout={**base, **layout})
     spec = made.to_json()
     assert spec is not None
-    return Figure(id, title, caption, alt, spec, tall)
+    return Figure(spec, alt, note)

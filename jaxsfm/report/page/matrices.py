@@ -23,12 +23,8 @@ def _reduced(matrix: np.ndarray, block: int) -> np.ndarray:
 
 
 def pair_matrices(names: Sequence[str], rows: Sequence[PairRow]) -> tuple[np.ndarray, np.ndarray]:
-    """Two symmetrical matrices int32 (n, n).
-
-    Returns:
-      The number of a pair's matches (COLMAP's inliers if it verified the pair), and the place of
-      the pair's state in STATES.
-    """
+    """Two symmetrical matrices int32 (n, n): the numbers of the pairs' matches (COLMAP's inliers
+    where it verified a pair), and the places of their states in STATES."""
     index = {name: k for k, name in enumerate(names)}
     inliers = np.zeros((len(names), len(names)), np.int32)
     states = np.zeros_like(inliers)
@@ -39,31 +35,21 @@ def pair_matrices(names: Sequence[str], rows: Sequence[PairRow]) -> tuple[np.nda
     return inliers, states
 
 
-def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> list[Figure]:
-    """Heat maps of the matches and of the states of all pairs.
-
-    Args:
-      names: all photos, in the order of the axes.
-      rows: all pairs that were tried.
-    """
+def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> tuple[Figure, Figure]:
+    """Heat maps of the matches and of the states of all pairs; `names` are all photos, in the order
+    of the axes."""
     block = max(1, -(-len(names) // MAX_SQUARES))
     inliers, states = (_reduced(m, block) for m in pair_matrices(names, rows))
     shown = short(names)
     groups = [shown[k : k + block] for k in range(0, len(shown), block)]
     labels = [text(g[0] if len(g) == 1 else f"{g[0]} .. {g[-1]}") for g in groups]
-    note = (
-        f" Each square stands for {block} x {block} photos and shows the best of their pairs."
-        if block > 1
-        else ""
-    )
-    side = np.arange(len(labels))
-    ticks = [text(g[0]) for g in groups]
+    note = f"Each square stands for {block} x {block} photos and shows the best of their pairs."
     every = max(1, -(-len(labels) // MAX_LABELS))
     axis = {
         "type": "category",
         "tickmode": "array",
-        "tickvals": side[::every],
-        "ticktext": ticks[::every],
+        "tickvals": np.arange(len(labels))[::every],
+        "ticktext": [text(g[0]) for g in groups[::every]],
         "showgrid": False,
         "zeroline": False,
         "automargin": True,
@@ -82,49 +68,30 @@ def matrix_figures(names: list[str], rows: Sequence[PairRow]) -> list[Figure]:
     ]
     common = {"x": labels, "y": labels, "hoverongaps": False}
     where = "%{x}<br>%{y}"
-    return [
+    matches = go.Heatmap(
+        z=np.where(inliers, np.log10(np.maximum(inliers, 1)), np.nan).astype(np.float32),
+        customdata=inliers,
+        colorscale="Viridis",
+        hovertemplate=where + "<br>%{customdata} matches<extra></extra>",
+        colorbar=_counts_bar(int(inliers.max(initial=1))),
+        **common,
+    )
+    outcomes = go.Heatmap(
+        z=place[states],
+        zmin=-0.5,
+        zmax=len(there) - 0.5,
+        colorscale=colours or None,
+        hovertemplate=where + "<extra></extra>",
+        colorbar=_bar(range(len(there)), [STATES[k].name for k in there]),
+        **common,
+    )
+    n, note = len(names), note if block > 1 else ""
+    return (
+        figure([matches], layout, alt=f"Heat map of the matches of {n} x {n} photos", note=note),
         figure(
-            "inliers",
-            "How many matches each pair has",
-            "Each square is a pair of photos. The brighter it is, the more verified matches the "
-            f"pair has, on a logarithmic scale. Photos of one place form bright blocks.{note}",
-            alt=f"Heat map of the matches of {len(names)} x {len(names)} photos",
-            data=[
-                go.Heatmap(
-                    z=np.where(inliers, np.log10(np.maximum(inliers, 1)), np.nan).astype(
-                        np.float32
-                    ),
-                    customdata=inliers,
-                    colorscale="Viridis",
-                    hovertemplate=where + "<br>%{customdata} matches<extra></extra>",
-                    colorbar=_counts_bar(int(inliers.max(initial=1))),
-                    **common,
-                )
-            ],
-            layout=layout,
-            tall=True,
+            [outcomes], layout, alt=f"Heat map of the outcome of the pairs of {n} photos", note=note
         ),
-        figure(
-            "states",
-            "What became of each pair",
-            "The same squares, coloured by the stage that a pair reached. The model rests on the "
-            f"blue pairs only. Orange pairs were verified, but contradict stronger pairs.{note}",
-            alt=f"Heat map of the outcome of the pairs of {len(names)} photos",
-            data=[
-                go.Heatmap(
-                    z=place[states],
-                    zmin=-0.5,
-                    zmax=len(there) - 0.5,
-                    colorscale=colours or None,
-                    hovertemplate=where + "<extra></extra>",
-                    colorbar=_bar(range(len(there)), [STATES[k].name for k in there]),
-                    **common,
-                )
-            ],
-            layout=layout,
-            tall=True,
-        ),
-    ]
+    )
 
 
 def _counts_bar(most: int) -> dict[str, object]:

@@ -15,19 +15,19 @@ def _hex(colours: np.ndarray) -> list[str]:
     return [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours.tolist()]
 
 
+def _coordinates(points: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(zip("xyz", points.astype(np.float32).T, strict=True))
+
+
 def _cameras(
     cameras: list[ShownCamera], depth: float, name: str, colour: str
 ) -> list[BaseTraceType]:
     """The frusta as one line with gaps, and the centres, which show a name under the mouse."""
     gap = np.full((1, 3), np.nan)
     lines = np.concatenate([p for c in cameras for p in (c.frustum(depth), gap)])
-    lines = lines.astype(np.float32)
-    centres = np.asarray([c.pose.centre for c in cameras], np.float32)
     return [
         go.Scatter3d(
-            x=lines[:, 0],
-            y=lines[:, 1],
-            z=lines[:, 2],
+            **_coordinates(lines),
             mode="lines",
             name=name,
             legendgroup=name,
@@ -35,9 +35,7 @@ def _cameras(
             hoverinfo="skip",
         ),
         go.Scatter3d(
-            x=centres[:, 0],
-            y=centres[:, 1],
-            z=centres[:, 2],
+            **_coordinates(np.asarray([c.pose.centre for c in cameras])),
             mode="markers",
             name=name,
             legendgroup=name,
@@ -49,29 +47,13 @@ def _cameras(
     ]
 
 
-def _start(scene: Scene) -> dict[str, object]:
-    """The first viewpoint, in the units of plotly."""
-    eye = 1.55 * scene.behind()
-    return {
-        "eye": dict(zip("xyz", eye.tolist(), strict=True)),
-        "up": {"x": 0, "y": 0, "z": 1},
-    }
-
-
-def model_figure(scene: Scene, unit: str) -> Figure:
-    """The points in their colours, the cameras, and the cameras of the reference if there is one.
-
-    Args:
-      unit: the unit of the axes, for the caption.
-    """
+def model_figure(scene: Scene) -> Figure:
+    """The points in their colours, the cameras, and those of the reference if there is one."""
     n = len(scene.points)
     some = np.sort(np.random.default_rng(0).permutation(n)[:MAX_POINTS])
-    points = scene.points[some].astype(np.float32)
     data: list[BaseTraceType] = [
         go.Scatter3d(
-            x=points[:, 0],
-            y=points[:, 1],
-            z=points[:, 2],
+            **_coordinates(scene.points[some]),
             mode="markers",
             name="points",
             # Squares are two triangles each: circles take three times as long to draw.
@@ -82,38 +64,25 @@ def model_figure(scene: Scene, unit: str) -> Figure:
     ]
     if scene.reference:
         data += _cameras(scene.reference, 1.3 * scene.frustum_depth, "reference", ORANGE)
-    notes = ""
+    notes = []
     if n > MAX_POINTS:
-        notes += f" {MAX_POINTS} of {n} points are drawn, taken at random."
+        notes.append(f"{MAX_POINTS} of {n} points are drawn, taken at random.")
     if scene.far:
-        notes += f" {scene.far} points far away from the others are left out."
-    reference = " Orange pyramids, a little larger, show the reference." * bool(scene.reference)
+        notes.append(f"{scene.far} points far away from the others are left out.")
     axis = {"showbackground": False, "title": {"text": ""}, "nticks": 6}
-    return figure(
-        "model",
-        "The 3-D model",
-        "Drag to turn the model, scroll to zoom. Points have the colours of the photos. Blue "
-        f"pyramids show where the cameras stand and in which direction they look.{reference} "
-        f"The axes are in {unit}.{notes}",
-        alt=f"3-D model with {len(some)} points and {len(scene.cameras)} cameras",
-        data=data,
-        layout={
-            "scene": {
-                "aspectmode": "data",
-                "dragmode": "orbit",
-                "camera": _start(scene),
-                "xaxis": axis,
-                "yaxis": axis,
-                "zaxis": axis,
+    eye = 1.55 * scene.behind()  # in the units of plotly
+    layout = {
+        "scene": {
+            "aspectmode": "data",
+            "dragmode": "orbit",
+            "camera": {
+                "eye": dict(zip("xyz", eye.tolist(), strict=True)),
+                "up": {"x": 0, "y": 0, "z": 1},
             },
-            "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-            "legend": {
-                "itemsizing": "constant",
-                "orientation": "h",
-                "x": 0,
-                "y": 1,
-                "yanchor": "top",
-            },
+            **dict.fromkeys(("xaxis", "yaxis", "zaxis"), axis),
         },
-        tall=True,
-    )
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"itemsizing": "constant", "orientation": "h", "x": 0, "y": 1, "yanchor": "top"},
+    }
+    alt = f"3-D model with {len(some)} points and {len(scene.cameras)} cameras"
+    return figure(data, layout, alt=alt, note=" ".join(notes))

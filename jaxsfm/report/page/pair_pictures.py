@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.report.finished_run import FinishedRun, RecordedPhotos
+from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.page.embedded import Embedded, embed
 from jaxsfm.report.page.pair_states import USED, refused_pairs, state
 from jaxsfm.report.plot import COLOURS, MAX_LINES
@@ -16,6 +16,8 @@ OF_A_KIND = 3
 """The number of pairs of each kind: best, weakest, refused."""
 SIDE = 640
 """Longer side of a photo in the page, pixels."""
+GAP = 6
+"""The space between the two photos, pixels of the page."""
 MAX_DOTS = 400
 """The most dots of a plane in a photo."""
 
@@ -33,13 +35,10 @@ class PairPicture(NamedTuple):
     """Two photos side by side with their matches."""
 
     heading: str
-    note: str
-    names: tuple[str, str]
+    row: PairRow
     photos: tuple[Embedded, Embedded]
     shift: int
     """The left edge of the second photo."""
-    width: int
-    height: int
     planes: list[Plane]
     matches: int
 
@@ -54,21 +53,6 @@ def _chosen(rows: list[PairRow]) -> list[tuple[str, PairRow]]:
         *(("Among the weakest pairs that were used", row) for row in weakest),
         *(("Refused", row) for row in refused_pairs(rows)[:OF_A_KIND]),
     ]
-
-
-def _note(row: PairRow) -> str:
-    verdict = row.view_graph
-    parts = [
-        f"{row.inliers} matches on {row.planes} planes, "
-        f"{row.colmap_inliers} of them verified by COLMAP"
-    ]
-    if verdict:
-        parts.append(f"strength {verdict.strength:.2f} of 1")
-        if verdict.reason:
-            parts.append(f"refused because {verdict.reason}")
-    elif not row.colmap_inliers:
-        parts.append("COLMAP found no common geometry")
-    return "; ".join(parts)
 
 
 def _some(index: np.ndarray, limit: int) -> np.ndarray:
@@ -92,37 +76,20 @@ def _planes(result: PairResult, xy0: np.ndarray, xy1: np.ndarray) -> list[Plane]
 def _picture(
     run: FinishedRun, heading: str, row: PairRow, seen: dict[str, Embedded]
 ) -> PairPicture | None:
-    a, b = row.pair
-    result = run.load_matches((a, b))
+    result = run.matches.load_matches(row.pair)
     if result is None:
         return None
-    for name in (a, b):
-        if name not in seen and (made := _photo(run.photos, name, len(seen))) is not None:
-            seen[name] = made
-    if a not in seen or b not in seen:
+    for name in row.pair:
+        if name not in seen and (image := run.photos.read(name)) is not None:
+            seen[name] = embed(image, id=f"photo{len(seen)}", side=SIDE)
+    if not seen.keys() >= set(row.pair):
         return None
-    photo0, photo1 = seen[a], seen[b]
-    shift = photo0.width + 6
-    return PairPicture(
-        heading=heading,
-        note=_note(row),
-        names=(a, b),
-        photos=(photo0, photo1),
-        shift=shift,
-        width=shift + photo1.width,
-        height=max(photo0.height, photo1.height),
-        planes=_planes(
-            result,
-            photo0.place(result.keypoints0),
-            photo1.place(result.keypoints1) + np.asarray([shift, 0]),
-        ),
-        matches=result.num_inliers,
-    )
-
-
-def _photo(photos: RecordedPhotos, name: str, number: int) -> Embedded | None:
-    image = photos.read(name)
-    return image and embed(image, id=f"photo{number}", side=SIDE)
+    photo0, photo1 = (seen[name] for name in row.pair)
+    shift = photo0.width + GAP
+    xy0 = photo0.place(result.keypoints0)
+    xy1 = photo1.place(result.keypoints1) + np.asarray([shift, 0])
+    planes = _planes(result, xy0, xy1)
+    return PairPicture(heading, row, (photo0, photo1), shift, planes, result.num_inliers)
 
 
 def pair_pictures(run: FinishedRun) -> tuple[list[PairPicture], Iterable[Embedded]]:

@@ -1,9 +1,16 @@
-"""How far a pair of photos came, with the names and colours of the page."""
+"""How far the pairs of photos came: the states of pairs with their colours, and the tables."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxsfm.report.page.figures import BLUE, GREEN, GREY, ORANGE
-from jaxsfm.report.run_results import PairRow
+from jaxsfm.report.run_results import Component, PairRow, ViewGraph
+from jaxsfm.report.summary import MAX_GROUPS
+
+MAX_PAIRS = 15
+"""The most rows of the table of refused pairs."""
 
 
 class State(NamedTuple):
@@ -38,6 +45,16 @@ def state(row: PairRow) -> int:
     return USED if row.trusted else NOT_TRUSTED
 
 
+def partners(names: Iterable[str], rows: Iterable[PairRow]) -> dict[str, int]:
+    """The number of used pairs of every photo."""
+    number = dict.fromkeys(names, 0)
+    for row in rows:
+        if state(row) == USED:
+            for name in row.pair:
+                number[name] += 1
+    return number
+
+
 def strength(row: PairRow, most: int) -> float:
     """A pair's strength, 0 .. 1.
 
@@ -51,3 +68,39 @@ def refused_pairs(rows: list[PairRow]) -> list[PairRow]:
     """The pairs with matches that the model does not rest on, those with most matches first."""
     refused = [row for row in rows if state(row) in (NOT_TRUSTED, NOT_VERIFIED)]
     return sorted(refused, key=lambda row: (-row.colmap_inliers, -row.inliers, row.pair))
+
+
+class PairTable(NamedTuple):
+    """How far all pairs came."""
+
+    counts: list[tuple[State, int]]
+    """The number of pairs in every state that occurs."""
+    refused: list[tuple[PairRow, str]]
+    """The refused pairs with the most matches, and why each was refused."""
+    left_out: int
+    """The number of refused pairs that have no row."""
+
+
+def pair_table(rows: list[PairRow]) -> PairTable:
+    """How far all pairs came, and the reasons why pairs with many matches were refused."""
+    refused = refused_pairs(rows)
+    numbers = np.bincount([state(row) for row in rows], minlength=len(STATES)).tolist()
+    shown = []
+    for row in refused[:MAX_PAIRS]:
+        name, meaning, _ = STATES[state(row)]
+        reason = row.view_graph.reason if row.view_graph else ""
+        shown.append((row, f"{name}: {reason or meaning}"))
+    return PairTable(
+        counts=[(each, n) for each, n in zip(STATES, numbers, strict=True) if n],
+        refused=shown,
+        left_out=max(0, len(refused) - MAX_PAIRS),
+    )
+
+
+def component_table(view_graph: ViewGraph) -> list[Component]:
+    """The groups of photos that trusted pairs join, the largest first; nothing if there is one
+    group only. Single photos have no row: they are listed among the lost photos."""
+    groups = view_graph.components
+    if len(groups) < 2:
+        return []
+    return [group for group in groups if len(group.images) > 1][:MAX_GROUPS]

@@ -6,7 +6,15 @@ import numpy as np
 import plotly.graph_objects as go
 
 from jaxsfm.report.page.figures import BLUE, ORANGE, Figure, figure, short, text
-from jaxsfm.report.page.pair_states import LOST, NOT_TRUSTED, REGISTERED, USED, state, strength
+from jaxsfm.report.page.pair_states import (
+    LOST,
+    NOT_TRUSTED,
+    REGISTERED,
+    USED,
+    partners,
+    state,
+    strength,
+)
 from jaxsfm.report.run_results import PairRow
 
 MAX_USED, MAX_NOT_TRUSTED = 1200, 300
@@ -35,13 +43,8 @@ def chosen_edges(rows: Sequence[PairRow], limit: int, most: int) -> list[PairRow
 
 
 def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection[str]) -> Figure:
-    """The photos around a circle, in the order of their names, and the verified pairs.
-
-    Args:
-      names: all photos.
-      rows: all pairs that were tried.
-      registered: the photos with a pose in the best model.
-    """
+    """The photos around a circle, in the order of their names, and the verified pairs among `rows`.
+    The photos `registered` have a pose in the best model."""
     by_state = {k: [row for row in rows if state(row) == k] for k in (USED, NOT_TRUSTED)}
     most = max((row.colmap_inliers for row in rows), default=1)
     used = chosen_edges(by_state[USED], MAX_USED, most)
@@ -71,10 +74,7 @@ def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection
         if some:
             data.append(lines(some, name, BLUE, width, opacity))
     labels = [text(name) for name in short(names)]
-    partners = dict.fromkeys(names, 0)
-    for row in by_state[USED]:
-        for name in row.pair:
-            partners[name] += 1
+    number = partners(names, rows)
     for colour, what, wanted in ((REGISTERED, "in the model", True), (LOST, "lost", False)):
         own = [k for k, name in enumerate(names) if (name in registered) == wanted]
         if own:
@@ -87,28 +87,22 @@ def view_graph(names: list[str], rows: Sequence[PairRow], registered: Collection
                     marker={"color": colour, "size": 9 if len(names) <= 200 else 5},
                     text=[labels[k] for k in own],
                     textposition=[_side(xy[k]) for k in own],
-                    customdata=[partners[names[k]] for k in own],
+                    customdata=[number[names[k]] for k in own],
                     hovertemplate="%{text}<br>%{customdata} pairs used<extra></extra>",
                     cliponaxis=False,
                 )
             )
     axis = {"visible": False, "range": [-1.6, 1.6]}
-    note = f" {left_out} weaker pairs are left out." if left_out else ""
+    layout = {
+        "xaxis": axis,
+        "yaxis": {**axis, "scaleanchor": "x", "range": [-1.15, 1.15]},
+        "margin": {"l": 8, "r": 8, "t": 8, "b": 8},
+    }
     return figure(
-        "view-graph",
-        "Which photos see the same thing",
-        "Each dot is a photo. Each blue line is a pair that the model rests on; the stronger the "
-        "pair, the thicker the line. A pair has the largest strength, 1, if it has as many matches "
-        "as the best pair of each of its photos, spread over the whole image. Orange lines are "
-        f"pairs that stronger pairs contradict.{note}",
+        data,
+        layout,
         alt=f"Graph of {len(names)} photos with {len(used)} used and {len(odd)} untrusted pairs",
-        data=data,
-        layout={
-            "xaxis": axis,
-            "yaxis": {**axis, "scaleanchor": "x", "range": [-1.15, 1.15]},
-            "margin": {"l": 8, "r": 8, "t": 8, "b": 8},
-        },
-        tall=True,
+        note=f"{left_out} weaker pairs are left out." if left_out else "",
     )
 
 

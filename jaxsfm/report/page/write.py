@@ -1,6 +1,7 @@
 """Puts the page together and writes it."""
 
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jinja2
@@ -10,21 +11,21 @@ from markupsafe import Markup
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import shown_name
+from jaxsfm.io.pairs import describe
 from jaxsfm.io.work_folder import PAGE
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.page.close_ups import SIDE, close_ups
-from jaxsfm.report.page.error_figures import cumulative_figures, reprojection_figure, track_figure
-from jaxsfm.report.page.figures import Figure, count, figures3
+from jaxsfm.report.page.error_figures import cumulative_figure, reprojection_figure, track_figure
+from jaxsfm.report.page.figures import BLUE, GREEN, Figure, count, duration, figures3
 from jaxsfm.report.page.matrices import matrix_figures
 from jaxsfm.report.page.model_figure import model_figure
 from jaxsfm.report.page.pair_pictures import pair_pictures
-from jaxsfm.report.page.pair_table import component_table, pair_table
+from jaxsfm.report.page.pair_states import component_table, pair_table
 from jaxsfm.report.page.photo_table import photo_table
-from jaxsfm.report.page.run_tables import next_steps, option_table, stage_table
-from jaxsfm.report.page.verdict import verdict
 from jaxsfm.report.page.view_graph import view_graph
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.scene import shown_scene
+from jaxsfm.report.summary import named
 from jaxsfm.report.typed_json import to_json
 
 _ENVIRONMENT = jinja2.Environment(
@@ -34,16 +35,16 @@ _ENVIRONMENT = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_ENVIRONMENT.filters["name"] = shown_name
-_ENVIRONMENT.filters["count"] = count
-_ENVIRONMENT.filters["figures3"] = figures3
-
-
-def _text(file: str) -> str:
-    """The content of a file of this package."""
-    found = _ENVIRONMENT.loader
-    assert found is not None
-    return found.get_source(_ENVIRONMENT, file)[0]
+_ENVIRONMENT.filters |= {
+    "name": shown_name,
+    "named": named,
+    "described": describe,
+    "count": count,
+    "figures3": figures3,
+    "duration": duration,
+    "quote": shlex.quote,
+    "repr": repr,
+}
 
 
 def photo_names(report: RunReport) -> list[str]:
@@ -53,33 +54,45 @@ def photo_names(report: RunReport) -> list[str]:
     return sorted(names | {photo.image for photo in report.lost})
 
 
-def _figures(run: FinishedRun, names: list[str]) -> Iterator[Figure]:
+def _figures(run: FinishedRun, names: list[str]) -> Iterator[tuple[str, Figure]]:
+    """The figures of the page, each with the name by which page.html places it."""
     report, rows = run.report, run.report.pairs.each
     if run.model is not None:
-        unit = "units of the reference" if run.reference else "the model's own, arbitrary units"
-        yield model_figure(shown_scene(run), unit)
-        yield reprojection_figure(run.model)
-        yield track_figure(run.model)
-    if report.evaluation:
-        yield from cumulative_figures(report.evaluation)
+        yield "model", model_figure(shown_scene(run))
+        yield "reprojection", reprojection_figure(run.errors)
+        yield "tracks", track_figure(run.model.tracks)
+    if evaluation := report.evaluation:
+        total, errors = evaluation.reference_images, evaluation.images.values()
+        positions, rotations = [e.position for e in errors], [e.rotation_deg for e in errors]
+        unit = "units of the reference"
+        yield "positions", cumulative_figure("position", unit, BLUE, positions, total)
+        yield "rotations", cumulative_figure("rotation", "degrees", GREEN, rotations, total)
     if names:
         registered = set(report.models[0].images) if report.models else set()
-        yield view_graph(names, rows, registered)
-        yield from matrix_figures(names, rows)
+        yield "view-graph", view_graph(names, rows, registered)
+        yield from zip(("inliers", "states"), matrix_figures(names, rows), strict=True)
+
+
+def _options(options: object, prefix: str = "") -> list[tuple[str, str]]:
+    """Nested options as rows of a name and a value."""
+    if isinstance(options, Mapping):
+        return [row for name, each in options.items() for row in _options(each, f"{prefix}{name}.")]
+    if isinstance(options, bool):
+        options = "yes" if options else "no"
+    return [(prefix.removesuffix("."), "-" if options is None else str(options))]
 
 
 def page(run: FinishedRun) -> str:
     """The report as HTML that needs nothing from outside."""
-    report = run.report
+    report, images = run.report, run.photos.folder
     names = photo_names(report)
     pictures, photos = pair_pictures(run)
     return _ENVIRONMENT.get_template("page.html").render(
         title=shown_name(run.folder.absolute().name),
-        style=Markup(_text("page.css")),
-        script=Markup(_text("page.js")),
         plotly=Markup(plotly.offline.get_plotlyjs()),
-        verdict=verdict(report),
-        figures={figure.id: figure for figure in _figures(run, names)},
+        report=report,
+        reference=run.reference,
+        figures=dict(_figures(run, names)),
         pictures=pictures,
         photos=photos,
         tracks=close_ups(run),
@@ -88,14 +101,9 @@ def page(run: FinishedRun) -> str:
         pairs=pair_table(report.pairs.each),
         groups=component_table(report.view_graph),
         table=photo_table(run, names),
-        seconds=stage_table(report.seconds),
-        options=option_table(to_json(report.options)),
-        versions=report.versions or {"jaxsfm": report.version},
-        finished=report.finished,
-        evaluation=report.evaluation,
-        folder=shown_name(str(run.folder.absolute())),
-        images=run.photos.folder and shown_name(str(run.photos.folder.absolute())),
-        steps=next_steps(run.folder, run.photos.folder, model=run.model is not None),
+        options=_options(to_json(report.options)),
+        out=str(run.folder.absolute()),
+        images=images and str(images.absolute()),
     )
 
 
