@@ -48,7 +48,6 @@ class ExternalMatches(NamedTuple):
     matches: dict[Pair, np.ndarray]
     """int32 (m, 2): indices of keypoints, one to one."""
     about: ExternalFiles | None
-    """None where there are no external matches."""
 
     def result(self, pair: Pair) -> PairResult:
         """The matches of a pair, in the form of ours. They are on no plane."""

@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
@@ -14,11 +13,7 @@ from jaxsfm.io.images import ImageError
 
 
 def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
-    """Write models into `folder`/0 (the best one), 1, 2, ... The folder is replaced.
-
-    Raises:
-      UserError: the disk is full.
-    """
+    """Write models into `folder`/0 (the best one), 1, 2, ... The folder is replaced."""
     shutil.rmtree(folder, ignore_errors=True)
     for index, model in enumerate(models):
         target = folder / str(index)

@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -62,8 +63,7 @@ class ImageFile:
         return int(self.sha256[:8], 16)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WorkingImage:
+class WorkingImage(NamedTuple):
     """The pixels of an image at working size."""
 
     rgb: np.ndarray
@@ -110,7 +110,6 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     """Check an image file and find its size and hash, without decoding it.
 
     Args:
-      path: the file.
       name: the image's name; None takes the name of the file.
 
     Raises:

@@ -18,7 +18,6 @@ class PairSelection(NamedTuple):
     """The parts of a value of `--pairs`."""
 
     exhaustive: bool = False
-    """All pairs are selected."""
     files: tuple[Path, ...] = ()
     """Files that list pairs."""
     sequential: int = 0
@@ -76,7 +75,6 @@ def selected_pairs(
     """Return the selected pairs, without those of retrieval, which needs to look at the photos.
 
     Args:
-      selection: what is selected.
       names: the images that can be used.
       known: the images that a file may name.
 

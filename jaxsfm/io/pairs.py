@@ -60,13 +60,7 @@ class PairResult:
 
 
 class LazyMatches(Mapping[Pair, PairResult]):
-    """The matches of many pairs, of which each is made when it is asked for and not kept.
-
-    A subclass defines `_load`.
-
-    Args:
-      pairs: the pairs, in the order in which the mapping lists them.
-    """
+    """The matches of `pairs`, in their order. Each is made (`_load`) when it is asked for."""
 
     def __init__(self, pairs: Iterable[Pair]) -> None:
         self._pairs = dict.fromkeys(pairs)
@@ -124,6 +118,20 @@ def _split(line: str, known: set[str]) -> Pair | None:
     return (parts[0], parts[1]) if len(parts) == 2 else None
 
 
+def listed_lines(path: Path, option: str) -> list[tuple[int, str]]:
+    """The stripped lines of a text file, with their numbers, without comments (#) and empty ones.
+
+    Raises:
+      UserError: the file that the option names cannot be read as text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{option} {path}: cannot be read as text") from error
+    stripped = enumerate(map(str.strip, lines), start=1)
+    return [(k, line) for k, line in stripped if line and not line.startswith("#")]
+
+
 def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
     """Read pairs from a text file that has two names on each line, separated by a blank or a tab.
 
@@ -131,7 +139,6 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
     or starts with # cannot be written in such a file.
 
     Args:
-      path: the file.
       known: the names of the images in the folder.
 
     Returns: the pairs, sorted, each once.
@@ -141,15 +148,8 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
         no pairs in it.
     """
     names = set(known)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--pairs {path}: cannot be read as text") from error
     pairs = set()
-    for number, line in enumerate(lines, start=1):
-        line = line.strip()
-        if not line or line.startswith("#"):
-            continue
+    for number, line in listed_lines(path, "--pairs"):
         cut = _split(line, names)
         if cut is None:
             raise UserError(f"--pairs {path} line {number}: expected two image names; got {line!r}")

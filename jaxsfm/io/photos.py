@@ -52,14 +52,9 @@ class Photos(Mapping[str, ImageFile]):
         ratios = [max(self[name].size) / max(self.working_size(name)) for name in self]
         return float(np.median(ratios))
 
-    def read(self, name: str) -> WorkingImage:
-        """The working image."""
-        return read_image(self[name], max_size=self._config.max_size, enlarge=self._config.enlarge)
-
-    def rgb(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
+    def rgb(self, name: str) -> WorkingImage:
         """Colours uint8 (h, w, 3) of the working image; original pixels per working pixel."""
-        working = self.read(name)
-        return working.rgb, working.scale
+        return read_image(self[name], max_size=self._config.max_size, enlarge=self._config.enlarge)
 
     def _gray(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
         """Intensities float32 (h, w) of the working image; original pixels per working pixel."""

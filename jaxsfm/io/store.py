@@ -42,9 +42,7 @@ def digest(*parts: Json) -> str:
 class Store:
     """Features, matches and descriptors in a folder, each in its own file.
 
-    Args:
-      path: the work folder.
-      identity: what the run depends on; it decides which files belong to the run.
+    The identity says what the run depends on. It decides which files belong to the run.
     """
 
     def __init__(self, path: Path, identity: Identity) -> None:
@@ -116,16 +114,11 @@ class Store:
     # -- descriptors of whole photos: they are small and stay ------------------------------------
 
     def save_descriptor(self, image: ImageFile, kind: str, arrays: Mapping[str, ArrayLike]) -> None:
-        """Save the arrays that describe a photo as a whole.
+        """Save the arrays that describe a photo as a whole; UserError if they cannot be written.
 
         Args:
-          image: the photo.
           kind: the name of the description, followed by all that it depends on besides the photo,
             the weights and jaxsfm's version.
-          arrays: the arrays by name.
-
-        Raises:
-          UserError: they cannot be written.
         """
         save_arrays(self._file("descriptors", kind, image.sha256), arrays)
 

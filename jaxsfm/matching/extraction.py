@@ -37,9 +37,7 @@ def _start(
 ) -> DenseFeatures:
     """Start the extraction of images that share a padded size and a capacity.
 
-    Returns:
-      Features on the devices, with leading axes for the devices and their batches. They are not
-      waited for.
+    The features are on the devices, with leading axes for the devices and their batches.
     """
     padded, num_coarse = _shapes(working[0].rgb.shape[1::-1])
     count = batch_size * mesh.size
@@ -61,8 +59,7 @@ def _start(
 def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Extraction:
     """What a config and the weights fix in the compiled program of an extraction.
 
-    Raises:
-      ValueError: the weights belong to another network than the config's.
+    Raises ValueError if the weights belong to another network than the config's.
     """
     if weights.backbone != config.backbone:
         raise ValueError(f"weights must be of {config.backbone}; got {weights.backbone}")

@@ -35,15 +35,10 @@ class GlobalDescriptors(NamedTuple):
     vectors: dict[str, np.ndarray]
     """float32, unit length, by the photos' names."""
     lost: list[tuple[ImageFile, ImageError]]
-    """Photos that cannot be decoded, and why."""
 
 
 def check_retrieval(kind: Retrieval, weights: Weights) -> None:
-    """Check that photos can be described in a way with these weights.
-
-    Raises:
-      UserError: they cannot.
-    """
+    """Raise UserError unless photos can be described in a way with these weights."""
     if kind == "netvlad" and not (is_converted(weights.path) and has_extras(weights.path)):
         raise UserError(
             "--retrieval netvlad: needs NetVLAD's weights with their head (--weights; jaxsfm "

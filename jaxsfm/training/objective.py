@@ -70,7 +70,6 @@ class Examples(NamedTuple):
     maps1: tuple[Float[Array, "b h w c"], ...]
     """The same maps of the second views."""
     cells: CellPairs
-    """The cells that show the same place."""
     known: Float[Array, "b 3 3"]
     """The homography from the first view to the second (pixels), or the fundamental matrix F with
     x1' F x0 = 0."""
@@ -105,10 +104,7 @@ def warped_examples(
     """Make two views of every crop, related by a random homography, and compute their maps.
 
     Args:
-      params: the parameters of `VGG16`.
-      key: the key of all random choices.
       crops: RGB in 0 .. 255.
-      preprocessing: what the network expects of an image.
       size: the side of a view, pixels.
     """
     views_key, offsets_key = jax.random.split(key)
@@ -140,9 +136,6 @@ def loss(
     agree for certain, plus the weighted lack of peakiness.
 
     Args:
-      scores: the parameters of `jaxsfm.core.scores.Scores`.
-      examples: pairs of views.
-      objective: how walks are compared.
       supervision: a key of `DISTANCES` that says what `examples.known` is.
 
     Returns: the loss, and figures to show by name.
@@ -186,7 +179,6 @@ def shares(scores: dict | None, examples: Examples, *, children: int = 2) -> dic
     Args:
       scores: the parameters of `jaxsfm.core.scores.Scores`; None takes the norm as the score.
       examples: pairs of views with known homographies.
-      children: children per axis and level.
 
     Returns: the shares `within_1` and `within_3`, and `cells`, the number of keypoints.
     """

@@ -36,12 +36,9 @@ def split(images: Sequence[ImageFile]) -> tuple[list[ImageFile], list[ImageFile]
 
 
 class Crops:
-    """Random crops of photos. Those of a step depend on the photos, the seed and the step alone.
+    """Random crops of photos, `side` pixels a side.
 
-    Args:
-      images: the photos.
-      side: the side of a crop, pixels.
-      seed: the seed of all random choices.
+    Those of a step depend on the photos, the seed and the step alone.
     """
 
     def __init__(self, images: Sequence[ImageFile], *, side: int, seed: int) -> None:

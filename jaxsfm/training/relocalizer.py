@@ -50,7 +50,6 @@ class TrainOptions:
     """The settings of a training. Its result depends on them, the photos and the network."""
 
     steps: int = 400
-    """The number of steps."""
     batch: int = 8
     """Pairs of views in a step."""
     view: int = 192
@@ -64,7 +63,6 @@ class TrainOptions:
     epipolar_weight: float = 1.0
     """Weight of the loss of posed pairs, if there are any."""
     seed: int = 0
-    """The seed of all random choices."""
     objective: Objective = dataclasses.field(default_factory=Objective)
 
     def __post_init__(self) -> None:
@@ -89,7 +87,6 @@ class State(NamedTuple):
     scores: PyTree
     """The parameters of `jaxsfm.core.scores.Scores`."""
     optimizer: optax.OptState
-    """The state of Adam."""
     step: np.ndarray
     """int32 (): the number of steps so far."""
 
@@ -144,13 +141,7 @@ def train_relocalizer(
     on from there, and it gives the same parameters as a training without interruption.
 
     Args:
-      weights: the weights of the network.
-      images: the photos.
-      out: the file for the relocalizer.
-      options: the settings.
       posed: pairs of photos with known cameras, to train on besides.
-      progress: shows a bar.
-      tell: is called with a line of text now and then.
 
     Returns: the time that the training took, seconds.
 

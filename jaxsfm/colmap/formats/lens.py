@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
@@ -27,7 +26,6 @@ class Lens(NamedTuple):
     """
 
     model: str
-    """COLMAP's name of the camera model."""
     size: tuple[int, int]
     fx: float
     fy: float
@@ -45,14 +43,7 @@ class Lens(NamedTuple):
 
 
 def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Camera:
-    """The camera of a row of a database.
-
-    Args:
-      where: beginning of messages.
-
-    Raises:
-      UserError: there is no such model, or it has other parameters.
-    """
+    """The camera of a row of a database; UserError, which begins with `where`, if it is none."""
     try:
         model = pycolmap.CameraModelId(row.model)
         camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=row.params)
@@ -64,14 +55,7 @@ def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Cam
 
 
 def lens_of(camera: pycolmap.Camera, to: str) -> Lens:
-    """Describe a camera by one of the two formulas.
-
-    Args:
-      to: name of the format, for messages.
-
-    Raises:
-      UserError: neither formula is that of the camera.
-    """
+    """Describe a camera by one of the two formulas. Raises UserError if neither is the camera's."""
     model = camera.model_name
     fisheye = model in _FISHEYE
     if not fisheye and model not in _PERSPECTIVE:
@@ -138,11 +122,7 @@ class PointTrack(NamedTuple):
 
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """The images with a pose, sorted by name.
-
-    Raises:
-      UserError: a name leads out of the photos' folder.
-    """
+    """The images with a pose, by name; UserError if a name leads out of the photos' folder."""
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     for image in images:
         path = PurePosixPath(image.name)
@@ -154,11 +134,7 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 def point_tracks(
     model: pycolmap.Reconstruction, images: list[pycolmap.Image]
 ) -> Iterator[tuple[int, PointTrack]]:
-    """The points of a model, in the order of their ids.
-
-    Yields:
-      the id; the point, with indices into `images`.
-    """
+    """The ids and points of a model, in the order of ids, with indices into `images`."""
     index = {image.image_id: k for k, image in enumerate(images)}
     pixels = [
         np.asarray([point.xy for point in image.points2D], np.float64).reshape(-1, 2)

@@ -28,8 +28,7 @@ MAX_ERROR_PX = 1.0
 def undistortion(lens: Lens) -> float:
     """The coefficient r that undoes k1 and k2 best over the image.
 
-    Raises:
-      UserError: the error that it leaves exceeds MAX_ERROR_PX.
+    Raises UserError if the error that it leaves exceeds MAX_ERROR_PX.
     """
     k1, k2 = lens.radial[:2]
     if k1 == k2 == 0:

@@ -67,7 +67,6 @@ def sfm_data(
       cameras: by image name, of images with and without a pose. For images with a pose they are
         the cameras of the model.
       model: poses and points; None: there are none.
-      root: the photos' folder.
 
     Raises:
       UserError: OpenMVG does not have a camera.

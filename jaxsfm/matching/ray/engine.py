@@ -42,7 +42,7 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RayEngine:
-    """Workers on a Ray cluster compute (`jaxsfm.matching.engines.Engine`)."""
+    """Workers on a Ray cluster compute."""
 
     address: str | None = None
     """HOST:PORT of the cluster; None: see `jaxsfm.matching.ray.cluster.connect`."""
@@ -60,11 +60,7 @@ class RayEngine:
         config: Config,
         execution: Execution | None = None,
     ) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
-        """As `jaxsfm.matching.extraction.extract_images`, in any order.
-
-        Raises:
-          UserError: also if Ray cannot be used, or loses workers again and again.
-        """
+        """As `jaxsfm.matching.extraction.extract_images`, in any order; UserError also for Ray."""
         ordered = sorted(
             images, key=lambda image: working_size(image.size, config.max_size, config.enlarge)
         )
@@ -88,11 +84,7 @@ class RayEngine:
         seed: int = 0,
         execution: Execution | None = None,
     ) -> Iterator[PairResult]:
-        """As `jaxsfm.matching.pair_matching.match_pairs`, in any order.
-
-        Raises:
-          UserError: also if Ray cannot be used, or loses workers again and again.
-        """
+        """As `jaxsfm.matching.pair_matching.match_pairs`, in any order; UserError also for Ray."""
         named = [make_pair(a, b) for a, b in pairs]
         if not named:
             return
