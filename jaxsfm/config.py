@@ -190,11 +190,7 @@ PRESETS: dict[str, Config] = {
 
 
 def preset(name: str) -> Config:
-    """The preset of this name.
-
-    Raises:
-      ValueError: there is no such preset; the message names the presets.
-    """
+    """The preset of this name; ValueError, which names the presets, if there is none."""
     if name not in PRESETS:
         raise ValueError(f"preset must be one of {sorted(PRESETS)}; got {name!r}")
     return PRESETS[name]

@@ -66,12 +66,9 @@ def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
 
 
 def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Camera:
-    """The camera of a photo.
+    """The camera of a photo; UserError if COLMAP does not accept it.
 
     Without intrinsics, its focal length comes from EXIF, or is 1.2 x the longer side of the photo.
-
-    Raises:
-      UserError: COLMAP does not accept the camera.
     """
     if intrinsics is not None:
         camera = intrinsics.camera(image.size)

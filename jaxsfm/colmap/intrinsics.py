@@ -67,8 +67,7 @@ def _from_matrix(path: Path) -> Intrinsics:
 def parse_intrinsics(text: str) -> Intrinsics:
     """Read intrinsics from the path of a K.txt, or from `MODEL:p1,p2,...` (a COLMAP camera model).
 
-    Raises:
-      UserError: the text is neither, or its numbers make no camera.
+    Raises UserError if the text is neither, or its numbers make no camera.
     """
     model, colon, params = text.partition(":")
     models = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}

@@ -69,14 +69,10 @@ class PairGeometry:
     """Share of the image that the inliers cover, 0 .. 1; the smaller of the two images' shares."""
 
 
-def spread(xy: np.ndarray, size: tuple[int, int], *, cells: int = 8) -> float:
-    """The share of a cells x cells grid over the image in which there is at least one point.
-
-    Args:
-      xy: float (n, 2), pixels of an image of `size` (width, height).
-    """
-    at = np.floor((xy + 0.5) / np.asarray(size) * cells).astype(int).clip(0, cells - 1)
-    return len(np.unique(at[:, 1] * cells + at[:, 0])) / cells**2
+def spread(xy: np.ndarray, size: tuple[int, int]) -> float:
+    """The share of an 8 x 8 grid over an image (width, height) that has points, pixels (n, 2)."""
+    at = np.floor((xy + 0.5) / np.asarray(size) * 8).astype(int).clip(0, 7)
+    return len(np.unique(at[:, 1] * 8 + at[:, 0])) / 64
 
 
 class TwoView(NamedTuple):

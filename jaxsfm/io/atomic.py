@@ -32,10 +32,8 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing; it takes the place of `path` when the block ends.
 
     Until then its bytes are in a file of another name. Data that the system has not written to the
-    disk yet may be lost if power fails; `write_atomic` waits for them.
-
-    Raises:
-      UserError: the file cannot be written (for example: no permission, or the disk is full).
+    disk yet may be lost if power fails; `write_atomic` waits for them. Raises UserError if the file
+    cannot be written.
     """
     # The process id keeps two processes from writing the same partial file.
     partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
@@ -62,10 +60,7 @@ def save_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
     """Write arrays into an .npz file.
 
     This does not wait for the disk, so a power failure may tear the file. The zip format carries
-    checksums; `load_arrays` treats a torn file as absent.
-
-    Raises:
-      UserError: the file or its folder cannot be written.
+    checksums; `load_arrays` treats a torn file as absent. Raises UserError if it cannot be written.
     """
     with writing(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)

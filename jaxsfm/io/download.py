@@ -159,10 +159,8 @@ def _reason(error: requests.RequestException) -> str:
 def unpack(archive: Path, folder: Path) -> None:
     """Unpack a zip or tar archive into a folder, beside the files that are there.
 
-    If the archive is damaged, nothing is written.
-
-    Raises:
-      UserError: the archive cannot be unpacked, or it would write outside the folder.
+    If the archive is damaged or would write outside the folder, UserError is raised and nothing is
+    written.
     """
     scratch = tempfile.TemporaryDirectory(
         prefix=".unpacking-", dir=folder, ignore_cleanup_errors=True

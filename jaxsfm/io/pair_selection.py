@@ -29,8 +29,7 @@ class PairSelection(NamedTuple):
 def parse_pair_selection(text: str) -> PairSelection:
     """Parse a value of `--pairs`. If a file of this name exists, the value is that file.
 
-    Raises:
-      UserError: a part is neither a file nor one of the known words, or its number is wrong.
+    Raises UserError if a part is neither a file nor one of the known words, or its number is wrong.
     """
     parts = [text] if os.path.isfile(text) else text.split("+")
     selection = PairSelection()

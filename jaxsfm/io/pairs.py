@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 
+Name = TypeVar("Name", str, int)
 Pair = tuple[str, str]
 """The names of two images; the first one sorts before the second."""
 
@@ -94,8 +95,8 @@ class PairCounts(NamedTuple):
     status: Status
 
 
-def make_pair(a: str, b: str) -> Pair:
-    """Return two names as a pair, in order."""
+def make_pair(a: Name, b: Name) -> tuple[Name, Name]:
+    """Two names as a pair, in order."""
     return (a, b) if a <= b else (b, a)
 
 
@@ -165,14 +166,12 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
 
 
 def best_pairs(num_inliers: Mapping[Pair, int], n: int) -> set[Pair]:
-    """Return the union over all images of an image's n pairs with the most inliers.
+    """The union over all images of an image's n pairs with the most inliers.
 
     A pair is kept if it is among the best of *either* image. So the result does not depend on the
     order of the images; the paper's code keeps (i, j) only if j is in the list of the
-    lower-numbered i. Pairs without inliers are never kept. Equal counts are decided by name.
-
-    Raises:
-      ValueError: n is less than 1.
+    lower-numbered i. Pairs without inliers are never kept. Equal counts are decided by name. Raises
+    ValueError if n is less than 1.
     """
     if n < 1:
         raise ValueError(f"n must be at least 1; got {n}")

@@ -50,7 +50,7 @@ class ConvertedWeights(NamedTuple):
 
 
 def preprocessing_numbers(p: Preprocessing) -> tuple[float, ...]:
-    """Return the seven numbers of a preprocessing: scale, mean and standard deviation."""
+    """The seven numbers of a preprocessing: scale, mean and standard deviation."""
     return (p.scale, *p.mean, *p.std)
 
 
@@ -120,11 +120,7 @@ def read_converted(path: Path, *, shapes: Shapes | None = None) -> ConvertedWeig
 
 
 def read_extras(path: Path) -> dict[str, np.ndarray]:
-    """Read those of `EXTRAS` that a file of converted weights has, float32.
-
-    Raises:
-      UserError: the file cannot be read, or an array is not as it must be.
-    """
+    """Those of `EXTRAS` that a file of converted weights has, float32; UserError if damaged."""
     with _open(path) as file:
         return {name: file.read(name, EXTRAS[name]) for name in EXTRAS if name in file.shapes}
 

@@ -146,11 +146,7 @@ def read_arrays(data: bytes, *, path: str) -> dict[str, dict[str, dict[str, np.n
 
 
 def default_path(backbone: BackboneName = "vgg16") -> Path:
-    """Return the file in which the installed distribution has a network.
-
-    Raises:
-      UserError: the distribution is not installed or does not have the network.
-    """
+    """The file in which the installed distribution has a network; UserError if it has none."""
     if backbone not in DISTRIBUTED:
         raise UserError(
             f"--backbone {backbone}: jaxsfm comes without weights of it; give yours with --weights"

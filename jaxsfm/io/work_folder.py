@@ -217,10 +217,8 @@ def _images(identity: Identity) -> Mapping[str, Json]:
 def lock_folder(path: Path) -> Iterator[None]:
     """Create or find a work folder and hold its lock while the block runs.
 
-    If a run was killed while it moved its results into place, the rest is moved first.
-
-    Raises:
-      UserError: `path` is a file or a folder of something else, cannot be written, or is in use.
+    If a run was killed while it moved its results into place, the rest is moved first. Raises
+    UserError if `path` is a file or a folder of something else, cannot be written, or is in use.
     """
     with _prepare(path) as lock:
         try:

@@ -24,11 +24,7 @@ Engine: TypeAlias = LocalEngine | RayEngine
 
 
 def chosen_engine(choice: EngineChoice) -> Engine:
-    """The engine that --engine, --workers and --ray-address choose.
-
-    Raises:
-      UserError: an option that the engine does not have, or Ray is not installed.
-    """
+    """The engine that --engine, --workers and --ray-address choose; UserError if they cannot."""
     if choice.workers is not None and choice.workers < 1:
         raise UserError(f"--workers must be at least 1; got {choice.workers}")
     if choice.engine == "local":

@@ -80,12 +80,7 @@ def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
 
 
 def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
-    """Read one image and compute its features.
-
-    Raises:
-      ImageError: the image cannot be read.
-      UserError: it needs more memory than there is.
-    """
+    """Read one image and compute its features; ImageError if it cannot be read."""
     ((_, found),) = extract_images(weights, [image], config=config, execution=ONE_AT_A_TIME)
     if isinstance(found, ImageError):
         raise found
@@ -102,10 +97,7 @@ def extract_images(
     """Yield every image with its features, or with the error if it cannot be read.
 
     Images come batch by batch, and those of one padded size follow each other. The next images are
-    read while a batch is computed.
-
-    Raises:
-      UserError: an image needs more memory than there is.
+    read while a batch is computed. Raises UserError if an image needs more memory than there is.
     """
     execution, images = execution or Execution(), list(images)
     mesh = select_devices(execution)

@@ -108,10 +108,8 @@ def describe_photos(
 def nearest_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
     """Pairs of each name with the `k` nearest others, each pair once, in order of names.
 
-    With fewer than `k` others, all of them are taken. Equally near ones are taken by name.
-
-    Raises:
-      ValueError: k is less than 1.
+    With fewer than `k` others, all of them are taken. Equally near ones are taken by name. Raises
+    ValueError if k is less than 1.
     """
     if k < 1:
         raise ValueError(f"k must be at least 1; got {k}")

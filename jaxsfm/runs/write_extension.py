@@ -106,5 +106,5 @@ def write_extension(extension: PlannedExtension, target: Path) -> RunReport:
         )
     models = extension.models(database, grown)
     write_models(models, target / "sparse")
-    sizes = {name: photos[name].size for name in photos.keys() - new.skipped.keys()}
+    sizes = {name: photos.files[name].size for name in photos.files.keys() - new.skipped.keys()}
     return extended_report(run, models, grown, new, matches, verified, sizes)

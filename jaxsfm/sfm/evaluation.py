@@ -110,11 +110,7 @@ def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, s
 
 
 def read_names(path: Path) -> list[str]:
-    """Read image names from a text file: one on each line. A line that starts with # is a comment.
-
-    Raises:
-      UserError: not text, or no names in it.
-    """
+    """The image names in a text file, one on each line; UserError if there are none."""
     names = [line for _, line in listed_lines(path, "--align-on")]
     if not names:
         raise UserError(f"--align-on {path}: no names in it")

@@ -173,49 +173,37 @@ def _refined(
 ) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
     """Refine the models, if asked for, and colour their points.
 
+    They are refined one after the other, each with the unmapped images that none before took.
+
     Args:
       database: of all images, with those that are in no model.
     """
-    figures: list[RefinementFigures | None] = [None] * len(models)
-    if refinement is not None:
-        cameras = read_images(database)
-        mapped = {name for model in models for name in registered(model)}
-        unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
-        evidence = Evidence(matches, unmapped, options.seed)
-        models, figures = _refine_each(models, photos, refinement, options, evidence, on_pass)
-    for model in models:
-        colour_points(model, photos.rgb)
-    return models, figures
-
-
-def _refine_each(
-    models: "list[pycolmap.Reconstruction]",
-    photos: Photos,
-    refinement: Refinement,
-    options: MapOptions,
-    evidence: Evidence,
-    on_pass: Callable[[], None],
-) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
-    """Refine models one after the other, each with the unmapped images that none before took."""
+    cameras = read_images(database)
+    mapped = {name for model in models for name in registered(model)}
+    unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
+    evidence = Evidence(matches, unmapped, options.seed)
     refined, figures = [], []
     for model in models:
+        new, done = model, None
         try:
-            new, done = refine_model(
-                model,
-                photos.gray,
-                refinement=refinement,
-                refine_intrinsics=options.refine_intrinsics,
-                evidence=evidence,
-                threads=options.threads,
-                on_pass=on_pass,
-            )
+            if refinement is not None:
+                new, done = refine_model(
+                    model,
+                    photos.gray,
+                    refinement=refinement,
+                    refine_intrinsics=options.refine_intrinsics,
+                    evidence=evidence,
+                    threads=options.threads,
+                    on_pass=on_pass,
+                )
         except ImageError as error:  # a photo was deleted since; the mapper's model remains
             logger.warning("no refinement: %s", error)
-            new, done = model, None
         left = [image for image in evidence.unmapped if image.name not in registered(new)]
         evidence = evidence._replace(unmapped=left)
         refined.append(new)
         figures.append(done)
     # Refinement adds and removes images: the first model is again the one with most.
     order = sorted(range(len(refined)), key=lambda k: -refined[k].num_reg_images())
+    for model in refined:
+        colour_points(model, photos.rgb)
     return [refined[k] for k in order], [figures[k] for k in order]

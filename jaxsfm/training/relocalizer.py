@@ -60,8 +60,6 @@ class TrainOptions:
     """Hidden units of the perceptron of each level."""
     learning_rate: float = 0.01
     """The learning rate at the start; it falls to 0 along a cosine."""
-    epipolar_weight: float = 1.0
-    """Weight of the loss of posed pairs, if there are any."""
     seed: int = 0
     objective: Objective = dataclasses.field(default_factory=Objective)
 
@@ -77,8 +75,6 @@ class TrainOptions:
             raise ValueError(f"learning_rate must lie in (0, 1]; got {self.learning_rate}")
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must lie in 0 .. 2147483647; got {self.seed}")
-        if self.epipolar_weight < 0:
-            raise ValueError(f"epipolar_weight must be at least 0; got {self.epipolar_weight}")
 
 
 class State(NamedTuple):
@@ -108,7 +104,7 @@ def train_step(
         value, figures = loss(scores, warped, objective=options.objective)
         if posed is not None:
             of_posed, _ = loss(scores, posed, objective=options.objective, supervision="epipolar")
-            value = value + options.epipolar_weight * of_posed
+            value = value + of_posed
             figures = figures | {"epipolar": of_posed}
         return value, figures
 

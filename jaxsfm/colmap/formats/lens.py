@@ -18,6 +18,11 @@ _FISHEYE = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4
 """COLMAP's camera models, and their numbers of radial terms."""
 
 
+def row_of(values: Iterable[float]) -> str:
+    """Numbers as text that reads back as the same numbers."""
+    return " ".join(repr(float(v)) for v in values)
+
+
 class Lens(NamedTuple):
     """A camera as OpenCV writes it, in COLMAP's pixels (centre of the top-left one (0.5, 0.5)).
 
@@ -86,20 +91,24 @@ def check_one_focal(lens: Lens, to: str) -> None:
         )
 
 
-def check_centred(lens: Lens, to: str) -> None:
-    """Raise UserError if the principal point is not the centre of the image."""
-    off = np.hypot(lens.cx - lens.size[0] / 2, lens.cy - lens.size[1] / 2)
-    if off > TOLERANCE_PX:
-        raise UserError(
-            f"--to {to}: its principal point is the image's centre, but the {lens.model} camera's "
-            f"lies {off:.2f} pixels off"
-        )
+def radial_lens(camera: pycolmap.Camera, to: str, *, centred: bool) -> Lens:
+    """`lens_of`; UserError also for fisheye cameras and tangential distortion.
 
-
-def check_no_tangential(lens: Lens, to: str) -> None:
-    """Raise UserError for fisheye cameras and tangential distortion."""
+    Args:
+      centred: the format has one focal length, and its principal point is the image's centre.
+    """
+    lens = lens_of(camera, to)
     if lens.fisheye or any(lens.tangential):
         raise UserError(f"--to {to}: it has no camera like COLMAP's {lens.model}")
+    if centred:
+        check_one_focal(lens, to)
+        off = np.hypot(lens.cx - lens.size[0] / 2, lens.cy - lens.size[1] / 2)
+        if off > TOLERANCE_PX:
+            raise UserError(
+                f"--to {to}: its principal point is the image's centre, but the {lens.model} "
+                f"camera's lies {off:.2f} pixels off"
+            )
+    return lens
 
 
 def check_no_blanks(names: Iterable[str], to: str) -> None:
@@ -111,14 +120,9 @@ def check_no_blanks(names: Iterable[str], to: str) -> None:
             )
 
 
-class PointTrack(NamedTuple):
-    """A 3-D point and its observations."""
-
-    xyz: np.ndarray
-    colour: tuple[int, int, int]
-    seen: list[tuple[int, int, np.ndarray]]
-    """For each observation the index of the image, that of its keypoint, and (x, y) in COLMAP's
-    pixels. Each image occurs once."""
+Observed = list[tuple[int, int, np.ndarray]]
+"""For each observation of a point the index of the image, that of its keypoint, and (x, y) in
+COLMAP's pixels. Each image occurs once."""
 
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
@@ -133,8 +137,8 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 
 def point_tracks(
     model: pycolmap.Reconstruction, images: list[pycolmap.Image]
-) -> Iterator[tuple[int, PointTrack]]:
-    """The ids and points of a model, in the order of ids, with indices into `images`."""
+) -> Iterator[tuple[int, pycolmap.Point3D, Observed]]:
+    """The points of a model and their ids, in order, and which of the images observe them."""
     index = {image.image_id: k for k, image in enumerate(images)}
     pixels = [
         np.asarray([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
@@ -146,5 +150,4 @@ def point_tracks(
         for element in point.track.elements:
             k = index[element.image_id]
             seen.setdefault(k, (k, element.point2D_idx, pixels[k][element.point2D_idx]))
-        red, green, blue = (int(c) for c in point.color)
-        yield point_id, PointTrack(point.xyz, (red, green, blue), list(seen.values()))
+        yield point_id, point, list(seen.values())

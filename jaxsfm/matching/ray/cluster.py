@@ -39,10 +39,7 @@ def connect(address: str | None) -> Iterator["ModuleType"]:
 
     If this process is connected already, that connection is used. Else it is the cluster at
     `address`, or at RAY_ADDRESS, or the one that runs on this machine, or a new one that lives as
-    long as the block.
-
-    Raises:
-      UserError: Ray is not installed, or there is no cluster at the address.
+    long as the block. Raises UserError if Ray is not installed or no cluster answers.
     """
     ray = import_ray()
     if ray.is_initialized():

@@ -8,10 +8,10 @@ Features travel through the object store of Ray.
 
 import dataclasses
 import functools
+import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import jax
 from jax.sharding import NamedSharding, PartitionSpec
@@ -37,7 +37,6 @@ workers have."""
 TASKS_EACH = 4
 """A worker gets at least so many tasks where there is little to do, so that all workers end at
 about the same time."""
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,9 +67,10 @@ class RayEngine:
             return
         work = ExtractionWork(weights, config, execution or Execution())
         with worker_pool(work, address=self.address, workers=self.workers) as pool:
+            size = _task_size(len(ordered), len(pool), TASK_IMAGES)
             tasks = (
                 Task(some, {image.name: pool.put(_bytes(image)) for image in some})
-                for some in _cut(ordered, _task_size(len(ordered), len(pool), TASK_IMAGES))
+                for some in (ordered[k : k + size] for k in range(0, len(ordered), size))
             )
             yield from pool.results(tasks)
 
@@ -91,7 +91,7 @@ class RayEngine:
         work = MatchingWork(dict(capacities), config, seed, execution or Execution())
         with worker_pool(work, address=self.address, workers=self.workers) as pool:
             blocks = pair_blocks(named, _task_size(len(named), len(pool), TILE * TILE))
-            touched = [_images(block) for block in blocks]
+            touched = [list(dict.fromkeys(itertools.chain(*block))) for block in blocks]
             cache = ImageCache(lambda name: pool.put(load(name)), touched, CACHED_IMAGES)
             tasks = (
                 Task(block, {name: cache.take(name) for name in names})
@@ -111,14 +111,6 @@ def _bytes(image: ImageFile) -> bytes | ImageError:
 def _task_size(count: int, workers: int, most: int) -> int:
     """How many of `count` items make a task."""
     return min(most, max(1, -(-count // (TASKS_EACH * workers))))
-
-
-def _cut(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    return (items[k : k + size] for k in range(0, len(items), size))
-
-
-def _images(pairs: Iterable[Pair]) -> list[str]:
-    return list(dict.fromkeys(name for pair in pairs for name in pair))
 
 
 def pair_blocks(pairs: Sequence[Pair], size: int) -> list[list[Pair]]:

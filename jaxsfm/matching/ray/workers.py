@@ -236,8 +236,7 @@ def worker_pool(
 ) -> Iterator[WorkerPool[Item, Result]]:
     """Start workers that live as long as the block (`worker_resources` says how many).
 
-    Raises:
-      UserError: Ray cannot be used (`connect`), or the cluster has too few CPUs or GPUs.
+    Raises UserError if Ray cannot be used (`connect`), or has too few CPUs or GPUs.
     """
     with connect(address) as ray:
         count, needs = worker_resources(ray, workers)
