@@ -79,12 +79,10 @@ def locate(
 
     Args:
       image: size, pixels and camera of the photo; its pose plays no part.
-      model: a model, or a part of one.
       matches: of the photo with the views, original pixels.
       read: intensities of the photo and of the views, by name.
       own_camera: estimate the focal length too. It is estimated from nothing, unless the camera's
         was known before (`has_prior_focal_length`).
-      seed: for RANSAC in the resection.
     """
     if not len(model.tracks.points):
         return _nowhere(0, matches)
