@@ -131,27 +131,20 @@ class Config:
             raise ValueError(f"max_size must be at least {MIN_SIDE} pixels; got {self.max_size}")
         if not self.enlarge >= 1:
             raise ValueError(f"enlarge must be at least 1; got {self.enlarge}")
-        if not 1 <= self.octaves <= MAX_OCTAVES:
-            raise ValueError(f"octaves must lie in 1..{MAX_OCTAVES}; got {self.octaves}")
-        if not 0 <= self.aligned_octaves <= MAX_OCTAVES:
-            raise ValueError(
-                f"aligned_octaves must lie in 0..{MAX_OCTAVES}; got {self.aligned_octaves}"
-            )
-        if self.backbone not in get_args(BackboneName):
-            raise ValueError(
-                f"backbone must be one of {get_args(BackboneName)}; got {self.backbone!r}"
-            )
+        for name, least in (("octaves", 1), ("aligned_octaves", 0)):
+            count = getattr(self, name)
+            if not least <= count <= MAX_OCTAVES:
+                raise ValueError(f"{name} must lie in {least}..{MAX_OCTAVES}; got {count}")
+        for name, words in (
+            ("backbone", get_args(BackboneName)),
+            ("convolutions", get_args(Convolutions)),
+            ("keypoints", get_args(Keypoints)),
+        ):
+            if getattr(self, name) not in words:
+                raise ValueError(f"{name} must be one of {words}; got {getattr(self, name)!r}")
         if self.keypoints == "learned" and self.backbone != "vgg16":
             raise ValueError(
                 f"keypoints 'learned' are scored from maps of vgg16; got backbone {self.backbone!r}"
-            )
-        if self.convolutions not in ("float32", "bfloat16"):
-            raise ValueError(
-                f"convolutions must be 'float32' or 'bfloat16'; got {self.convolutions!r}"
-            )
-        if self.keypoints not in get_args(Keypoints):
-            raise ValueError(
-                f"keypoints must be one of {get_args(Keypoints)}; got {self.keypoints!r}"
             )
         if not self.threshold_px > 0:
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
@@ -197,11 +190,7 @@ PRESETS: dict[str, Config] = {
 
 
 def preset(name: str) -> Config:
-    """The preset of this name.
-
-    Raises:
-      ValueError: there is no such preset; the message names the presets.
-    """
+    """The preset of this name; ValueError, which names the presets, if there is none."""
     if name not in PRESETS:
         raise ValueError(f"preset must be one of {sorted(PRESETS)}; got {name!r}")
     return PRESETS[name]

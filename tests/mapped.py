@@ -6,8 +6,7 @@ from pathlib import Path
 import pycolmap
 
 from jaxsfm.colmap.mapper import MapOptions, build_models
-from jaxsfm.colmap.two_views import read_two_views
-from jaxsfm.colmap.verification import VerificationOptions, verify
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 
 
 def verified(path: Path, options: MapOptions):

@@ -12,7 +12,7 @@ from jaxsfm.bench.methods import KEYPOINTS, PAIR_ABLATED, method_config
 from jaxsfm.bench.options import PairOptions
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.config import BackboneName, Config
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile

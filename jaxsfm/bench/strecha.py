@@ -20,8 +20,7 @@ from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import model_poses, read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import read_two_views
-from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic

@@ -13,8 +13,7 @@ from jaxsfm.colmap.database import drop_pairs
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import read_two_views
-from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.io.features import ImageFeatures, image_capacity
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.io.weights import chosen_weights

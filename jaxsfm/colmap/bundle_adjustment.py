@@ -1,6 +1,5 @@
 """COLMAP's bundle adjustment of a whole model."""
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
 
 from jaxsfm.colmap.native import native

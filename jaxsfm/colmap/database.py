@@ -2,16 +2,11 @@
 
 Everything is checked before COLMAP sees it, because a match index out of range ends the process in
 native code, and some unset options fail silently.
-
-zlib and cv2 are imported before pycolmap on purpose. pycolmap 4.2.1 brings a zlib of its own. If
-that one is loaded first, every later deflate (zlib.compress, PNG by OpenCV or Pillow) corrupts the
-heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even so, and is not used.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-import cv2  # noqa: F401  must precede pycolmap, see above
 import numpy as np
 import pycolmap
 
@@ -58,11 +53,7 @@ def _united(rows: Iterable[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, 
 
 
 def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
-    """The results, one by one.
-
-    Raises:
-      ValueError: a result on which COLMAP would end the process.
-    """
+    """The results, one by one; ValueError for one on which COLMAP would end the process."""
     for pair, result in results.items():
         if pair != result.pair:
             raise ValueError(f"pair {describe(pair)} holds the result of {describe(result.pair)}")
@@ -75,12 +66,9 @@ def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
 
 
 def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Camera:
-    """The camera of a photo.
+    """The camera of a photo; UserError if COLMAP does not accept it.
 
     Without intrinsics, its focal length comes from EXIF, or is 1.2 x the longer side of the photo.
-
-    Raises:
-      UserError: COLMAP does not accept the camera.
     """
     if intrinsics is not None:
         camera = intrinsics.camera(image.size)

@@ -4,13 +4,11 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.database import PIXEL_OFFSET, read_images
-from jaxsfm.colmap.two_views import read_two_views
-from jaxsfm.colmap.verification import VerificationOptions, verify
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
@@ -39,10 +37,7 @@ def add_images(
 
 
 def copy_database(source: Path, target: Path, matches: int) -> None:
-    """Copy a database to which matches will be added.
-
-    Args:
-      matches: how many will be added.
+    """Copy a database to which `matches` matches will be added.
 
     Raises:
       UserError: the copy, the copy that `add_matches` makes, and SQLite's journal do not fit on the

@@ -4,7 +4,7 @@ import dataclasses
 import logging
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from jaxsfm.colmap.formats.tables import CameraRow, Tables, one_to_one
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.hashes import sha256_of
 from jaxsfm.io.images import ImageFile, shown_name
 from jaxsfm.io.pairs import LazyMatches, Pair, PairCounts, PairResult
@@ -26,20 +27,6 @@ FOCAL_RATIO = 1.1
 """Focal lengths may differ by this factor, because EXIF knows them to a few percent."""
 
 
-class ExternalFiles(TypedDict):
-    """Where external matches came from, for the report of a run."""
-
-    files: list[str]
-    sha256: list[str]
-    verified: bool
-    """The files hold two-view inliers, and these are used."""
-    images: int
-    ignored: list[str]
-    """Images that are not among the photos."""
-    pairs: int
-    matches: int
-
-
 class ExternalMatches(NamedTuple):
     """Matches that another tool made."""
 
@@ -47,8 +34,8 @@ class ExternalMatches(NamedTuple):
     """By image name float32 (n, 2), original pixels, centre of the top-left pixel (0, 0)."""
     matches: dict[Pair, np.ndarray]
     """int32 (m, 2): indices of keypoints, one to one."""
-    about: ExternalFiles | None
-    """None where there are no external matches."""
+    about: dict[str, Json] | None
+    """Where they came from, as plain JSON (`jaxsfm.report.run_inputs.UsedExternalMatches`)."""
 
     def result(self, pair: Pair) -> PairResult:
         """The matches of a pair, in the form of ours. They are on no plane."""
@@ -143,15 +130,15 @@ def _checked(
         for pair, rows in sorted((tables.inliers or tables.matches).items())
         if pair[0] in keypoints and pair[1] in keypoints
     }
-    about = ExternalFiles(
-        files=[str(path.absolute()) for path in files],
-        sha256=[sha256_of(path) for path in files],
-        verified=bool(tables.inliers),
-        images=len(keypoints),
-        ignored=ignored,
-        pairs=len(matches),
-        matches=sum(map(len, matches.values())),
-    )
+    about: dict[str, Json] = {
+        "files": [str(path.absolute()) for path in files],
+        "sha256": [sha256_of(path) for path in files],
+        "verified": bool(tables.inliers),
+        "images": len(keypoints),
+        "ignored": ignored,
+        "pairs": len(matches),
+        "matches": sum(map(len, matches.values())),
+    }
     return ExternalMatches(keypoints, matches, about)
 
 

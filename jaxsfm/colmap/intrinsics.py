@@ -7,7 +7,6 @@ COLMAP model count them as COLMAP does, where that centre is (0.5, 0.5).
 import dataclasses
 from pathlib import Path
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
@@ -20,7 +19,6 @@ class Intrinsics:
     """One camera for all images."""
 
     model: str
-    """Name of a COLMAP camera model."""
     params: tuple[float, ...]
     """Parameters of the COLMAP model, in COLMAP's pixels."""
 
@@ -69,8 +67,7 @@ def _from_matrix(path: Path) -> Intrinsics:
 def parse_intrinsics(text: str) -> Intrinsics:
     """Read intrinsics from the path of a K.txt, or from `MODEL:p1,p2,...` (a COLMAP camera model).
 
-    Raises:
-      UserError: the text is neither, or its numbers make no camera.
+    Raises UserError if the text is neither, or its numbers make no camera.
     """
     model, colon, params = text.partition(":")
     models = set(pycolmap.CameraModelId.__members__) - {"INVALID", "EQUIRECTANGULAR"}
@@ -99,13 +96,10 @@ def parse_intrinsics(text: str) -> Intrinsics:
 
 
 def check_fits(intrinsics: Intrinsics, sizes: dict[str, tuple[int, int]]) -> None:
-    """Check that one camera fits images: they have one size, and hold its principal point.
+    """Raise UserError unless all images have one size and hold the camera's principal point.
 
     Args:
       sizes: image name -> (width, height).
-
-    Raises:
-      UserError: it does not fit.
     """
     by_size: dict[tuple[int, int], list[str]] = {}
     for name, size in sizes.items():

@@ -9,9 +9,9 @@ import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
 
+from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.native import native
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.io.pairs import Pair, component_of
@@ -130,7 +130,6 @@ def build_models(
     models of other images.
 
     Args:
-      two_views: the pairs of the database.
       on_image: called for every image that the incremental mapper registers.
 
     Returns:
@@ -168,12 +167,6 @@ def _attempt(mapper: Mapper, pair: Pair | None, models: list[pycolmap.Reconstruc
     )
 
 
-def _image_ids(database: Path, pair: Pair) -> tuple[int, int]:
-    with pycolmap.Database.open(database) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-    return ids[pair[0]], ids[pair[1]]
-
-
 def _run(
     database: Path, options: MapOptions, initial: Pair | None, on_image: Callable[[], None]
 ) -> list[pycolmap.Reconstruction]:
@@ -189,7 +182,8 @@ def _run(
             return _order(list(found.values()))
         p = _incremental_options(options)
         if initial is not None:
-            p.init_image_id1, p.init_image_id2 = _image_ids(database, initial)
+            images = read_images(database)
+            p.init_image_id1, p.init_image_id2 = (images[name][0] for name in initial)
             p.multiple_models = (
                 False  # otherwise COLMAP starts every model from this pair, 50 times
             )

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Collection, Mapping
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 

@@ -11,7 +11,6 @@ Layout: COLMAP 4, src/colmap/scene/reconstruction_io.cc; all little-endian.
 import struct
 from pathlib import Path
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 

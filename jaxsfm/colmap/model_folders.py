@@ -1,24 +1,19 @@
 """COLMAP models on disk, and the colours of their points."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageError
+from jaxsfm.io.photos import Reader
 
 
 def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
-    """Write models into `folder`/0 (the best one), 1, 2, ... The folder is replaced.
-
-    Raises:
-      UserError: the disk is full.
-    """
+    """Write models into `folder`/0 (the best one), 1, 2, ... The folder is replaced."""
     shutil.rmtree(folder, ignore_errors=True)
     for index, model in enumerate(models):
         target = folder / str(index)
@@ -50,16 +45,10 @@ def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
     return models
 
 
-def colour_points(
-    model: pycolmap.Reconstruction,
-    read_rgb: Callable[[str], tuple[np.ndarray, tuple[float, float]]],
-) -> None:
+def colour_points(model: pycolmap.Reconstruction, read_rgb: Reader) -> None:
     """Give every 3-D point the mean colour of its observations, in place.
 
     A photo that cannot be read any more is left out.
-
-    Args:
-      read_rgb: image name -> uint8 (h, w, 3), and original pixels per pixel, (x, y).
     """
     total: dict[int, np.ndarray] = {}
     for image_id in sorted(model.reg_image_ids()):

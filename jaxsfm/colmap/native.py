@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
 
 from jaxsfm.errors import UserError
@@ -13,7 +12,6 @@ from jaxsfm.io import interrupt
 
 T = TypeVar("T")
 THREAD = "jaxsfm-colmap"
-"""Name of the thread that COLMAP runs in."""
 
 
 def native(

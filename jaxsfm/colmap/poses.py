@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
@@ -49,11 +48,7 @@ def _read_strecha(path: Path) -> CameraPose:
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
-    """Read the COLMAP model (binary or text) in a folder.
-
-    Raises:
-      UserError: no readable model.
-    """
+    """Read the COLMAP model (binary or text) in a folder. Raises UserError if there is none."""
     try:
         if (path / "images.bin").is_file():
             check_binary(path)
@@ -74,11 +69,7 @@ def _has_model(path: Path) -> bool:
 
 
 def find_model(path: Path) -> Path:
-    """Find the model in the results of a run, or in a folder that is a model itself.
-
-    Raises:
-      UserError: there is none.
-    """
+    """The model's folder: this one, or one in a run's results; UserError if there is none."""
     for sub in ("", "sparse/0", "sparse"):
         if _has_model(path / sub):
             return path / sub
@@ -89,7 +80,6 @@ def read_poses(path: Path, *, option: str = "--reference") -> Poses:
     """Read reference poses: Strecha `.camera` files or a COLMAP model, in the folder or below it.
 
     Args:
-      path: the folder.
       option: the option that names it, for messages.
 
     Raises:

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
@@ -31,7 +30,6 @@ def adjust_view(
     Args:
       xy: float64 (n, 2), where the view shows the points, working pixels.
       points: float64 (n, 3), world units.
-      refine_focal_length: also adjust the focal length.
 
     Returns:
       None if the solver fails.
@@ -65,7 +63,6 @@ def find_view(
     Args:
       xy, points: as in `adjust_view`; some of them may be wrong.
       max_error_px: the largest reprojection error of an inlier, working pixels.
-      estimate_focal_length: find the focal length too.
 
     Returns:
       None if no pose is found.

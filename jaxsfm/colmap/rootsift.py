@@ -4,12 +4,11 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import pycolmap
 
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.native import native
-from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair
@@ -30,7 +29,6 @@ def write_rootsift_database(
     images; otherwise one per image, from EXIF or with 1.2 x the longer side as focal length.
 
     Args:
-      folder: the images' folder.
       verification: its threads are those of extraction and matching too. Pairs with fewer matches
         or inliers than its `min_inliers` are emptied.
       pairs: those to match; None: all.

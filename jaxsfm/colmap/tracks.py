@@ -61,11 +61,7 @@ class Tracks(NamedTuple):
         return Tracks(self.points, self.point[keep], self.view[keep], self.xy[keep])
 
     def select_points(self, rows: np.ndarray) -> "Tracks":
-        """Keep only some points and their observations.
-
-        Args:
-          rows: int, indices of the points, ascending.
-        """
+        """Keep only some points (their indices, ascending) and their observations."""
         place = np.full(len(self.points), -1)
         place[rows] = np.arange(len(rows))
         keep = np.flatnonzero(place[self.point] >= 0)

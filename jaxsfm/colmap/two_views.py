@@ -1,4 +1,4 @@
-"""The results of COLMAP's two-view verification, read from a database."""
+"""COLMAP's two-view verification of the matches in a database, and its results."""
 
 import dataclasses
 from pathlib import Path
@@ -8,10 +8,54 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.database import PIXEL_OFFSET
+from jaxsfm.colmap.native import native
 from jaxsfm.io.pairs import Pair
 
 PLANAR = (4, 6)
 """The numbers of COLMAP's two-view configurations PLANAR and PLANAR_OR_PANORAMIC."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VerificationOptions:
+    """Settings of COLMAP's two-view verification."""
+
+    seed: int = 0
+    threads: int = -1
+    """-1 takes all cores."""
+    scale: float = 1.0
+    """Original pixels per working pixel. COLMAP's 4 px are multiplied by it."""
+    relative_poses: bool = True
+    """Also find the relative pose of every pair, which the view graph needs."""
+    min_inliers: int | None = None
+    """A pair with fewer inliers has none; None: COLMAP's 15."""
+
+    def for_colmap(self) -> pycolmap.TwoViewGeometryOptions:
+        """As COLMAP takes them."""
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.random_seed = self.seed
+        options.ransac.max_error *= self.scale
+        options.compute_relative_pose = self.relative_poses
+        if self.min_inliers is not None:
+            options.min_num_inliers = self.min_inliers
+        return options
+
+
+def verify(path: Path, options: VerificationOptions) -> None:
+    """Run COLMAP's own two-view verification on all pairs of a database (paper, section 4).
+
+    Cameras with a known or prior focal length are verified as calibrated (essential matrices).
+    """
+    verifier = pycolmap.GeometricVerifierOptions()
+    verifier.num_threads = options.threads
+    native(
+        lambda token: pycolmap.geometric_verification(
+            path,
+            verifier_options=verifier,
+            two_view_geometry_options=options.for_colmap(),
+            cancellation_token=token,
+        ),
+        path,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,14 +69,10 @@ class PairGeometry:
     """Share of the image that the inliers cover, 0 .. 1; the smaller of the two images' shares."""
 
 
-def spread(xy: np.ndarray, size: tuple[int, int], *, cells: int = 8) -> float:
-    """The share of a cells x cells grid over the image in which there is at least one point.
-
-    Args:
-      xy: float (n, 2), pixels of an image of `size` (width, height).
-    """
-    at = np.floor((xy + 0.5) / np.asarray(size) * cells).astype(int).clip(0, cells - 1)
-    return len(np.unique(at[:, 1] * cells + at[:, 0])) / cells**2
+def spread(xy: np.ndarray, size: tuple[int, int]) -> float:
+    """The share of an 8 x 8 grid over an image (width, height) that has points, pixels (n, 2)."""
+    at = np.floor((xy + 0.5) / np.asarray(size) * 8).astype(int).clip(0, 7)
+    return len(np.unique(at[:, 1] * 8 + at[:, 0])) / 64
 
 
 class TwoView(NamedTuple):
@@ -55,12 +95,9 @@ def rays_of(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:
 
 
 def read_two_views(path: Path) -> dict[Pair, TwoView]:
-    """Read every pair that has inliers.
+    """Every pair that has inliers, by pair of image names in order.
 
     Relative poses are known if `verify` was asked for them.
-
-    Returns:
-      by pair of image names, in order.
     """
     with pycolmap.Database.open(path) as db:
         images = {image.image_id: image for image in db.read_all_images()}

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 

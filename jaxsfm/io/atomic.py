@@ -16,7 +16,7 @@ from typing import BinaryIO, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxsfm.errors import UserError
+from jaxsfm.errors import UserError, writing
 
 Json: TypeAlias = Mapping[str, "Json"] | Sequence["Json"] | str | int | float | bool | None
 """What `json.dumps` writes. What `json.loads` returns is a dict, a list or one of the others."""
@@ -32,21 +32,20 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing; it takes the place of `path` when the block ends.
 
     Until then its bytes are in a file of another name. Data that the system has not written to the
-    disk yet may be lost if power fails; `write_atomic` waits for them.
-
-    Raises:
-      UserError: the file cannot be written (for example: no permission, or the disk is full).
+    disk yet may be lost if power fails; `write_atomic` waits for them. Raises UserError if the file
+    cannot be written.
     """
     # The process id keeps two processes from writing the same partial file.
     partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
-    try:
-        with partial.open("wb") as file:
-            yield file
-        os.replace(partial, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+    with writing(path):
+        try:
+            with partial.open("wb") as file:
+                yield file
+            os.replace(partial, path)
+        except OSError:
+            with contextlib.suppress(OSError):
+                partial.unlink()
+            raise
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -61,15 +60,10 @@ def save_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
     """Write arrays into an .npz file.
 
     This does not wait for the disk, so a power failure may tear the file. The zip format carries
-    checksums; `load_arrays` treats a torn file as absent.
-
-    Raises:
-      UserError: the file or its folder cannot be written.
+    checksums; `load_arrays` treats a torn file as absent. Raises UserError if it cannot be written.
     """
-    try:
+    with writing(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{path.parent}: cannot be written ({error.strerror})") from error
     with atomic_file(path) as file:
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]  names are no options
 
@@ -110,17 +104,10 @@ def read_json(path: Path) -> Json:
 
 
 def check_disk_space(folder: Path, needed: int) -> None:
-    """Refuse to start what would not fit on the disk.
+    """Raise UserError if less than `needed` bytes are free on the disk of an existing folder.
 
     COLMAP does not survive a full disk: it ends the process when its database cannot grow, and it
     writes models that are cut off.
-
-    Args:
-      folder: an existing folder on the disk in question.
-      needed: the space that will be used, bytes.
-
-    Raises:
-      UserError: there is less space; the message gives both numbers.
     """
     free = shutil.disk_usage(folder).free
     if free < needed:

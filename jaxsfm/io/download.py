@@ -8,7 +8,6 @@ import contextlib
 import fcntl
 import lzma
 import os
-import shutil
 import tarfile
 import tempfile
 import zipfile
@@ -21,10 +20,9 @@ import pooch
 import requests
 from tqdm import tqdm
 
-from jaxsfm.errors import UserError
+from jaxsfm.errors import UserError, writing
 
 CHUNK = 1 << 16
-"""Bytes that are read at once."""
 TIMEOUT = (10, 60)
 """The longest time to wait for the connection, and between two parts of a file, seconds."""
 OnBytes = Callable[[int, int | None], None]
@@ -108,27 +106,19 @@ def download(
     """Download a file, unless it is there already with the right hash.
 
     Args:
-      url: the address of the file.
-      path: the file to write.
       known_hash: "sha256:..." or "md5:..."; with None any content is accepted, and a file that is
         there already is kept.
-      on_bytes: is told how many bytes have been received.
 
     Returns: `path`.
 
     Raises:
       UserError: the file cannot be downloaded, cannot be written, or has another hash.
     """
+    pooch.get_logger().disabled = True  # else pooch announces every file
+    downloader = _Resuming(path.with_name(path.name + ".part"), on_bytes)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pooch.get_logger().disabled = True  # else pooch announces every file
-        pooch.retrieve(
-            url,
-            known_hash,
-            fname=path.name,
-            path=path.parent,
-            downloader=_Resuming(path.with_name(path.name + ".part"), on_bytes),  # pyright: ignore[reportArgumentType]
-        )
+        pooch.retrieve(url, known_hash, path.name, path.parent, downloader=downloader)  # pyright: ignore[reportArgumentType]
     except requests.RequestException as error:
         raise UserError(
             f"{url}: cannot be downloaded ({_reason(error)}); give the same command again, or "
@@ -169,28 +159,26 @@ def _reason(error: requests.RequestException) -> str:
 def unpack(archive: Path, folder: Path) -> None:
     """Unpack a zip or tar archive into a folder, beside the files that are there.
 
-    If the archive is damaged, nothing is written.
-
-    Raises:
-      UserError: the archive cannot be unpacked, or it would write outside the folder.
+    If the archive is damaged or would write outside the folder, UserError is raised and nothing is
+    written.
     """
-    fresh = Path(tempfile.mkdtemp(prefix=".unpacking-", dir=folder))
-    try:
-        if zipfile.is_zipfile(archive):
-            with zipfile.ZipFile(archive) as opened:
-                opened.extractall(fresh)  # zipfile removes ".." and roots from the names
-        else:
-            with tarfile.open(archive) as opened:
-                opened.extractall(fresh, filter="data")
+    scratch = tempfile.TemporaryDirectory(
+        prefix=".unpacking-", dir=folder, ignore_cleanup_errors=True
+    )
+    with writing(folder), scratch as name:
+        fresh = Path(name)
+        try:
+            if zipfile.is_zipfile(archive):
+                with zipfile.ZipFile(archive) as opened:
+                    opened.extractall(fresh)  # zipfile removes ".." and roots from the names
+            else:
+                with tarfile.open(archive) as opened:
+                    opened.extractall(fresh, filter="data")
+        except _DAMAGED as error:
+            raise UserError(f"{archive}: cannot be unpacked ({error})") from error
         for path in sorted(fresh.rglob("*")):
             target = folder / path.relative_to(fresh)
             if path.is_dir():
                 target.mkdir(exist_ok=True)
             else:
                 os.replace(path, target)
-    except _DAMAGED as error:
-        raise UserError(f"{archive}: cannot be unpacked ({error})") from error
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)

@@ -127,9 +127,7 @@ def check_memory(image: ImageFile, at_once: int = 1, *, config: Config) -> None:
     """Refuse an image whose features do not fit into memory, before the system kills the process.
 
     Args:
-      image: the image.
       at_once: the number of such images that are computed together.
-      config: it says the working size.
 
     Raises:
       UserError: there is too little memory; the message gives both numbers.

@@ -7,17 +7,13 @@ from pathlib import Path
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file's content, hexadecimal; the file is read in parts.
-
-    Raises:
-      OSError: the file cannot be read.
-    """
+    """The SHA-256 of a file's content, hexadecimal; the file is read in parts."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def rows_sha256(database: Path) -> str:
-    """Return the SHA-256 of every row of every table of an SQLite database, hexadecimal.
+    """The SHA-256 of every row of every table of an SQLite database, hexadecimal.
 
     The file's own hash is of no use: COLMAP writes into a database's header whenever it opens it.
 

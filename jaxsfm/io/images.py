@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -62,8 +63,7 @@ class ImageFile:
         return int(self.sha256[:8], 16)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WorkingImage:
+class WorkingImage(NamedTuple):
     """The pixels of an image at working size."""
 
     rgb: np.ndarray
@@ -73,9 +73,7 @@ class WorkingImage:
 
 
 def find_images(folder: Path) -> list[str]:
-    """Return the names of the image files in a folder and its sub-folders, sorted.
-
-    Hidden files and folders are left out.
+    """The names of the image files in a folder and its sub-folders, sorted, without hidden ones.
 
     Raises:
       UserError: there is no such folder, it cannot be read, or it holds no images.
@@ -110,7 +108,6 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     """Check an image file and find its size and hash, without decoding it.
 
     Args:
-      path: the file.
       name: the image's name; None takes the name of the file.
 
     Raises:
@@ -142,7 +139,9 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
         raise ImageError(
             f"{shown}: {size[0]} x {size[1]} pixels is too small (at least {MIN_SIDE} per side)"
         )
-    _check_complete(data, shown)
+    # Decoders would fill the missing part of a JPEG with grey and not say so.
+    if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
+        raise ImageError(f"{shown}: the file is truncated")
     digest = hashlib.sha256(data).hexdigest()
     return ImageFile(name=name or path.name, path=path, size=size, sha256=digest)
 
@@ -180,12 +179,6 @@ def _jpeg_is_complete(data: bytes) -> bool:
     return data[position : position + 2] == b"\xff\xd9"
 
 
-def _check_complete(data: bytes, shown: str) -> None:
-    """Refuse a truncated JPEG; decoders would fill the missing part with grey and not say so."""
-    if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
-        raise ImageError(f"{shown}: the file is truncated")
-
-
 @contextlib.contextmanager
 def _any_size() -> Iterator[None]:
     """Let Pillow read the header of an image of any size; `_decode` has a limit of its own."""
@@ -200,10 +193,8 @@ def _any_size() -> Iterator[None]:
 def image_bytes(image: ImageFile) -> bytes:
     """Read the bytes of an image file, which must be those that were inspected.
 
-    Results are stored under the hash of the file, so they must not be made from other bytes.
-
-    Raises:
-      ImageError: the file cannot be read, or it has changed since it was inspected.
+    Results are stored under the hash of the file, so they must not be made from other bytes. Raises
+    ImageError if the file cannot be read or has changed.
     """
     try:
         data = image.path.read_bytes()
@@ -257,11 +248,8 @@ def working_size(size: tuple[int, int], max_size: int, enlarge: float = 1.0) -> 
 def read_image(image: ImageFile, *, max_size: int, enlarge: float = 1.0) -> WorkingImage:
     """Decode an image and resize it to its working size (`working_size`).
 
-    Images in grey, with alpha, with 16 bits or in CMYK are converted to RGB with 8 bits.
-
-    Raises:
-      ImageError: the file cannot be decoded, or a side of the working image is shorter than
-        `MIN_SIDE`.
+    Images in grey, with alpha, with 16 bits or in CMYK are converted to RGB with 8 bits. Raises
+    ImageError if the file cannot be decoded, or a side would be shorter than `MIN_SIDE`.
     """
     rgb = _decode(image)
     width, height = working_size(image.size, max_size, enlarge)

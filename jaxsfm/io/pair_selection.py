@@ -18,7 +18,6 @@ class PairSelection(NamedTuple):
     """The parts of a value of `--pairs`."""
 
     exhaustive: bool = False
-    """All pairs are selected."""
     files: tuple[Path, ...] = ()
     """Files that list pairs."""
     sequential: int = 0
@@ -30,8 +29,7 @@ class PairSelection(NamedTuple):
 def parse_pair_selection(text: str) -> PairSelection:
     """Parse a value of `--pairs`. If a file of this name exists, the value is that file.
 
-    Raises:
-      UserError: a part is neither a file nor one of the known words, or its number is wrong.
+    Raises UserError if a part is neither a file nor one of the known words, or its number is wrong.
     """
     parts = [text] if os.path.isfile(text) else text.split("+")
     selection = PairSelection()
@@ -76,7 +74,6 @@ def selected_pairs(
     """Return the selected pairs, without those of retrieval, which needs to look at the photos.
 
     Args:
-      selection: what is selected.
       names: the images that can be used.
       known: the images that a file may name.
 

@@ -5,7 +5,7 @@ import dataclasses
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 
+Name = TypeVar("Name", str, int)
 Pair = tuple[str, str]
 """The names of two images; the first one sorts before the second."""
 
@@ -60,13 +61,7 @@ class PairResult:
 
 
 class LazyMatches(Mapping[Pair, PairResult]):
-    """The matches of many pairs, of which each is made when it is asked for and not kept.
-
-    A subclass defines `_load`.
-
-    Args:
-      pairs: the pairs, in the order in which the mapping lists them.
-    """
+    """The matches of `pairs`, in their order. Each is made (`_load`) when it is asked for."""
 
     def __init__(self, pairs: Iterable[Pair]) -> None:
         self._pairs = dict.fromkeys(pairs)
@@ -100,8 +95,8 @@ class PairCounts(NamedTuple):
     status: Status
 
 
-def make_pair(a: str, b: str) -> Pair:
-    """Return two names as a pair, in order."""
+def make_pair(a: Name, b: Name) -> tuple[Name, Name]:
+    """Two names as a pair, in order."""
     return (a, b) if a <= b else (b, a)
 
 
@@ -124,6 +119,20 @@ def _split(line: str, known: set[str]) -> Pair | None:
     return (parts[0], parts[1]) if len(parts) == 2 else None
 
 
+def listed_lines(path: Path, option: str) -> list[tuple[int, str]]:
+    """The stripped lines of a text file, with their numbers, without comments (#) and empty ones.
+
+    Raises:
+      UserError: the file that the option names cannot be read as text.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{option} {path}: cannot be read as text") from error
+    stripped = enumerate(map(str.strip, lines), start=1)
+    return [(k, line) for k, line in stripped if line and not line.startswith("#")]
+
+
 def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
     """Read pairs from a text file that has two names on each line, separated by a blank or a tab.
 
@@ -131,7 +140,6 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
     or starts with # cannot be written in such a file.
 
     Args:
-      path: the file.
       known: the names of the images in the folder.
 
     Returns: the pairs, sorted, each once.
@@ -141,15 +149,8 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
         no pairs in it.
     """
     names = set(known)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--pairs {path}: cannot be read as text") from error
     pairs = set()
-    for number, line in enumerate(lines, start=1):
-        line = line.strip()
-        if not line or line.startswith("#"):
-            continue
+    for number, line in listed_lines(path, "--pairs"):
         cut = _split(line, names)
         if cut is None:
             raise UserError(f"--pairs {path} line {number}: expected two image names; got {line!r}")
@@ -165,14 +166,12 @@ def read_pairs(path: Path, known: Iterable[str]) -> list[Pair]:
 
 
 def best_pairs(num_inliers: Mapping[Pair, int], n: int) -> set[Pair]:
-    """Return the union over all images of an image's n pairs with the most inliers.
+    """The union over all images of an image's n pairs with the most inliers.
 
     A pair is kept if it is among the best of *either* image. So the result does not depend on the
     order of the images; the paper's code keeps (i, j) only if j is in the list of the
-    lower-numbered i. Pairs without inliers are never kept. Equal counts are decided by name.
-
-    Raises:
-      ValueError: n is less than 1.
+    lower-numbered i. Pairs without inliers are never kept. Equal counts are decided by name. Raises
+    ValueError if n is less than 1.
     """
     if n < 1:
         raise ValueError(f"n must be at least 1; got {n}")

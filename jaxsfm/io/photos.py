@@ -1,7 +1,7 @@
 """The photos of a run and the readers of their pixels at working size."""
 
 import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -21,45 +21,28 @@ def intensities(rgb: np.ndarray) -> np.ndarray:
     return rgb.astype(np.float32) @ LUMA
 
 
-class Photos(Mapping[str, ImageFile]):
-    """Image files by name, in the given order, and the size at which they are worked on.
+class Photos:
+    """Image files by name, and the size at which they are worked on.
 
     The reading methods raise ImageError if a file cannot be decoded or has changed.
     """
 
     def __init__(self, files: Iterable[ImageFile], config: Config) -> None:
         """Photos whose working size is given by `config.max_size` and `config.enlarge`."""
-        self._files = {file.name: file for file in files}
-        self._config = config
+        self.files = {file.name: file for file in files}
+        self._limits = config.max_size, config.enlarge
         # The cache belongs to the object, so that its images go when the object goes.
         self.gray = functools.lru_cache(maxsize=GRAYS)(self._gray)
 
-    def __getitem__(self, name: str) -> ImageFile:
-        return self._files[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._files)
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def working_size(self, name: str) -> tuple[int, int]:
-        """(width, height) of the working image."""
-        return working_size(self[name].size, self._config.max_size, self._config.enlarge)
-
     def median_scale(self) -> float:
         """The median over the photos of original pixels per working pixel, on the longer side."""
-        ratios = [max(self[name].size) / max(self.working_size(name)) for name in self]
-        return float(np.median(ratios))
+        sizes = [file.size for file in self.files.values()]
+        return float(np.median([max(s) / max(working_size(s, *self._limits)) for s in sizes]))
 
-    def read(self, name: str) -> WorkingImage:
-        """The working image."""
-        return read_image(self[name], max_size=self._config.max_size, enlarge=self._config.enlarge)
-
-    def rgb(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
+    def rgb(self, name: str) -> WorkingImage:
         """Colours uint8 (h, w, 3) of the working image; original pixels per working pixel."""
-        working = self.read(name)
-        return working.rgb, working.scale
+        max_size, enlarge = self._limits
+        return read_image(self.files[name], max_size=max_size, enlarge=enlarge)
 
     def _gray(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
         """Intensities float32 (h, w) of the working image; original pixels per working pixel."""

@@ -29,17 +29,12 @@ class Relocalizer:
     params: Parameters
     """{'params': {level: the fields of `jaxsfm.core.scores.Head` by name}}, float32."""
     sha256: str
-    """The SHA-256 of the file."""
     about: dict[str, Json]
     """The metadata of the file: how the parameters were made."""
 
 
 def save_relocalizer(path: Path, params: Parameters, about: Mapping[str, Json]) -> None:
-    """Write the parameters of `Scores`. The same parameters always give the same bytes.
-
-    Raises:
-      UserError: the file cannot be written.
-    """
+    """Write the parameters of `Scores`. The same parameters always give the same bytes."""
     tensors = {
         f"{level}.{part}": params["params"][level][part]
         for level in WALKED
@@ -49,11 +44,7 @@ def save_relocalizer(path: Path, params: Parameters, about: Mapping[str, Json]) 
 
 
 def load_relocalizer(path: Path) -> Relocalizer:
-    """Read and check a relocalizer.
-
-    Raises:
-      UserError: there is no such file, or it is not a relocalizer.
-    """
+    """Read and check a relocalizer. Raises UserError if the file is none, or cannot be read."""
     with open_tensors(
         path, marker=FORMAT, what="relocalizer", made_by="jaxsfm train relocalizer"
     ) as file:

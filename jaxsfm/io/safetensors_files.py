@@ -27,8 +27,6 @@ def save_tensors(
     """Write arrays as float32. The same arrays always give the same bytes.
 
     Args:
-      path: the file.
-      tensors: the arrays by name.
       marker: the name and version of the format; `about` is kept under it.
       about: what the arrays are and where they come from.
 
@@ -64,11 +62,7 @@ class TensorFile:
             )
 
     def read(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Read an array, which must be float32, have this shape, and hold finite values.
-
-        Raises:
-          UserError: the array is missing or is not like that.
-        """
+        """A float32 array of this shape and of finite values. Raises UserError if it is none."""
         self.check(name, shape)
         array = self._file.get_tensor(name)
         if not np.isfinite(array).all():
@@ -90,8 +84,6 @@ def open_tensors(path: Path, *, marker: str, what: str, made_by: str) -> Iterato
     """Open a file that `save_tensors` wrote.
 
     Args:
-      path: the file.
-      marker: the name and version of its format.
       what: what the file is, in words, for messages.
       made_by: the command that makes such files, for messages.
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Array
-from numpy.typing import ArrayLike
 
 from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
@@ -42,9 +41,7 @@ def digest(*parts: Json) -> str:
 class Store:
     """Features, matches and descriptors in a folder, each in its own file.
 
-    Args:
-      path: the work folder.
-      identity: what the run depends on; it decides which files belong to the run.
+    The identity says what the run depends on. It decides which files belong to the run.
     """
 
     def __init__(self, path: Path, identity: Identity) -> None:
@@ -115,23 +112,18 @@ class Store:
 
     # -- descriptors of whole photos: they are small and stay ------------------------------------
 
-    def save_descriptor(self, image: ImageFile, kind: str, arrays: Mapping[str, ArrayLike]) -> None:
-        """Save the arrays that describe a photo as a whole.
+    def save_descriptor(self, image: ImageFile, kind: str, array: np.ndarray) -> None:
+        """Save the array that describes a photo as a whole; UserError if it cannot be written.
 
         Args:
-          image: the photo.
           kind: the name of the description, followed by all that it depends on besides the photo,
             the weights and jaxsfm's version.
-          arrays: the arrays by name.
-
-        Raises:
-          UserError: they cannot be written.
         """
-        save_arrays(self._file("descriptors", kind, image.sha256), arrays)
+        save_arrays(self._file("descriptors", kind, image.sha256), {"array": array})
 
-    def load_descriptor(self, image: ImageFile, kind: str) -> dict[str, np.ndarray] | None:
-        """The arrays that were saved, or None if the file is missing or damaged."""
-        return load_arrays(self._file("descriptors", kind, image.sha256))
+    def load_descriptor(self, image: ImageFile, kind: str) -> np.ndarray | None:
+        """The array that was saved, or None if the file is missing or damaged."""
+        return (load_arrays(self._file("descriptors", kind, image.sha256)) or {}).get("array")
 
     # -- photos that could not be decoded --------------------------------------------------------
 

@@ -47,11 +47,10 @@ class ConvertedWeights(NamedTuple):
     about: dict[str, Json]
     """The metadata: where the weights come from."""
     sha256: str
-    """The SHA-256 of the file."""
 
 
 def preprocessing_numbers(p: Preprocessing) -> tuple[float, ...]:
-    """Return the seven numbers of a preprocessing: scale, mean and standard deviation."""
+    """The seven numbers of a preprocessing: scale, mean and standard deviation."""
     return (p.scale, *p.mean, *p.std)
 
 
@@ -68,12 +67,8 @@ def save_weights(
     """Write converted weights. The same weights always give the same bytes.
 
     Args:
-      path: the file.
       layers: {layer: {'kernel': HWIO, input channels RGB, 'bias': O}}.
       extras: those of `EXTRAS` that there are.
-      architecture: a key of `ARCHITECTURES`.
-      family: one of `FAMILIES`.
-      preprocessing: what must be done with an image.
       about: where the weights come from; the entry `source` is the name of a file.
 
     Raises:
@@ -97,7 +92,6 @@ def read_converted(path: Path, *, shapes: Shapes | None = None) -> ConvertedWeig
     """Read and check converted weights. Of the extras only the shapes are checked.
 
     Args:
-      path: the file.
       shapes: the channels of the layers; None takes those of the architecture.
 
     Raises:
@@ -126,21 +120,13 @@ def read_converted(path: Path, *, shapes: Shapes | None = None) -> ConvertedWeig
 
 
 def read_extras(path: Path) -> dict[str, np.ndarray]:
-    """Read those of `EXTRAS` that a file of converted weights has, float32.
-
-    Raises:
-      UserError: the file cannot be read, or an array is not as it must be.
-    """
+    """Those of `EXTRAS` that a file of converted weights has, float32; UserError if damaged."""
     with _open(path) as file:
         return {name: file.read(name, EXTRAS[name]) for name in EXTRAS if name in file.shapes}
 
 
 def has_extras(path: Path) -> bool:
-    """Whether a file of converted weights has NetVLAD's head.
-
-    Raises:
-      UserError: the file cannot be read.
-    """
+    """Whether a file of converted weights has NetVLAD's head; UserError if it cannot be read."""
     with _open(path) as file:
         return all(name in file.shapes for name in EXTRAS)
 

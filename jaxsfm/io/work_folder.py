@@ -9,11 +9,11 @@ import json
 import logging
 import shutil
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TextIO
 
-from jaxsfm.errors import UserError
+from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import PARTIAL, Json, atomic_folder, read_json, write_atomic
 from jaxsfm.io.hashes import rows_sha256, sha256_of
 from jaxsfm.io.store import Identity, Store, digest
@@ -33,29 +33,36 @@ class WorkFolder(Store):
 
     # -- stages after matching -------------------------------------------------------------------
 
-    def stage_folder(self, name: str) -> Path:
-        """The folder of a stage's files, whether it exists or not."""
-        return self.path / "stages" / name
+    def stage(self, name: str, key: str, compute: Callable[[Path], None]) -> Path:
+        """The folder with the files of a stage, which runs only if its files are not there yet.
 
-    def stage(self, name: str, key: str) -> Path | None:
-        """The folder of a finished stage, or None if it was made with another key or is damaged."""
-        folder = self.stage_folder(name)
-        try:
-            found = (folder / _KEY).read_text(encoding="ascii")
-            return folder if found == f"{key} {_content(folder)}" else None
-        except (OSError, ValueError):
-            return None
-
-    @contextlib.contextmanager
-    def record_stage(self, name: str, key: str) -> Iterator[Path]:
-        """Make a folder for a stage's files; it replaces the former one when the block ends."""
-        with atomic_folder(self.stage_folder(name)) as fresh:
-            yield fresh
+        Args:
+          key: identifies everything that the stage depends on.
+          compute: runs the stage and writes its files into the given folder.
+        """
+        folder = self._stage_folder(name)
+        if self._has_stage(folder, key):
+            logger.info("%s: as before, nothing it depends on has changed", name)
+            return folder
+        with atomic_folder(folder) as fresh:
+            compute(fresh)
             (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
+        return folder
 
     def forget_stage(self, name: str) -> None:
         """Make the next run compute a stage again."""
-        (self.stage_folder(name) / _KEY).unlink(missing_ok=True)
+        (self._stage_folder(name) / _KEY).unlink(missing_ok=True)
+
+    def _stage_folder(self, name: str) -> Path:
+        return self.path / "stages" / name
+
+    def _has_stage(self, folder: Path, key: str) -> bool:
+        """Whether the files of a stage are whole and were made with this key."""
+        try:
+            found = (folder / _KEY).read_text(encoding="ascii")
+            return found == f"{key} {_content(folder)}"
+        except (OSError, ValueError):
+            return False
 
     # -- results ---------------------------------------------------------------------------------
 
@@ -156,7 +163,7 @@ def _short(value: Json) -> Json:
 
 def _prepare(path: Path) -> TextIO:
     """Make the folder, or check that it is a work folder; return its lock file, open."""
-    try:
+    with writing(f"--out {path}"):
         if path.exists() and not path.is_dir():
             raise UserError(f"--out {path}: this is a file and not a folder")
         if path.is_dir() and not (path / RECORD).exists():
@@ -169,16 +176,10 @@ def _prepare(path: Path) -> TextIO:
                 )
         path.mkdir(parents=True, exist_ok=True)
         return (path / ".lock").open("w")
-    except OSError as error:
-        raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
 
 
 def _former(path: Path) -> Identity | None:
-    """The identity of the folder's last run; None if the folder is new.
-
-    Raises:
-      UserError: the record is damaged.
-    """
+    """The identity of the folder's last run; None if the folder is new."""
     record = path / RECORD
     if not record.exists():
         return None
@@ -216,20 +217,16 @@ def _images(identity: Identity) -> Mapping[str, Json]:
 def lock_folder(path: Path) -> Iterator[None]:
     """Create or find a work folder and hold its lock while the block runs.
 
-    If a run was killed while it moved its results into place, the rest is moved first.
-
-    Raises:
-      UserError: `path` is a file or a folder of something else, cannot be written, or is in use.
+    If a run was killed while it moved its results into place, the rest is moved first. Raises
+    UserError if `path` is a file or a folder of something else, cannot be written, or is in use.
     """
     with _prepare(path) as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise UserError(f"--out {path}: another run is using this folder") from error
-        try:
+        with writing(f"--out {path}"):
             WorkFolder(path, {}).finish_publishing()
-        except OSError as error:
-            raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
         yield
 
 
@@ -239,10 +236,6 @@ def open_folder(path: Path, identity: Identity) -> Iterator[WorkFolder]:
 
     An earlier run in the folder may have been made with other options or some other photos; the
     log says how it differs.
-
-    Args:
-      path: the folder.
-      identity: what the matches of this run depend on (`jaxsfm.io.store.Identity`).
 
     Raises:
       UserError: the folder cannot be used (`lock_folder`), or the earlier run in it has no photo in
@@ -268,10 +261,8 @@ def open_locked_folder(path: Path, identity: Identity) -> WorkFolder:
         else:
             logger.info("continuing the run in %s", path)
     folder = WorkFolder(path, new)
-    try:
+    with writing(f"--out {path}"):
         folder.sweep()
-    except OSError as error:
-        raise UserError(f"--out {path}: cannot be written ({error.strerror})") from error
     if old != new:
         write_atomic(path / RECORD, json.dumps(new, indent=1).encode())
     return folder

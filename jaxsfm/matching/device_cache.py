@@ -61,12 +61,7 @@ class ImageCache(Generic[Name, Loaded]):
     def __init__(
         self, load: Callable[[Name], Loaded], pairs: Sequence[Sequence[Name]], most: int
     ) -> None:
-        """
-        Args:
-          load: loads an image by its name.
-          pairs: the names in each pair or block, in the order in which `take` will ask for them.
-          most: how many images are held at a time.
-        """
+        """`take` will ask for the names of each pair or block in turn; at most `most` are held."""
         self._load, self._most = load, most
         self._images: dict[Name, Loaded] = {}
         self._uses: dict[Name, deque[int]] = {}

@@ -41,9 +41,7 @@ longer for the slowest one."""
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Execution(ExecutionChoice):
-    """How many devices are used, how large batches are, and how much memory features may take.
-
-    The fields are those of `jaxsfm.options.ExecutionChoice`, checked.
+    """The fields of `jaxsfm.options.ExecutionChoice`, checked.
 
     Raises:
       ValueError: a number that is not positive, or not finite.
@@ -63,11 +61,7 @@ ONE_AT_A_TIME = Execution(devices=1, images_at_once=1, pairs_at_once=1)
 
 
 def select_devices(execution: Execution) -> Mesh:
-    """The devices that are used, as a mesh with one axis.
-
-    Raises:
-      UserError: fewer devices are there than `execution.devices`.
-    """
+    """The devices that are used, as a mesh with one axis. UserError if there are too few."""
     devices = jax.local_devices()
     if execution.devices is not None and execution.devices > len(devices):
         raise UserError(
@@ -84,12 +78,9 @@ def _device_memory(mesh: Mesh) -> int | None:
 
 
 def joined_bytes(num_coarse: int, *, octaves: int, backbone: str = "vgg16") -> int:
-    """Bytes of one image's joined features.
+    """Bytes of one image's joined features, padded to `num_coarse` cells in the first octave.
 
     With VGG they are about 98 bytes per working pixel with four octaves, and 24 with one.
-
-    Args:
-      num_coarse: the padded number of coarse cells of the first octave.
     """
     network = BACKBONES[backbone]
 
@@ -127,12 +118,7 @@ not been measured on a GPU yet."""
 
 
 def images_at_once(execution: Execution, mesh: Mesh, pixels: int, count: int) -> int:
-    """How many images each device extracts side by side.
-
-    Args:
-      pixels: number of pixels of one padded image.
-      count: number of images of that size.
-    """
+    """How many of `count` images of `pixels` pixels, padded, each device extracts side by side."""
     each = ACCELERATOR_BYTES_PER_PIXEL * pixels
     return _side_by_side(execution.images_at_once, mesh, DEVICE_SHARE, each, MAX_IMAGES, count)
 

@@ -37,9 +37,7 @@ def _start(
 ) -> DenseFeatures:
     """Start the extraction of images that share a padded size and a capacity.
 
-    Returns:
-      Features on the devices, with leading axes for the devices and their batches. They are not
-      waited for.
+    The features are on the devices, with leading axes for the devices and their batches.
     """
     padded, num_coarse = _shapes(working[0].rgb.shape[1::-1])
     count = batch_size * mesh.size
@@ -61,8 +59,7 @@ def _start(
 def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Extraction:
     """What a config and the weights fix in the compiled program of an extraction.
 
-    Raises:
-      ValueError: the weights belong to another network than the config's.
+    Raises ValueError if the weights belong to another network than the config's.
     """
     if weights.backbone != config.backbone:
         raise ValueError(f"weights must be of {config.backbone}; got {weights.backbone}")
@@ -83,12 +80,7 @@ def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
 
 
 def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
-    """Read one image and compute its features.
-
-    Raises:
-      ImageError: the image cannot be read.
-      UserError: it needs more memory than there is.
-    """
+    """Read one image and compute its features; ImageError if it cannot be read."""
     ((_, found),) = extract_images(weights, [image], config=config, execution=ONE_AT_A_TIME)
     if isinstance(found, ImageError):
         raise found
@@ -105,10 +97,7 @@ def extract_images(
     """Yield every image with its features, or with the error if it cannot be read.
 
     Images come batch by batch, and those of one padded size follow each other. The next images are
-    read while a batch is computed.
-
-    Raises:
-      UserError: an image needs more memory than there is.
+    read while a batch is computed. Raises UserError if an image needs more memory than there is.
     """
     execution, images = execution or Execution(), list(images)
     mesh = select_devices(execution)

@@ -56,17 +56,9 @@ class PhotoCollection:
     lost: dict[str, ImageError] = field(default_factory=dict)
     """Errors of photos that cannot be decoded, by SHA-256; added while photos are described."""
 
-    def load(self, image: ImageFile, kind: str) -> np.ndarray | None:
-        """A photo's array in the store; None if it is missing or damaged."""
-        return (self.store.load_descriptor(image, kind) or {}).get("array")
-
-    def save(self, image: ImageFile, kind: str, array: np.ndarray) -> None:
-        """Keep a photo's array in the store."""
-        self.store.save_descriptor(image, kind, {"array": array})
-
     def stored(self, kind: str) -> ByContent:
         """All descriptors of this kind that are in the store."""
-        found = {image.sha256: self.load(image, kind) for image in self.unique}
+        found = {image.sha256: self.store.load_descriptor(image, kind) for image in self.unique}
         return {sha256: each for sha256, each in found.items() if each is not None}
 
     def missing(self, have: Collection[str]) -> list[ImageFile]:
@@ -79,7 +71,7 @@ def gem_descriptors(collection: PhotoCollection) -> ByContent:
     found = collection.stored(GEM)
     for image, rows in _decoded(collection, _coarse_rows(collection, collection.missing(found))):
         found[image.sha256] = np.asarray(_gem(_padded(rows)))
-        collection.save(image, GEM, found[image.sha256])
+        collection.store.save_descriptor(image, GEM, found[image.sha256])
     return found
 
 
@@ -88,9 +80,13 @@ def vlad_descriptors(collection: PhotoCollection) -> ByContent:
     found = collection.stored(_vlad_kind(collection.unique))
     if len(found) == len(collection.unique):
         return found
-    todo = [image for image in collection.unique if collection.load(image, CELLS) is None]
+    todo = [
+        image
+        for image in collection.unique
+        if collection.store.load_descriptor(image, CELLS) is None
+    ]
     for image, rows in _decoded(collection, _coarse_rows(collection, todo)):
-        collection.save(image, CELLS, rows)
+        collection.store.save_descriptor(image, CELLS, rows)
     good = collection.missing(collection.lost)
     kind = _vlad_kind(good)
     found = collection.stored(kind)
@@ -100,7 +96,7 @@ def vlad_descriptors(collection: PhotoCollection) -> ByContent:
         interrupt.check()
         rows = _padded(_local_descriptors(collection, image))
         found[image.sha256] = np.asarray(_vlad(rows, words))
-        collection.save(image, kind, found[image.sha256])
+        collection.store.save_descriptor(image, kind, found[image.sha256])
     return found
 
 
@@ -115,7 +111,7 @@ def netvlad_descriptors(collection: PhotoCollection) -> ByContent:
     head = NetVLADHead(*(jnp.asarray(extras[f"netvlad.{name}"]) for name in NetVLADHead._fields))
     for image, rows in _decoded(collection, _conv5_rows(collection.weights, todo)):
         found[image.sha256] = np.asarray(_netvlad(rows, head))
-        collection.save(image, kind, found[image.sha256])
+        collection.store.save_descriptor(image, kind, found[image.sha256])
     return found
 
 
@@ -169,12 +165,12 @@ def _coarse_rows(
 
 def _local_descriptors(collection: PhotoCollection, image: ImageFile) -> np.ndarray:
     """A photo's local descriptors from the store; if missing there, they are made again."""
-    rows = collection.load(image, CELLS)
+    rows = collection.store.load_descriptor(image, CELLS)
     if rows is None:
         ((_, rows),) = _coarse_rows(collection, [image])
         if isinstance(rows, ImageError):
             raise rows
-        collection.save(image, CELLS, rows)
+        collection.store.save_descriptor(image, CELLS, rows)
     return rows
 
 

@@ -7,7 +7,7 @@ all pairs, so that an image is loaded as rarely as that memory allows.
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -18,7 +18,7 @@ from jaxsfm.core.grid import rescale
 from jaxsfm.core.sharded import match_batch, pick
 from jaxsfm.core.types import JoinedFeatures, PairMatches, Status, Thresholds
 from jaxsfm.io.features import FeatureCapacity, ImageFeatures
-from jaxsfm.io.pairs import PairResult, make_pair
+from jaxsfm.io.pairs import Name, PairResult, make_pair
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.matching.device_cache import (
     DeviceFeatures,
@@ -35,8 +35,6 @@ from jaxsfm.matching.execution import (
     select_devices,
 )
 
-Name = TypeVar("Name")
-
 
 def match_features(
     features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int = 0
@@ -44,13 +42,16 @@ def match_features(
     """Verified matches of two images; `features0` is the first image of the result."""
     both = {0: features0, 1: features1}
     capacities = {side: features.capacity for side, features in both.items()}
-    return next(_match_pairs(both.__getitem__, capacities, [(0, 1)], config, seed, ONE_AT_A_TIME))
+    (result,) = match_pairs(
+        both.__getitem__, capacities, [(0, 1)], config=config, seed=seed, execution=ONE_AT_A_TIME
+    )
+    return result
 
 
 def match_pairs(
-    load: Callable[[str], ImageFeatures],
-    capacities: Mapping[str, FeatureCapacity],
-    pairs: Iterable[tuple[str, str]],
+    load: Callable[[Name], ImageFeatures],
+    capacities: Mapping[Name, FeatureCapacity],
+    pairs: Iterable[tuple[Name, Name]],
     *,
     config: Config,
     seed: int = 0,
@@ -66,8 +67,41 @@ def match_pairs(
       load: loads an image's features by its name; it is called again if they have left the device.
       capacities: the feature capacity of every image, by its name.
     """
-    named = [make_pair(a, b) for a, b in pairs]
-    return _match_pairs(load, capacities, named, config, seed, execution or Execution())
+    chosen = execution or Execution()
+    mesh, root = select_devices(chosen), jax.random.key(seed)
+    programs: dict[_Program, list[tuple[Name, Name]]] = {}
+    for a, b in (make_pair(*pair) for pair in pairs):
+        programs.setdefault(_program(capacities[a], capacities[b], config), []).append((a, b))
+
+    def batches() -> Iterator[_Batch]:
+        for program, some in programs.items():
+            num_coarse = program.num_coarse
+            side_by_side = pairs_at_once(chosen, mesh, num_coarse, len(some), config=config)
+            most = cached_images(chosen, mesh, num_coarse, config=config)
+            ordered = tile_order(some, max(1, most // 2))
+
+            def on_devices(name: Name, num_coarse: int = num_coarse) -> DeviceFeatures:
+                return put_on_devices(load(name), num_coarse, mesh)
+
+            cache, todo = ImageCache(on_devices, ordered, most), iter(ordered)
+            while batch := list(itertools.islice(todo, side_by_side * mesh.size)):
+                images = [(cache.take(a), cache.take(b)) for a, b in batch]
+                yield _Batch(program, side_by_side, images)
+
+    def start(batch: _Batch) -> _Started:
+        missing = batch.side_by_side * mesh.size - len(batch.images)
+        filled = batch.images + batch.images[-1:] * missing
+        found = match_batch(
+            root,
+            _identities(filled, mesh),
+            tuple(_columns(filled, mesh)),
+            thresholds(config),
+            mesh=mesh,
+            shape=batch.program.shape,
+        )
+        return _Started(found, [(a.features, b.features) for a, b in batch.images])
+
+    return overlap_batches(batches(), start, _results)
 
 
 def thresholds(config: Config) -> Thresholds:
@@ -99,50 +133,6 @@ class _Started(NamedTuple):
 
     matches: PairMatches
     images: list[tuple[ImageFeatures, ImageFeatures]]
-
-
-def _match_pairs(
-    load: Callable[[Name], ImageFeatures],
-    capacities: Mapping[Name, FeatureCapacity],
-    pairs: Sequence[tuple[Name, Name]],
-    config: Config,
-    seed: int,
-    execution: Execution,
-) -> Iterator[PairResult]:
-    mesh, root = select_devices(execution), jax.random.key(seed)
-    programs: dict[_Program, list[tuple[Name, Name]]] = {}
-    for a, b in pairs:
-        programs.setdefault(_program(capacities[a], capacities[b], config), []).append((a, b))
-
-    def batches() -> Iterator[_Batch]:
-        for program, some in programs.items():
-            num_coarse = program.num_coarse
-            side_by_side = pairs_at_once(execution, mesh, num_coarse, len(some), config=config)
-            most = cached_images(execution, mesh, num_coarse, config=config)
-            ordered = tile_order(some, max(1, most // 2))
-
-            def on_devices(name: Name, num_coarse: int = num_coarse) -> DeviceFeatures:
-                return put_on_devices(load(name), num_coarse, mesh)
-
-            cache, todo = ImageCache(on_devices, ordered, most), iter(ordered)
-            while batch := list(itertools.islice(todo, side_by_side * mesh.size)):
-                images = [(cache.take(a), cache.take(b)) for a, b in batch]
-                yield _Batch(program, side_by_side, images)
-
-    def start(batch: _Batch) -> _Started:
-        missing = batch.side_by_side * mesh.size - len(batch.images)
-        filled = batch.images + batch.images[-1:] * missing
-        found = match_batch(
-            root,
-            _identities(filled, mesh),
-            tuple(_columns(filled, mesh)),
-            thresholds(config),
-            mesh=mesh,
-            shape=batch.program.shape,
-        )
-        return _Started(found, [(a.features, b.features) for a, b in batch.images])
-
-    return overlap_batches(batches(), start, _results)
 
 
 class _Batch(NamedTuple):

@@ -35,15 +35,10 @@ class GlobalDescriptors(NamedTuple):
     vectors: dict[str, np.ndarray]
     """float32, unit length, by the photos' names."""
     lost: list[tuple[ImageFile, ImageError]]
-    """Photos that cannot be decoded, and why."""
 
 
 def check_retrieval(kind: Retrieval, weights: Weights) -> None:
-    """Check that photos can be described in a way with these weights.
-
-    Raises:
-      UserError: they cannot.
-    """
+    """Raise UserError unless photos can be described in a way with these weights."""
     if kind == "netvlad" and not (is_converted(weights.path) and has_extras(weights.path)):
         raise UserError(
             "--retrieval netvlad: needs NetVLAD's weights with their head (--weights; jaxsfm "
@@ -113,10 +108,8 @@ def describe_photos(
 def nearest_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
     """Pairs of each name with the `k` nearest others, each pair once, in order of names.
 
-    With fewer than `k` others, all of them are taken. Equally near ones are taken by name.
-
-    Raises:
-      ValueError: k is less than 1.
+    With fewer than `k` others, all of them are taken. Equally near ones are taken by name. Raises
+    ValueError if k is less than 1.
     """
     if k < 1:
         raise ValueError(f"k must be at least 1; got {k}")

@@ -1,7 +1,7 @@
 """Pictures of matches.
 
 They are drawn by matplotlib's Agg canvas and encoded by OpenCV, because Pillow's PNG encoder must
-not run in a process that has loaded pycolmap (see jaxsfm.colmap.database).
+not run in a process that has loaded pycolmap (see jaxsfm.colmap).
 """
 
 from pathlib import Path

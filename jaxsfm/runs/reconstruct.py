@@ -34,8 +34,7 @@ from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.runs.run_options import RunOptions, check_options
-from jaxsfm.sfm.reconstruction import Reconstructed, reconstruct
-from jaxsfm.sfm.stages import StageCache
+from jaxsfm.sfm.reconstruction import Reconstructed, StageCache, reconstruct
 
 logger = logging.getLogger("jaxsfm")
 

@@ -54,8 +54,8 @@ def similar_photos(
         if name in new:
             return describe(new[name])
         saved = run.matches.load_descriptor(run.photos.recorded(name), GEM)
-        if saved is not None and "array" in saved:
-            return saved["array"]
+        if saved is not None:
+            return saved
         image = photos_of_run(run, [name])[name]
         try:
             return describe(image, run.matches)

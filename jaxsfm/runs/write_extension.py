@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
-from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun
@@ -71,5 +71,5 @@ def write_extension(
         models[0] = grown.model.to_colmap()
         colour_points(models[0], photos.rgb)
     write_models(models, target / "sparse")
-    sizes = {name: photos[name].size for name in photos.keys() - new.skipped.keys()}
+    sizes = {name: photos.files[name].size for name in photos.files.keys() - new.skipped.keys()}
     return extended_report(run, models, grown, new, matches, verified, sizes)

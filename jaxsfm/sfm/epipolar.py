@@ -125,11 +125,7 @@ def refine_fundamental_matrix(
 
 
 def fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.ndarray | None:
-    """Find the fundamental matrix F (float64 (3, 3)) with x1' F x0 = 0; None if there is none.
-
-    Args:
-      xy0, xy1: matches (n, 2), pixels.
-    """
+    """The F (float64 (3, 3)) with x1' F x0 = 0 of matches (n, 2), pixels; None if there is none."""
     xy0, xy1 = np.asarray(xy0, np.float64), np.asarray(xy1, np.float64)
     seeds = np.random.SeedSequence(seed).generate_state(STARTS)
     starts = [_estimate(cv2.findFundamentalMat, xy0, xy1, 8, int(s >> 1)) for s in seeds]
@@ -138,9 +134,5 @@ def fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.nda
 
 
 def homography(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.ndarray | None:
-    """Find the homography H (float64 (3, 3)) with x1 ~ H x0; None if there is none.
-
-    Args:
-      xy0, xy1: matches (n, 2), pixels.
-    """
+    """The H (float64 (3, 3)) with x1 ~ H x0 of matches (n, 2), pixels; None if there is none."""
     return _estimate(cv2.findHomography, xy0, xy1, 4, seed)

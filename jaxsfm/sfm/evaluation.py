@@ -7,12 +7,14 @@ paper's night protocol aligns on day cameras and scores the night camera (sectio
 import dataclasses
 from collections.abc import Collection
 from pathlib import Path
-from typing import NamedTuple, TypedDict
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
+from jaxsfm.io.pairs import listed_lines
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 DISTANCES = (0.5, 1.0, 5.0, 10.0, 20.0)
@@ -31,21 +33,6 @@ class PoseError:
     position: float
     """Units of the reference."""
     rotation_deg: float
-
-
-class EvaluationRecord(TypedDict):
-    """An `Evaluation` as plain JSON."""
-
-    registered: int
-    reference_images: int
-    aligned_on: int
-    position: dict[str, float]
-    """Mean, median and max, units of the reference."""
-    rotation_deg: dict[str, float]
-    within_10deg: dict[str, float]
-    """By distance, the share of the reference's images."""
-    images: dict[str, dict[str, float]]
-    missing: list[str]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,27 +75,24 @@ class Evaluation:
             for d in DISTANCES
         }
 
-    def as_dict(self) -> EvaluationRecord:
-        """The evaluation as plain JSON."""
-        return EvaluationRecord(
-            registered=len(self.images),
-            reference_images=len(self.images) + len(self.missing),
-            aligned_on=self.aligned_on,
-            position=self.position,
-            rotation_deg=self.rotation_deg,
-            within_10deg={f"{d:g}": share for d, share in self.within.items()},
-            images={n: dataclasses.asdict(e) for n, e in sorted(self.images.items())},
-            missing=self.missing,
-        )
+    def as_dict(self) -> dict[str, Json]:
+        """The evaluation as plain JSON (`jaxsfm.report.run_results.EvaluationReport`)."""
+        return {
+            "registered": len(self.images),
+            "reference_images": len(self.images) + len(self.missing),
+            "aligned_on": self.aligned_on,
+            "position": self.position,
+            "rotation_deg": self.rotation_deg,
+            "within_10deg": {f"{d:g}": share for d, share in self.within.items()},
+            "images": {n: dataclasses.asdict(e) for n, e in sorted(self.images.items())},
+            "missing": self.missing,
+        }
 
 
 def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, str]:
-    """Pair the names of a model with those of a reference.
+    """Our name -> the reference's name, of the images that both have.
 
     Names are paired if they are equal, or if their stems are equal and unique (0000.jpg, 0000.png).
-
-    Returns:
-      our name -> the reference's name.
     """
     pairs = {name: name for name in ours if name in reference}
     stems: dict[str, list[str]] = {}
@@ -126,16 +110,8 @@ def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, s
 
 
 def read_names(path: Path) -> list[str]:
-    """Read image names from a text file: one on each line. A line that starts with # is a comment.
-
-    Raises:
-      UserError: not text, or no names in it.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--align-on {path}: cannot be read as text") from error
-    names = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
+    """The image names in a text file, one on each line; UserError if there are none."""
+    names = [line for _, line in listed_lines(path, "--align-on")]
     if not names:
         raise UserError(f"--align-on {path}: no names in it")
     return names
@@ -173,10 +149,7 @@ def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
 
 
 def align(ours: np.ndarray, reference: np.ndarray) -> Similarity:
-    """The similarity that takes our centres to the reference's.
-
-    Args:
-      ours, reference: float64 (n, 3).
+    """The similarity that takes our centres (n, 3) to the reference's.
 
     Raises:
       UserError: fewer than three centres, or (nearly) on one line in either set.

@@ -11,26 +11,25 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.database import drop_pairs, read_images, write_database
 from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
 from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
 from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
-from jaxsfm.colmap.two_views import read_two_views
-from jaxsfm.colmap.verification import VerificationOptions, verify
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
+from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 from jaxsfm.sfm.stage_files import VerificationFigures
-from jaxsfm.sfm.stages import StageCache, TemporaryStages, run_stage
-from jaxsfm.sfm.view_graph import Verdict, trusted_pairs
+from jaxsfm.sfm.view_graph import trusted_pairs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -39,20 +38,21 @@ DATABASE, SPARSE = "database.db", "sparse"
 logger = logging.getLogger("jaxsfm")
 
 
+class StageCache(NamedTuple):
+    """Stages of earlier runs, and what tells whether they still hold."""
+
+    folder: WorkFolder
+    matches_key: str
+    """Identifies the matches. A stage is used again only for the same matches."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Reconstructed:
+class Reconstructed(VerificationFigures):
     """The models of verified matches, and how they came about."""
 
     models: "list[pycolmap.Reconstruction]"
     """The model with most images first; empty if there is none."""
-    verdicts: dict[Pair, Verdict]
-    """The view graph's decision on each pair; empty if it is switched off."""
-    verified: dict[Pair, int]
-    """Number of COLMAP's two-view inliers, by pair that has any."""
-    angles: dict[Pair, float]
-    """Degrees at which the rays of a verified pair's points meet (median); 0: unknown."""
     attempts: list[Attempt]
-    """Runs of the mapper."""
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
 
@@ -84,8 +84,6 @@ def reconstruct(
         are given.
       kept: stages of earlier runs, which are used again where they hold. New ones are kept there.
       on_image: called for every image that the mapper registers.
-      on_mapped: called at the end of mapping.
-      on_pass: called after every pass of the refinement.
 
     Raises:
       UserError: the intrinsics do not fit the images, or COLMAP fails.
@@ -117,28 +115,26 @@ def reconstruct(
         stage_files.write_refinement(folder, figures)
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        store, key = kept or (TemporaryStages(scratch), "")
+        stages, key = kept or (WorkFolder(Path(scratch), {}), "")
         by_image = [[image.name, image.sha256, image.size] for image in images]
         camera = intrinsics and dataclasses.asdict(intrinsics)
         verifying = [options.seed, options.threads, options.scale, config.view_graph]
         key = digest(key, by_image, camera, verifying, package_versions())
-        checked = run_stage(store, "verified", key, verify_matches)
+        checked = stages.stage("verified", key, verify_matches)
         key = digest(key, dataclasses.asdict(options))
-        mapped = run_stage(store, "mapped", key, build)
+        mapped = stages.stage("mapped", key, build)
         on_mapped()
         key = digest(key, config.refinement and dataclasses.asdict(config.refinement))
-        refined = run_stage(store, "refined", key, refine)
+        refined = stages.stage("refined", key, refine)
         shutil.copyfile(checked / DATABASE, database)
         verification = stage_files.read_verification(checked)
         refinement = stage_files.read_refinement(refined)
         models = read_models(refined / SPARSE, database)
         if config.refinement is not None and None in refinement:
-            store.forget_stage("refined")  # a photo could not be read; perhaps it can next time
+            stages.forget_stage("refined")  # a photo could not be read; perhaps it can next time
         return Reconstructed(
+            **vars(verification),
             models=models,
-            verdicts=verification.verdicts,
-            verified=verification.verified,
-            angles=verification.angles,
             attempts=stage_files.read_attempts(mapped),
             refinement=refinement,
         )
@@ -177,49 +173,37 @@ def _refined(
 ) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
     """Refine the models, if asked for, and colour their points.
 
+    They are refined one after the other, each with the unmapped images that none before took.
+
     Args:
       database: of all images, with those that are in no model.
     """
-    figures: list[RefinementFigures | None] = [None] * len(models)
-    if refinement is not None:
-        cameras = read_images(database)
-        mapped = {name for model in models for name in registered(model)}
-        unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
-        evidence = Evidence(matches, unmapped, options.seed)
-        models, figures = _refine_each(models, photos, refinement, options, evidence, on_pass)
-    for model in models:
-        colour_points(model, photos.rgb)
-    return models, figures
-
-
-def _refine_each(
-    models: "list[pycolmap.Reconstruction]",
-    photos: Photos,
-    refinement: Refinement,
-    options: MapOptions,
-    evidence: Evidence,
-    on_pass: Callable[[], None],
-) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
-    """Refine models one after the other, each with the unmapped images that none before took."""
+    cameras = read_images(database)
+    mapped = {name for model in models for name in registered(model)}
+    unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
+    evidence = Evidence(matches, unmapped, options.seed)
     refined, figures = [], []
     for model in models:
+        new, done = model, None
         try:
-            new, done = refine_model(
-                model,
-                photos.gray,
-                refinement=refinement,
-                refine_intrinsics=options.refine_intrinsics,
-                evidence=evidence,
-                threads=options.threads,
-                on_pass=on_pass,
-            )
+            if refinement is not None:
+                new, done = refine_model(
+                    model,
+                    photos.gray,
+                    refinement=refinement,
+                    refine_intrinsics=options.refine_intrinsics,
+                    evidence=evidence,
+                    threads=options.threads,
+                    on_pass=on_pass,
+                )
         except ImageError as error:  # a photo was deleted since; the mapper's model remains
             logger.warning("no refinement: %s", error)
-            new, done = model, None
         left = [image for image in evidence.unmapped if image.name not in registered(new)]
         evidence = evidence._replace(unmapped=left)
         refined.append(new)
         figures.append(done)
     # Refinement adds and removes images: the first model is again the one with most.
     order = sorted(range(len(refined)), key=lambda k: -refined[k].num_reg_images())
+    for model in refined:
+        colour_points(model, photos.rgb)
     return [refined[k] for k in order], [figures[k] for k in order]

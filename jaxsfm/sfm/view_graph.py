@@ -10,7 +10,7 @@ are compared, the strongest first:
    the pairs between them vote, with their strengths, on the rotation between the groups; the
    largest group of agreeing votes decides.
 3. The rotations of all images are then averaged over the agreeing pairs (robustly), and a pair
-   whose own rotation is further than `tolerance_deg` from them is dropped, unless it is strong:
+   whose own rotation is further than `TOLERANCE_DEG` from them is dropped, unless it is strong:
    then its rotation may be poor (a plane, a guessed focal length), but its matches are sound.
 
 So a false pair is trusted only where no stronger pair contradicts it. The order of images and pairs
@@ -67,24 +67,12 @@ def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
     }
 
 
-def trusted_pairs(
-    geometries: Mapping[Pair, PairGeometry], *, tolerance_deg: float = TOLERANCE_DEG
-) -> dict[Pair, Verdict]:
-    """Decide for every pair whether it is trusted.
-
-    Args:
-      geometries: by pair of image names, in order.
-      tolerance_deg: see `TOLERANCE_DEG`.
-
-    Raises:
-      ValueError: `tolerance_deg` is not between 0 and 180.
-    """
-    if not 0 < tolerance_deg < 180:
-        raise ValueError(f"tolerance_deg must lie in (0, 180); got {tolerance_deg}")
+def trusted_pairs(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, Verdict]:
+    """Decide for every pair, of image names in order, whether it is trusted."""
     strength = strengths(geometries)
     ranked = sorted(geometries, key=lambda p: (-strength[p], p))
     known = [p for p in ranked if geometries[p].rotation is not None and strength[p] > 0]
-    rotations = _average(_grow(known, geometries, strength, tolerance_deg), known, geometries)
+    rotations = _average(_grow(known, geometries, strength), known, geometries)
     verdicts = {}
     determined = set(known)
     for pair in sorted(geometries):
@@ -93,7 +81,7 @@ def trusted_pairs(
             reason = "no relative pose"
         else:
             error = float(_error_deg(pair, geometries, rotations))
-            if error > tolerance_deg and strength[pair] < STRONG:
+            if error > TOLERANCE_DEG and strength[pair] < STRONG:
                 reason = (
                     f"its rotation is {error:.0f} deg from the one that stronger pairs give "
                     f"(its strength is {strength[pair]:.3f} of 1)"
@@ -127,7 +115,6 @@ def _grow(
     ranked: list[Pair],
     geometries: Mapping[Pair, PairGeometry],
     strength: Mapping[Pair, float],
-    tolerance_deg: float,
 ) -> Rotations:
     """Camera rotations (world to camera). Each connected group of images has a world of its own."""
     names = sorted({image for pair in ranked for image in pair})
@@ -150,10 +137,9 @@ def _grow(
         turned = np.where(swap[:, None, None], relative[rows].transpose(0, 2, 1), relative[rows])
         # From the world of b to the world of a, as each pair determines it.
         moves = rotations[in_a].transpose(0, 2, 1) @ turned.transpose(0, 2, 1) @ rotations[in_b]
-        close = rotation_angle_deg(moves[:, None], moves[None]) < tolerance_deg
-        winner = int(
-            np.argmax(close @ votes[rows])
-        )  # among equals the first, which is the strongest
+        close = rotation_angle_deg(moves[:, None], moves[None]) < TOLERANCE_DEG
+        # Among equals the first one wins, which is the strongest.
+        winner = int(np.argmax(close @ votes[rows]))
         move = mean_rotation(moves[close[winner]], votes[rows][close[winner]])
         members = group == b
         rotations[members] = rotations[members] @ move.T

@@ -19,11 +19,9 @@ FORMAT = "jaxsfm training 1"
 
 
 def save_checkpoint(path: Path, state: PyTree, about: Mapping[str, Json]) -> None:
-    """Write the state of a training.
+    """Write the state of a training, a tree of arrays.
 
     Args:
-      path: the file.
-      state: a tree of arrays.
       about: which training it is, and what it has measured.
 
     Raises:
@@ -37,7 +35,6 @@ def load_checkpoint(path: Path, like: State) -> tuple[State, dict[str, Json]]:
     """Read the state of a training, and what was saved about it.
 
     Args:
-      path: the file.
       like: a state with the same structure and shapes.
 
     Raises:

@@ -32,6 +32,15 @@ MATCH_ERROR_PX = 3.0
 cells loses within 3 px what it gains within 1 px (docs/decisions/relocalization.md)."""
 
 
+SIGMA_PX = 0.8
+"""Distance over which two places agree, pixels."""
+NEAR_PX, NEAR = 3.0, 0.3
+"""Distance over which two places nearly agree, pixels, and the weight of that."""
+FLOOR = 0.1
+"""Is added to the probability before the logarithm is taken, so that cells which cannot agree have
+less influence."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Objective:
     """How the walks in two views are compared. It is static in the training's programs."""
@@ -39,27 +48,14 @@ class Objective:
     temperature: float = 0.5
     """Temperature of the random walks in training; the walks of keypoints always take the best
     child."""
-    sigma_px: float = 0.8
-    """Distance over which two places agree, pixels."""
-    near_px: float = 3.0
-    """Distance over which two places nearly agree, pixels."""
-    near: float = 0.3
-    """Weight of nearly agreeing."""
-    floor: float = 0.1
-    """Is added to the probability before the logarithm is taken, so that cells which cannot agree
-    have less influence."""
     peakiness: float = 0.0
     """Weight of the loss that makes the walks more certain of their end."""
-    children: int = 2
-    """Children per axis and level (K in the paper); the pipeline walks with 2."""
 
     def __post_init__(self) -> None:
-        for name in ("temperature", "sigma_px", "near_px", "floor"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"Objective.{name} must be positive; got {getattr(self, name)}")
-        for name in ("near", "peakiness"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"Objective.{name} must be at least 0; got {getattr(self, name)}")
+        if not self.temperature > 0:
+            raise ValueError(f"Objective.temperature must be positive; got {self.temperature}")
+        if self.peakiness < 0:
+            raise ValueError(f"Objective.peakiness must be at least 0; got {self.peakiness}")
 
 
 class Examples(NamedTuple):
@@ -70,7 +66,6 @@ class Examples(NamedTuple):
     maps1: tuple[Float[Array, "b h w c"], ...]
     """The same maps of the second views."""
     cells: CellPairs
-    """The cells that show the same place."""
     known: Float[Array, "b 3 3"]
     """The homography from the first view to the second (pixels), or the fundamental matrix F with
     x1' F x0 = 0."""
@@ -105,10 +100,7 @@ def warped_examples(
     """Make two views of every crop, related by a random homography, and compute their maps.
 
     Args:
-      params: the parameters of `VGG16`.
-      key: the key of all random choices.
       crops: RGB in 0 .. 255.
-      preprocessing: what the network expects of an image.
       size: the side of a view, pixels.
     """
     views_key, offsets_key = jax.random.split(key)
@@ -140,9 +132,6 @@ def loss(
     agree for certain, plus the weighted lack of peakiness.
 
     Args:
-      scores: the parameters of `jaxsfm.core.scores.Scores`.
-      examples: pairs of views.
-      objective: how walks are compared.
       supervision: a key of `DISTANCES` that says what `examples.known` is.
 
     Returns: the loss, and figures to show by name.
@@ -155,19 +144,18 @@ def loss(
                 cell[:, 0],
                 cell[:, 1],
                 temperature=objective.temperature,
-                children=objective.children,
             )
             for maps, cell in ((maps0, cells.cell0), (maps1, cells.cell1))
         )
         squared = DISTANCES[supervision](known, first, second)
-        agree = agreement(first, second, squared, sigma=objective.sigma_px)
-        near = agreement(first, second, squared, sigma=objective.near_px)
-        agree = (agree + objective.near * near) / (1 + objective.near)
+        agree = agreement(first, second, squared, sigma=SIGMA_PX)
+        near = agreement(first, second, squared, sigma=NEAR_PX)
+        agree = (agree + NEAR * near) / (1 + NEAR)
         return agree, (peakiness(first) + peakiness(second)) / 2
 
     agree, peaks = jax.vmap(one)(*examples)
     weight = examples.cells.weight.reshape(-1)
-    surprise = jnp.log((1 + objective.floor) / (agree.reshape(-1) + objective.floor))
+    surprise = jnp.log((1 + FLOOR) / (agree.reshape(-1) + FLOOR))
     repeatability = weighted_mean(surprise, weight)
     sure = weighted_mean(peaks.reshape(-1), weight)
     total = repeatability + objective.peakiness * (1 - sure)
@@ -179,20 +167,19 @@ def loss(
     return total, figures
 
 
-@functools.partial(jax.jit, static_argnames=("children",))
-def shares(scores: dict | None, examples: Examples, *, children: int = 2) -> dict[str, Array]:
+@jax.jit
+def shares(scores: dict | None, examples: Examples) -> dict[str, Array]:
     """Measure how many keypoints lie within 1 and 3 px of the other view's keypoint.
 
     Args:
       scores: the parameters of `jaxsfm.core.scores.Scores`; None takes the norm as the score.
       examples: pairs of views with known homographies.
-      children: children per axis and level.
 
     Returns: the shares `within_1` and `within_3`, and `cells`, the number of keypoints.
     """
 
     def places(maps: tuple[Array, ...], cell: Int[Array, "m 2"]) -> Float[Array, "m 2"]:
-        return relocalize(_scored(scores, maps), cell[:, 0], cell[:, 1], children=children)
+        return relocalize(_scored(scores, maps), cell[:, 0], cell[:, 1])
 
     def one(maps0, maps1, cells, known):
         moved = warp_points(known, places(maps0, cells.cell0))

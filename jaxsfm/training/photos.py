@@ -20,10 +20,8 @@ HELD_OUT = 5
 def split(images: Sequence[ImageFile]) -> tuple[list[ImageFile], list[ImageFile]]:
     """Split photos into those to train on and those held out.
 
-    The split depends on the content of the photos, not on their names or order.
-
-    Raises:
-      UserError: there are fewer than two different photos.
+    The split depends on the content of the photos, not on their names or order. Raises UserError if
+    there are fewer than two different photos.
     """
     different = sorted({image.sha256: image for image in images}.values(), key=lambda i: i.sha256)
     if len(different) < 2:
@@ -36,12 +34,9 @@ def split(images: Sequence[ImageFile]) -> tuple[list[ImageFile], list[ImageFile]
 
 
 class Crops:
-    """Random crops of photos. Those of a step depend on the photos, the seed and the step alone.
+    """Random crops of photos, `side` pixels a side.
 
-    Args:
-      images: the photos.
-      side: the side of a crop, pixels.
-      seed: the seed of all random choices.
+    Those of a step depend on the photos, the seed and the step alone.
     """
 
     def __init__(self, images: Sequence[ImageFile], *, side: int, seed: int) -> None:

@@ -135,13 +135,8 @@ def posed_pairs(
     """Match the photos that have a pose with their neighbours.
 
     Args:
-      weights: the weights of the network.
       images: the photos; those without a pose are left out.
-      poses: poses by name.
       intrinsics: one pinhole camera for all photos.
-      view: side of the windows, pixels.
-      batch: windows in a step.
-      seed: the seed of the matching and of the windows.
 
     Raises:
       UserError: no pair has enough matches, the camera has distortion, or the photos differ in

@@ -50,7 +50,6 @@ class TrainOptions:
     """The settings of a training. Its result depends on them, the photos and the network."""
 
     steps: int = 400
-    """The number of steps."""
     batch: int = 8
     """Pairs of views in a step."""
     view: int = 192
@@ -61,10 +60,7 @@ class TrainOptions:
     """Hidden units of the perceptron of each level."""
     learning_rate: float = 0.01
     """The learning rate at the start; it falls to 0 along a cosine."""
-    epipolar_weight: float = 1.0
-    """Weight of the loss of posed pairs, if there are any."""
     seed: int = 0
-    """The seed of all random choices."""
     objective: Objective = dataclasses.field(default_factory=Objective)
 
     def __post_init__(self) -> None:
@@ -79,8 +75,6 @@ class TrainOptions:
             raise ValueError(f"learning_rate must lie in (0, 1]; got {self.learning_rate}")
         if not 0 <= self.seed < 2**31:
             raise ValueError(f"seed must lie in 0 .. 2147483647; got {self.seed}")
-        if self.epipolar_weight < 0:
-            raise ValueError(f"epipolar_weight must be at least 0; got {self.epipolar_weight}")
 
 
 class State(NamedTuple):
@@ -89,7 +83,6 @@ class State(NamedTuple):
     scores: PyTree
     """The parameters of `jaxsfm.core.scores.Scores`."""
     optimizer: optax.OptState
-    """The state of Adam."""
     step: np.ndarray
     """int32 (): the number of steps so far."""
 
@@ -111,7 +104,7 @@ def train_step(
         value, figures = loss(scores, warped, objective=options.objective)
         if posed is not None:
             of_posed, _ = loss(scores, posed, objective=options.objective, supervision="epipolar")
-            value = value + options.epipolar_weight * of_posed
+            value = value + of_posed
             figures = figures | {"epipolar": of_posed}
         return value, figures
 
@@ -144,13 +137,7 @@ def train_relocalizer(
     on from there, and it gives the same parameters as a training without interruption.
 
     Args:
-      weights: the weights of the network.
-      images: the photos.
-      out: the file for the relocalizer.
-      options: the settings.
       posed: pairs of photos with known cameras, to train on besides.
-      progress: shows a bar.
-      tell: is called with a line of text now and then.
 
     Returns: the time that the training took, seconds.
 

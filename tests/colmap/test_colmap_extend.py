@@ -12,7 +12,7 @@ from jaxsfm.colmap.database import (
     write_database,
 )
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
-from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.io import atomic

@@ -8,7 +8,7 @@ from strategies import rng_of
 
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.verification import VerificationOptions, verify
+from jaxsfm.colmap.two_views import VerificationOptions, verify
 
 APART = np.repeat([0.0, 6.0, 24.0], [200, 100, 100])
 """Pixels between matches and the geometry: none, between 4 and 8, more than either."""

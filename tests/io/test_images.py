@@ -1,4 +1,4 @@
-"""Finding and checking images. PNGs are written by cv2 only (see jaxsfm.colmap.database)."""
+"""Finding and checking images. PNGs are written by cv2 only (see jaxsfm.colmap)."""
 
 from pathlib import Path
 

@@ -107,16 +107,24 @@ def test_a_failure_while_results_are_made_leaves_the_old_ones(tmp_path):
 
 
 def test_a_stage_is_found_under_its_key_alone_and_once_it_is_whole(tmp_path):
+    ran = []
+
+    def half(fresh):
+        (fresh / "file").write_text("half")
+        raise Killed
+
+    def whole(fresh):
+        assert not (fresh / "file").exists()
+        (fresh / "file").write_text("whole")
+        ran.append(fresh)
+
     with open_folder(tmp_path, IDENTITY) as folder:
-        with pytest.raises(Killed), folder.record_stage("mapped", "k") as fresh:
-            (fresh / "file").write_text("half")
-            raise Killed
-        assert folder.stage("mapped", "k") is None
-        with folder.record_stage("mapped", "k") as fresh:
-            assert not (fresh / "file").exists()
-            (fresh / "file").write_text("whole")
-        found = folder.stage("mapped", "k")
-        assert found is not None and (found / "file").read_text() == "whole"
-        assert folder.stage("mapped", "other") is None and folder.stage("verified", "k") is None
+        with pytest.raises(Killed):
+            folder.stage("mapped", "k", half)
+        for count, (name, key) in enumerate([("mapped", "k"), ("mapped", "l"), ("verified", "k")]):
+            for _ in range(2):
+                found = folder.stage(name, key, whole)
+                assert (found / "file").read_text() == "whole" and len(ran) == count + 1
         folder.forget_stage("mapped")
-        assert folder.stage("mapped", "k") is None
+        folder.stage("mapped", "l", whole)
+        assert len(ran) == 4

@@ -1,4 +1,4 @@
-"""Decoding and reducing images. PNGs are written by cv2 only (see jaxsfm.colmap.database)."""
+"""Decoding and reducing images. PNGs are written by cv2 only (see jaxsfm.colmap)."""
 
 from pathlib import Path
 

@@ -192,7 +192,7 @@ def test_everything_is_kept_under_all_that_it_depends_on(tmp_path):
     store = opened(tmp_path)
     store.save_features(features())
     store.save_matches(result())
-    store.save_descriptor(features().image, "kind", {"x": np.ones(3)})
+    store.save_descriptor(features().image, "kind", np.ones(3))
     store.record_failure(features(digit="b").image, DamagedImage("torn"))
     other = {"images": IDENTITY["images"] | {"b.jpg": "other"}}
     fewer = {"images": {name: IDENTITY["images"][name] for name in ("a.jpg", "b.jpg")}}

@@ -154,8 +154,6 @@ def test_pairs_without_a_pose_are_not_trusted_and_say_so():
     assert [v.trusted for v in verdicts.values()] == [False, False, True]
     assert verdicts["a", "b"].reason == "no relative pose"
     assert trusted_pairs({}) == {}
-    with pytest.raises(ValueError, match="tolerance_deg"):
-        trusted_pairs(pairs, tolerance_deg=0)
 
 
 def test_strength_is_one_for_the_best_pair_of_both_images():

@@ -25,8 +25,7 @@ from jaxsfm.colmap.database import drop_pairs, write_database
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.two_views import read_two_views
-from jaxsfm.colmap.verification import VerificationOptions, verify
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.io.atomic import read_json, write_atomic
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photos import Photos

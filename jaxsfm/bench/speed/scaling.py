@@ -15,7 +15,7 @@ import numpy as np
 import jaxsfm
 from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.verification import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.config import Config, preset
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.weights import load_weights

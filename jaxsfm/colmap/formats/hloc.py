@@ -21,6 +21,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from jaxsfm.colmap.formats.lens import check_no_blanks
 from jaxsfm.colmap.formats.tables import MAX_KEYPOINTS, Tables, checked_keypoints, checked_matches
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
@@ -49,7 +50,6 @@ def write_hloc(
     All matches get the score 1, because they are inliers of RANSAC without scores of their own.
 
     Args:
-      folder: an existing folder.
       matches: those of `tables.matches` or `tables.inliers` to write.
       uncertainty_px: by image name, uncertainty of its keypoints, original pixels.
 
@@ -76,12 +76,9 @@ def write_hloc(
 
 
 def _check_names(names: Iterable[str]) -> None:
+    check_no_blanks(names, "hloc")
     shortened = Counter(name.replace("/", "-") for name in names)
     for name in names:
-        if len(name.split()) != 1 or name != name.strip():
-            raise UserError(
-                f"--to hloc: {shown_name(name)!r} has a blank in it, where hloc cuts its pair lists"
-            )
         if shortened[name.replace("/", "-")] > 1:
             raise UserError(
                 f"--to hloc: {shown_name(name)} and another image have one name in hloc's matches, "
@@ -100,11 +97,7 @@ def _dataset(group: h5py.Group, key: str, where: str, max_rows: int) -> np.ndarr
 
 
 def _pairs_in(file: h5py.Group, names: Mapping[str, str]) -> Iterator[tuple[str, str, h5py.Group]]:
-    """Find every pair of known images, and its group.
-
-    Args:
-      names: shortened name -> name.
-    """
+    """Find every pair of known images, and its group. `names`: shortened name -> name."""
     for key, group in file.items():
         if not isinstance(group, h5py.Group):
             continue

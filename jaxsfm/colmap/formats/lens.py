@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
-import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
 import numpy as np
 import pycolmap
 
@@ -19,6 +18,11 @@ _FISHEYE = {"SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4
 """COLMAP's camera models, and their numbers of radial terms."""
 
 
+def row_of(values: Iterable[float]) -> str:
+    """Numbers as text that reads back as the same numbers."""
+    return " ".join(repr(float(v)) for v in values)
+
+
 class Lens(NamedTuple):
     """A camera as OpenCV writes it, in COLMAP's pixels (centre of the top-left one (0.5, 0.5)).
 
@@ -27,7 +31,6 @@ class Lens(NamedTuple):
     """
 
     model: str
-    """COLMAP's name of the camera model."""
     size: tuple[int, int]
     fx: float
     fy: float
@@ -45,14 +48,7 @@ class Lens(NamedTuple):
 
 
 def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Camera:
-    """The camera of a row of a database.
-
-    Args:
-      where: beginning of messages.
-
-    Raises:
-      UserError: there is no such model, or it has other parameters.
-    """
+    """The camera of a row of a database; UserError, which begins with `where`, if it is none."""
     try:
         model = pycolmap.CameraModelId(row.model)
         camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=row.params)
@@ -64,14 +60,7 @@ def camera_of(row: CameraRow, size: tuple[int, int], where: str) -> pycolmap.Cam
 
 
 def lens_of(camera: pycolmap.Camera, to: str) -> Lens:
-    """Describe a camera by one of the two formulas.
-
-    Args:
-      to: name of the format, for messages.
-
-    Raises:
-      UserError: neither formula is that of the camera.
-    """
+    """Describe a camera by one of the two formulas. Raises UserError if neither is the camera's."""
     model = camera.model_name
     fisheye = model in _FISHEYE
     if not fisheye and model not in _PERSPECTIVE:
@@ -102,20 +91,24 @@ def check_one_focal(lens: Lens, to: str) -> None:
         )
 
 
-def check_centred(lens: Lens, to: str) -> None:
-    """Raise UserError if the principal point is not the centre of the image."""
-    off = np.hypot(lens.cx - lens.size[0] / 2, lens.cy - lens.size[1] / 2)
-    if off > TOLERANCE_PX:
-        raise UserError(
-            f"--to {to}: its principal point is the image's centre, but the {lens.model} camera's "
-            f"lies {off:.2f} pixels off"
-        )
+def radial_lens(camera: pycolmap.Camera, to: str, *, centred: bool) -> Lens:
+    """`lens_of`; UserError also for fisheye cameras and tangential distortion.
 
-
-def check_no_tangential(lens: Lens, to: str) -> None:
-    """Raise UserError for fisheye cameras and tangential distortion."""
+    Args:
+      centred: the format has one focal length, and its principal point is the image's centre.
+    """
+    lens = lens_of(camera, to)
     if lens.fisheye or any(lens.tangential):
         raise UserError(f"--to {to}: it has no camera like COLMAP's {lens.model}")
+    if centred:
+        check_one_focal(lens, to)
+        off = np.hypot(lens.cx - lens.size[0] / 2, lens.cy - lens.size[1] / 2)
+        if off > TOLERANCE_PX:
+            raise UserError(
+                f"--to {to}: its principal point is the image's centre, but the {lens.model} "
+                f"camera's lies {off:.2f} pixels off"
+            )
+    return lens
 
 
 def check_no_blanks(names: Iterable[str], to: str) -> None:
@@ -127,22 +120,13 @@ def check_no_blanks(names: Iterable[str], to: str) -> None:
             )
 
 
-class PointTrack(NamedTuple):
-    """A 3-D point and its observations."""
-
-    xyz: np.ndarray
-    colour: tuple[int, int, int]
-    seen: list[tuple[int, int, np.ndarray]]
-    """For each observation the index of the image, that of its keypoint, and (x, y) in COLMAP's
-    pixels. Each image occurs once."""
+Observed = list[tuple[int, int, np.ndarray]]
+"""For each observation of a point the index of the image, that of its keypoint, and (x, y) in
+COLMAP's pixels. Each image occurs once."""
 
 
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """The images with a pose, sorted by name.
-
-    Raises:
-      UserError: a name leads out of the photos' folder.
-    """
+    """The images with a pose, by name; UserError if a name leads out of the photos' folder."""
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     for image in images:
         path = PurePosixPath(image.name)
@@ -153,12 +137,8 @@ def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 
 def point_tracks(
     model: pycolmap.Reconstruction, images: list[pycolmap.Image]
-) -> Iterator[tuple[int, PointTrack]]:
-    """The points of a model, in the order of their ids.
-
-    Yields:
-      the id; the point, with indices into `images`.
-    """
+) -> Iterator[tuple[int, pycolmap.Point3D, Observed]]:
+    """The points of a model and their ids, in order, and which of the images observe them."""
     index = {image.image_id: k for k, image in enumerate(images)}
     pixels = [
         np.asarray([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
@@ -170,5 +150,4 @@ def point_tracks(
         for element in point.track.elements:
             k = index[element.image_id]
             seen.setdefault(k, (k, element.point2D_idx, pixels[k][element.point2D_idx]))
-        red, green, blue = (int(c) for c in point.color)
-        yield point_id, PointTrack(point.xyz, (red, green, blue), list(seen.values()))
+        yield point_id, point, list(seen.values())

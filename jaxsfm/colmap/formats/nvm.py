@@ -11,13 +11,11 @@ import pycolmap
 
 from jaxsfm.colmap.formats.lens import (
     Lens,
-    check_centred,
     check_no_blanks,
-    check_no_tangential,
-    check_one_focal,
-    lens_of,
     point_tracks,
+    radial_lens,
     registered_images,
+    row_of,
 )
 from jaxsfm.errors import UserError
 
@@ -28,8 +26,7 @@ MAX_ERROR_PX = 1.0
 def undistortion(lens: Lens) -> float:
     """The coefficient r that undoes k1 and k2 best over the image.
 
-    Raises:
-      UserError: the error that it leaves exceeds MAX_ERROR_PX.
+    Raises UserError if the error that it leaves exceeds MAX_ERROR_PX.
     """
     k1, k2 = lens.radial[:2]
     if k1 == k2 == 0:
@@ -51,38 +48,29 @@ def undistortion(lens: Lens) -> float:
 
 
 def nvm_text(model: pycolmap.Reconstruction) -> str:
-    """The text of the file.
-
-    Raises:
-      UserError: the format cannot express a camera, or a name has a blank in it.
-    """
+    """The text of the file; UserError if the format cannot express a camera or an image's name."""
     images = registered_images(model)
     check_no_blanks([image.name for image in images], "nvm")
-    lenses = [lens_of(model.camera(image.camera_id), "nvm") for image in images]
     fixed = len({image.camera_id for image in images}) == 1
+    lenses = [
+        radial_lens(model.camera(image.camera_id), "nvm", centred=not fixed) for image in images
+    ]
     header = "NVM_V3"
-    for lens in lenses:
-        check_no_tangential(lens, "nvm")
-        if not fixed:
-            check_one_focal(lens, "nvm")
-            check_centred(lens, "nvm")
     if fixed:
         one = lenses[0]
         given = (one.fx, one.cx - 0.5, one.fy, one.cy - 0.5, undistortion(one))
-        header += " FixedK " + " ".join(map(repr, given))
+        header += f" FixedK {row_of(given)}"
     lines = [header, "", str(len(images))]
     for image, lens in zip(images, lenses, strict=True):
         pose = image.cam_from_world()
         x, y, z, w = pose.rotation.quat
         numbers = [lens.fx, w, x, y, z, *image.projection_center(), undistortion(lens)]
-        lines.append(f"{image.name} {' '.join(repr(float(v)) for v in numbers)} 0")
+        lines.append(f"{image.name} {row_of(numbers)} 0")
     lines += ["", str(model.num_points3D())]
-    for _, point in point_tracks(model, images):
+    for _, point, observed in point_tracks(model, images):
         seen = []
-        for k, keypoint, xy in point.seen:
-            mx, my = xy - (lenses[k].cx, lenses[k].cy)
-            seen.append(f"{k} {keypoint} {float(mx)!r} {float(my)!r}")
-        xyz = " ".join(repr(float(v)) for v in point.xyz)
-        colour = " ".join(map(str, point.colour))
-        lines.append(f"{xyz} {colour} {len(seen)} {' '.join(seen)}")
+        for k, keypoint, xy in observed:
+            seen.append(f"{k} {keypoint} {row_of(xy - (lenses[k].cx, lenses[k].cy))}")
+        colour = " ".join(map(str, point.color))
+        lines.append(f"{row_of(point.xyz)} {colour} {len(seen)} {' '.join(seen)}")
     return "\n".join([*lines, "", "0", ""])

@@ -67,7 +67,6 @@ def sfm_data(
       cameras: by image name, of images with and without a pose. For images with a pose they are
         the cameras of the model.
       model: poses and points; None: there are none.
-      root: the photos' folder.
 
     Raises:
       UserError: OpenMVG does not have a camera.
@@ -108,8 +107,8 @@ def sfm_data(
             rotation = image.cam_from_world().rotation.matrix().tolist()
             pose = {"rotation": rotation, "center": image.projection_center().tolist()}
             poses.append((key, pose))
-        for point_id, point in point_tracks(model, images):
-            seen = [(keys[k], {"id_feat": f, "x": (xy - 0.5).tolist()}) for k, f, xy in point.seen]
+        for point_id, point, observed in point_tracks(model, images):
+            seen = [(keys[k], {"id_feat": f, "x": (xy - 0.5).tolist()}) for k, f, xy in observed]
             points.append((point_id, {"X": point.xyz.tolist(), "observations": _keyed(seen)}))
     return {
         "sfm_data_version": "0.3",
@@ -125,10 +124,8 @@ def sfm_data(
 def write_features(folder: Path, tables: Tables) -> None:
     """Write NAME.feat (x y scale orientation on each line), matches.putative.txt and matches.f.txt.
 
-    Views are numbered by name, as in `sfm_data`. Scale and orientation are 1 and 0.
-
-    Raises:
-      UserError: the names of two images differ in folder or ending only.
+    Views are numbered by name, as in `sfm_data`. Scale and orientation are 1 and 0. Raises
+    UserError if the names of two images differ in folder or ending only.
     """
     names = sorted(tables.sizes)
     stems = Counter(PurePosixPath(name).stem for name in names)

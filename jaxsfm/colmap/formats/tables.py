@@ -41,11 +41,9 @@ class Tables(NamedTuple):
 def checked_keypoints(values: np.ndarray, where: str) -> np.ndarray:
     """Check keypoints, and return their (x, y) as float32 (n, 2).
 
-    Args:
-      where: beginning of messages.
-
     Raises:
-      UserError: they are no numbers, have fewer than two columns, or are not finite.
+      UserError: they are no numbers, have fewer than two columns, or are not finite. The message
+        begins with `where`.
     """
     if values.ndim != 2 or values.shape[1] < 2 or values.dtype.kind not in "fiu":
         raise UserError(f"{where}: keypoints must be numbers, n x 2; got {values.shape}")
@@ -63,7 +61,6 @@ def checked_matches(
 
     Args:
       rows: integers (m, 2), columns in the order of `names`.
-      where: beginning of messages.
 
     Returns:
       the pair, with its names in order; int32 (m, 2), with its columns in that order.

@@ -23,11 +23,7 @@ does not print between the progress bars when a worker dies (`WorkerPool` report
 
 
 def import_ray() -> "ModuleType":
-    """Import Ray with `ENVIRONMENT`.
-
-    Raises:
-      UserError: Ray is not installed.
-    """
+    """Import Ray with `ENVIRONMENT`. Raises UserError if it is not installed."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
@@ -43,10 +39,7 @@ def connect(address: str | None) -> Iterator["ModuleType"]:
 
     If this process is connected already, that connection is used. Else it is the cluster at
     `address`, or at RAY_ADDRESS, or the one that runs on this machine, or a new one that lives as
-    long as the block.
-
-    Raises:
-      UserError: Ray is not installed, or there is no cluster at the address.
+    long as the block. Raises UserError if Ray is not installed or no cluster answers.
     """
     ray = import_ray()
     if ray.is_initialized():
@@ -74,11 +67,7 @@ def connect(address: str | None) -> Iterator["ModuleType"]:
 
 
 def _check_answers(address: str | None) -> None:
-    """Check that something listens at an address. Ray itself would try for minutes, and print.
-
-    Raises:
-      UserError: nothing does, or it is no address.
-    """
+    """Raise UserError unless an address answers. Ray itself would try for minutes, and print."""
     if address in (None, "auto", "local"):
         return
     host, _, port = address.rpartition(":")
@@ -111,9 +100,6 @@ def share_cpus(cpus: Sequence[int], workers: int | None, usual: int) -> tuple[in
       cpus: the number of CPUs of each machine.
       workers: the number that was asked for; None: one for every `usual` CPUs of a machine, and at
         least one for each machine.
-
-    Raises:
-      UserError: there are fewer CPUs than workers.
     """
     if workers is None:
         each = min(usual, *cpus)

@@ -8,10 +8,10 @@ Features travel through the object store of Ray.
 
 import dataclasses
 import functools
+import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import jax
 from jax.sharding import NamedSharding, PartitionSpec
@@ -37,12 +37,11 @@ workers have."""
 TASKS_EACH = 4
 """A worker gets at least so many tasks where there is little to do, so that all workers end at
 about the same time."""
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RayEngine:
-    """Workers on a Ray cluster compute (`jaxsfm.matching.engines.Engine`)."""
+    """Workers on a Ray cluster compute."""
 
     address: str | None = None
     """HOST:PORT of the cluster; None: see `jaxsfm.matching.ray.cluster.connect`."""
@@ -60,11 +59,7 @@ class RayEngine:
         config: Config,
         execution: Execution | None = None,
     ) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
-        """As `jaxsfm.matching.extraction.extract_images`, in any order.
-
-        Raises:
-          UserError: also if Ray cannot be used, or loses workers again and again.
-        """
+        """As `jaxsfm.matching.extraction.extract_images`, in any order; UserError also for Ray."""
         ordered = sorted(
             images, key=lambda image: working_size(image.size, config.max_size, config.enlarge)
         )
@@ -72,9 +67,10 @@ class RayEngine:
             return
         work = ExtractionWork(weights, config, execution or Execution())
         with worker_pool(work, address=self.address, workers=self.workers) as pool:
+            size = _task_size(len(ordered), len(pool), TASK_IMAGES)
             tasks = (
                 Task(some, {image.name: pool.put(_bytes(image)) for image in some})
-                for some in _cut(ordered, _task_size(len(ordered), len(pool), TASK_IMAGES))
+                for some in (ordered[k : k + size] for k in range(0, len(ordered), size))
             )
             yield from pool.results(tasks)
 
@@ -88,18 +84,14 @@ class RayEngine:
         seed: int = 0,
         execution: Execution | None = None,
     ) -> Iterator[PairResult]:
-        """As `jaxsfm.matching.pair_matching.match_pairs`, in any order.
-
-        Raises:
-          UserError: also if Ray cannot be used, or loses workers again and again.
-        """
+        """As `jaxsfm.matching.pair_matching.match_pairs`, in any order; UserError also for Ray."""
         named = [make_pair(a, b) for a, b in pairs]
         if not named:
             return
         work = MatchingWork(dict(capacities), config, seed, execution or Execution())
         with worker_pool(work, address=self.address, workers=self.workers) as pool:
             blocks = pair_blocks(named, _task_size(len(named), len(pool), TILE * TILE))
-            touched = [_images(block) for block in blocks]
+            touched = [list(dict.fromkeys(itertools.chain(*block))) for block in blocks]
             cache = ImageCache(lambda name: pool.put(load(name)), touched, CACHED_IMAGES)
             tasks = (
                 Task(block, {name: cache.take(name) for name in names})
@@ -119,14 +111,6 @@ def _bytes(image: ImageFile) -> bytes | ImageError:
 def _task_size(count: int, workers: int, most: int) -> int:
     """How many of `count` items make a task."""
     return min(most, max(1, -(-count // (TASKS_EACH * workers))))
-
-
-def _cut(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    return (items[k : k + size] for k in range(0, len(items), size))
-
-
-def _images(pairs: Iterable[Pair]) -> list[str]:
-    return list(dict.fromkeys(name for pair in pairs for name in pair))
 
 
 def pair_blocks(pairs: Sequence[Pair], size: int) -> list[list[Pair]]:

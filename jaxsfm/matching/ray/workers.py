@@ -9,7 +9,7 @@ import itertools
 import logging
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Generic, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
@@ -19,6 +19,8 @@ from jaxsfm.matching.ray.cluster import connect, worker_resources, xla_threads
 
 if TYPE_CHECKING:
     from types import ModuleType
+
+    from ray.actor import ActorHandle
 
 TASKS_PER_WORKER = 2
 """Tasks that a worker has at most: one to do and the next one, so that it need not wait."""
@@ -42,21 +44,6 @@ class Task(NamedTuple, Generic[Item]):
     items: Sequence[Item]
     objects: Mapping[str, object]
     """References into Ray's object store, by name; the objects live while somebody holds them."""
-
-
-class _Versions(Protocol):
-    def remote(self) -> object: ...
-
-
-class _Run(Protocol):
-    def remote(self, *arguments: object) -> Iterator[object]: ...
-
-
-class _Actor(Protocol):
-    """Ray's handle of a `_Worker`."""
-
-    versions: _Versions
-    run: _Run
 
 
 class _Worker:
@@ -90,7 +77,7 @@ class _Running(NamedTuple, Generic[Item]):
 class _Slot(Generic[Item]):
     """A place for a worker: the worker that has it now, and the tasks of that worker."""
 
-    def __init__(self, start: Callable[[], _Actor]) -> None:
+    def __init__(self, start: "Callable[[], ActorHandle[_Worker]]") -> None:
         self._start = start
         self.begin()
 
@@ -249,15 +236,14 @@ def worker_pool(
 ) -> Iterator[WorkerPool[Item, Result]]:
     """Start workers that live as long as the block (`worker_resources` says how many).
 
-    Raises:
-      UserError: Ray cannot be used (`connect`), or the cluster has too few CPUs or GPUs.
+    Raises UserError if Ray cannot be used (`connect`), or has too few CPUs or GPUs.
     """
     with connect(address) as ray:
         count, needs = worker_resources(ray, workers)
         actor = ray.remote(**needs, max_restarts=0, max_task_retries=0)(_Worker)
         environment = {"env_vars": {"NPROC": str(xla_threads())}}
 
-        def start() -> _Actor:
+        def start() -> "ActorHandle[_Worker]":
             return actor.options(runtime_env=environment).remote()
 
         pool = WorkerPool(ray, [_Slot(start) for _ in range(count)], work)

@@ -31,7 +31,7 @@ def data_uri(rgb: np.ndarray, suffix: str) -> str:
     """Colours uint8 (h, w, 3) as the address of an <img>.
 
     Args:
-      suffix: .jpg or .png. OpenCV encodes both, see jaxsfm.colmap.database.
+      suffix: .jpg or .png. OpenCV encodes both, see jaxsfm.colmap.
     """
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if suffix == ".jpg" else []
     ok, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)

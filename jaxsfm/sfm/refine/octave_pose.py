@@ -154,7 +154,6 @@ def _step(
 
     Args:
       view: that of the pose, in pixels of the octave.
-      seen: the points that agreed.
       px: working pixels per pixel of the octave.
 
     Returns:

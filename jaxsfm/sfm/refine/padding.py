@@ -26,11 +26,7 @@ def padded(image: np.ndarray) -> PaddedImage:
 
 
 def chunks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-    """Cut indices (n,) into chunks of CHUNK.
-
-    Yields:
-      the indices of a chunk, filled up with its first one; how many of them count.
-    """
+    """Chunks of CHUNK indices (n,), filled up with their first one, and how many of each count."""
     for start in range(0, len(rows), CHUNK):
         piece = rows[start : start + CHUNK]
         filled = np.full(CHUNK, piece[0])

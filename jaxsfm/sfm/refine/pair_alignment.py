@@ -35,13 +35,9 @@ class AlignedMatches(NamedTuple):
 
 
 def local_map(h: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Map points by homographies, and small offsets around them.
+    """Map points (n, 2) by homographies (n, 3, 3), and small offsets around them.
 
     Source: Hartley and Zisserman, 2nd ed., section 2.2 (the affinity that agrees to first order).
-
-    Args:
-      h: (n, 3, 3).
-      xy: (n, 2).
 
     Returns:
       (n, 2) points; (n, 2, 2) derivatives there.

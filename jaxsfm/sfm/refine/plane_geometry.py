@@ -66,11 +66,7 @@ def normals(model: Model, *, neighbours: int) -> np.ndarray:
 
 
 def visibility(model: Model, normal: np.ndarray) -> Visibility:
-    """How every view would see every point's plane.
-
-    Args:
-      normal: (n, 3), of the model's points.
-    """
+    """How every view would see every point's plane, of normals (n, 3)."""
     tracks = model.tracks
     n, v = len(tracks.points), len(model.views)
     cosine, log_scale = np.zeros((n, v)), np.zeros((n, v))

@@ -117,16 +117,10 @@ def _align(
 
 
 def neighbourhoods(tracks: Tracks, count: int) -> np.ndarray:
-    """Order points so that those that the same views see are near each other.
+    """The indices (n,) of points, so that those that the same views see are near each other.
 
-    Points are ordered by their first view, and the views so that those that see the same points
-    follow each other (reverse Cuthill-McKee).
-
-    Args:
-      count: number of views.
-
-    Returns:
-      int (n,): the points' indices in that order.
+    Points are ordered by their first view, and the `count` views so that those that see the same
+    points follow each other (reverse Cuthill-McKee).
     """
     shape = (len(tracks.points), count)
     seen = coo_array((np.ones(len(tracks.point)), (tracks.point, tracks.view)), shape=shape).tocsr()

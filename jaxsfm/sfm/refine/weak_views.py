@@ -104,11 +104,10 @@ def _starts(
     refinement: Refinement,
     refine_intrinsics: bool,
 ) -> dict[int, list[PoseHypothesis]]:
-    """The poses to follow, for each wanted image.
+    """The poses to follow, for each wanted image (an index).
 
     Args:
       images: the views of the structure, and behind them those without a pose.
-      wanted: indices of images.
     """
     normal = plane_geometry.normals(structure, neighbours=refinement.neighbours)
     cameras = [view.camera.camera_id for view in images]

@@ -56,11 +56,9 @@ def grow(
     """Register views until a round registers none. The views of one round do not see each other.
 
     Args:
-      unregistered: by name.
       matches: of unregistered views with views and with each other, original pixels.
       read: intensities of all these views, by name.
       refinement: the model's; None: it was not refined.
-      seed: for RANSAC.
       on_view: called for every view that is registered.
     """
     placed: list[str] = []

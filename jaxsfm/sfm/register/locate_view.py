@@ -37,29 +37,29 @@ CELL_PX = 8
 class Localization:
     """The outcome for a photo."""
 
-    view: View | None
+    view: View | None = None
     """The photo with its pose. None: neither alignment confirms a pose nor do 30 matches agree."""
-    trusted: bool
+    trusted: bool = False
     """Alignment confirms the pose. Otherwise it rests on matches alone."""
     why: str | None
     """Why it has no pose, or none that is trusted."""
     on_surface: int
     """Matches with the surface of the model under them."""
-    inliers: int
+    inliers: int = 0
     """Matches on the surface that agree with the resection."""
-    candidates: int
+    candidates: int = 0
     """Points of the model that it could show."""
-    agreed: int
+    agreed: int = 0
     """Candidates that alignment finds there."""
-    octave_px: int | None
+    octave_px: int | None = None
     """Working pixels per pixel of the octave that gives the pose; None: it is not trusted."""
-    error_px: float | None
+    error_px: float | None = None
     """Median distance of what determines the pose from where the pose puts it, working pixels."""
-    doubt_px: float | None
+    doubt_px: float | None = None
     """How far off projections are expected to be, working pixels (`OctavePose.doubt_px`)."""
-    centre_error: float | None
+    centre_error: float | None = None
     """Expected error of the centre, units of the model. The model's own error comes on top."""
-    rotation_error_deg: float | None
+    rotation_error_deg: float | None = None
     """Expected error of the rotation. The model's own error comes on top."""
     points: AlignedPoints | None = None
     """The points that it shows, if the pose is trusted; working pixels."""
@@ -79,12 +79,10 @@ def locate(
 
     Args:
       image: size, pixels and camera of the photo; its pose plays no part.
-      model: a model, or a part of one.
       matches: of the photo with the views, original pixels.
       read: intensities of the photo and of the views, by name.
       own_camera: estimate the focal length too. It is estimated from nothing, unless the camera's
         was known before (`has_prior_focal_length`).
-      seed: for RANSAC in the resection.
     """
     if not len(model.tracks.points):
         return _nowhere(0, matches)
@@ -109,9 +107,9 @@ def locate(
         follow([pose], model, read, refinement)
     best = trusted(pose)
     if best is None and near.sum() < MIN_COUNT:
-        return dataclasses.replace(
-            _nowhere(len(xy), matches),
+        return Localization(
             why=_doubtful(pose, int(near.sum()), len(xy)),
+            on_surface=len(xy),
             inliers=int(near.sum()),
             candidates=pose.candidates,
             agreed=pose.agreed,
@@ -154,20 +152,7 @@ def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Localizatio
         )
     else:
         why = f"no pose agrees with enough of the {on_surface} matches on the model's surface"
-    return Localization(
-        view=None,
-        trusted=False,
-        why=why,
-        on_surface=on_surface,
-        inliers=0,
-        candidates=0,
-        agreed=0,
-        octave_px=None,
-        error_px=None,
-        doubt_px=None,
-        centre_error=None,
-        rotation_error_deg=None,
-    )
+    return Localization(why=why, on_surface=on_surface)
 
 
 def _doubtful(pose: PoseHypothesis, inliers: int, on_surface: int) -> str:
