@@ -46,6 +46,7 @@ def _configs() -> dict[str, Config]:
     }
     return {
         "paper-grid": dataclasses.replace(paper, keypoints="grid"),
+        "paper-grid-80px": dataclasses.replace(paper, keypoints="grid", threshold_px=80.0),
         "paper": paper,
         "paper-learned": dataclasses.replace(paper, keypoints="learned"),
         **{
@@ -59,9 +60,13 @@ def _configs() -> dict[str, Config]:
 
 
 CONFIGS = _configs()
-"""The configuration of each method: a preset; a preset with other keypoints; `grid`, `reloc` and
-`learned`, which are the preset `default` without refinement and alignment; and PRESET-IDEA, which
-is a preset changed by an entry of `ABLATIONS`."""
+"""The configuration of each method.
+
+A method is a preset; the preset `paper` with other keypoints; `grid`, `reloc` or `learned`, which
+are the preset `default` without refinement and alignment; or PRESET-IDEA, which is a preset changed
+by an entry of `ABLATIONS`. `paper-grid-80px` has the threshold of the authors' experiments without
+relocalization: ten cells, because their keypoints were then counted in cells.
+"""
 PAIR_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-placing")))
 """The methods of the benchmarks of pairs.
 

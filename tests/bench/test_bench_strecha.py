@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from jaxsfm.bench.methods import method_config
-from jaxsfm.bench.strecha import ratios
+from jaxsfm.bench.strecha import PUBLISHED, means, ratios, table_lines
 from jaxsfm.bench.strecha_sets import find_sets
 from jaxsfm.cli.main import main
 from jaxsfm.config import preset
@@ -93,10 +93,38 @@ def test_ratios_are_means_of_the_sets_ratios():
     }
 
 
+def test_the_table_ends_with_the_means_of_the_sets_and_the_published_ones():
+    rows = [row("a", "paper", 1.0, 10), row("b", "paper", 3.0, 10), row("b", "paper-grid", 2.0, 1)]
+    rows.append({"set": "a", "method": "paper-grid", "position": None, "rotation_deg": None})
+    got = means(rows)
+    assert got == {
+        "paper": {"sets": 2, "position": 2.0, "rotation_deg": 4.0},
+        "paper-grid": {"sets": 1, "position": 2.0, "rotation_deg": 4.0},
+    }
+    lines = table_lines({"rows": [], "summary": {"means": got, "ratios": {}}})
+    assert lines[1].split() == ["mean", "of", "2", "sets", "paper", "2.0000", "4.0000"]
+    for (name, (position, rotation)), line in zip(PUBLISHED.items(), lines[-2:], strict=True):
+        assert line.startswith("published") and name in line
+        assert [float(value) for value in line.split()[-2:]] == [position, rotation]
+
+
+@pytest.mark.slow
+def test_only_the_best_pairs_are_mapped(root, tmp_path):
+    """Three views have three pairs; with one pair for each view, one of them is not mapped."""
+    args = ["bench", "strecha", "--root", str(root), "--methods", "paper", "--threads", "1"]
+    handed = []
+    for name, more in (("all", []), ("best", ["--best-pairs", "1"])):
+        assert main([*args, *more, "--out", str(tmp_path / name)]) == 0
+        report = json.loads((tmp_path / name / "room/paper/report.json").read_text())
+        handed.append(report["pairs"]["handed_on"])
+    assert handed == [3, 2]
+
+
 @pytest.mark.parametrize(
     ("args", "word"),
     [
         (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}", "--best-pairs", "0"], "--best-pairs"),
         (["--root", "{root}", "--methods", "reloc", "--weights", "/nowhere"], "/nowhere: cannot"),
         (["--root", "{root}", "--sets", "cathedral"], "no set 'cathedral'"),
         (["--root", "{root}/room"], "no Strecha sets"),
