@@ -11,29 +11,28 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NotRequired, TypedDict
 
-import numpy as np
-
 from jaxsfm.bench import scenes
-from jaxsfm.bench.figures import collect
-from jaxsfm.bench.methods import RUN_ABLATED
+from jaxsfm.bench.curves import write_curves
+from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
+from jaxsfm.bench.methods import RUN_METHODS
 from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.bench.subset_models import SubsetModel, dense_models, rootsift_models
 from jaxsfm.colmap.poses import Poses
 from jaxsfm.errors import UserError
-from jaxsfm.io.versions import package_versions
 from jaxsfm.sfm.evaluation import evaluate
 
-METHODS = ("rootsift", "paper-grid", "paper", "default", "robust", "paper-learned", *RUN_ABLATED)
-"""paper-grid is the preset `paper` with keypoints at cell centres. (The paper's own row without
-relocalization has keypoints at the corners of cells and a threshold of 80 px.)"""
 LIMITS = ((0.1, 1.0), (0.5, 10.0), (1.0, 10.0), (5.0, 10.0), (10.0, 10.0), (20.0, 10.0))
 """Limits of the position error (units of the reference, metres for Strecha and Aachen) and of the
 rotation error (degrees)."""
-PUBLISHED = (
-    "published (Widya et al. 2018, Aachen, 98 subsets of 20 day + 1 night): registered night / day "
-    "DoG + RootSIFT 48 / 1910, dense without relocalization 95 / 1924, with 96 / 1944"
-)
+PUBLISHED = {
+    "DoG + RootSIFT": (48, 1910, (15.31, 25.61, 36.73, 35.71, 39.80)),
+    "dense, no relocalization": (95, 1924, (5.10, 14.29, 45.92, 61.22, 69.39)),
+    "dense + relocalization": (96, 1944, (18.37, 33.67, 69.39, 81.63, 82.65)),
+}
+"""What the paper reports (Widya et al. 2018, table 2) for 98 subsets of Aachen, each of 20 day
+photos and a night photo: registered night photos, registered day photos, and the percentages of the
+night photos within 0.5, 1, 5, 10 and 20 m and 10 degrees."""
 
 
 class SubsetRow(TypedDict):
@@ -62,10 +61,13 @@ class Summary(TypedDict):
     day_registered: int
     matches: int | None
     correct: int | None
+    nights_with_reference: int
+    """The number of nights that `within` counts, registered or not."""
     within: dict[str, float] | None
     not_evaluated: int
     sorted_positions: list[float]
-    median_rotation_deg: float | None
+    """The position errors of the nights that were evaluated, units of the reference."""
+    sorted_rotations_deg: list[float]
 
 
 class DayNightRow(Summary):
@@ -79,17 +81,8 @@ class DayNightRow(Summary):
     subsets: list[SubsetRow]
 
 
-class DayNightFigures(TypedDict):
-    """The figures of the benchmark, as JSON."""
-
-    benchmark: str
-    versions: dict[str, str]
-    seed: int
-    denoise: bool
-    jpeg: bool
-    rows: list[DayNightRow]
-    totals: dict[str, Summary]
-    published: str
+Totals = dict[str, Summary]
+"""The figures of all scenes, by method."""
 
 
 def judge(made: SubsetModel, subset: Subset, truth: Poses) -> SubsetRow:
@@ -118,6 +111,11 @@ def judge(made: SubsetModel, subset: Subset, truth: Poses) -> SubsetRow:
     return row
 
 
+def limit_name(position: float, rotation_deg: float) -> str:
+    """The name of a limit in tables and figures."""
+    return f"{position:g}; {rotation_deg:g} deg"
+
+
 def summary(rows: Sequence[SubsetRow]) -> Summary:
     """The figures of several subsets together.
 
@@ -133,7 +131,7 @@ def summary(rows: Sequence[SubsetRow]) -> Summary:
     correct = [row["correct"] for row in rows if "correct" in row]
     known = sum(row["has_truth"] for row in rows)
     within = {
-        f"{d:g}; {deg:g} deg": sum(p <= d and r <= deg for p, r in judged) / known
+        limit_name(d, deg): sum(p <= d and r <= deg for p, r in judged) / known
         for d, deg in LIMITS
         if known
     }
@@ -144,16 +142,17 @@ def summary(rows: Sequence[SubsetRow]) -> Summary:
         "day_registered": sum(row["day_registered"] for row in rows),
         "matches": sum(matches) if matches else None,
         "correct": sum(correct) if correct else None,
+        "nights_with_reference": known,
         "within": within or None,
         "not_evaluated": sum("not_evaluated" in row for row in rows),
         "sorted_positions": sorted(position for position, _ in judged),
-        "median_rotation_deg": float(np.median([r for _, r in judged])) if judged else None,
+        "sorted_rotations_deg": sorted(rotation for _, rotation in judged),
     }
 
 
-def bench_daynight(options: DayNightOptions) -> DayNightFigures:
+def bench_daynight(options: DayNightOptions) -> BenchFigures[DayNightRow, Totals]:
     """Run all methods on all subsets of all scenes (`jaxsfm.bench.scenes`)."""
-    methods = options.chosen_methods(METHODS)
+    methods = options.chosen_methods(RUN_METHODS)
     folders = scenes.find_scenes(options.root, options.chosen_sets())
     ready: dict[str, Scene] = {}
     for name, folder in folders.items():  # all inputs are read before the first long run
@@ -174,23 +173,30 @@ def bench_daynight(options: DayNightOptions) -> DayNightFigures:
                 for method in methods:
                     yield _row(name, scene, method, scratch, options)
 
-    def figures(measured: list[DayNightRow]) -> DayNightFigures:
-        totals = {
-            method: summary([s for r in measured if r["method"] == method for s in r["subsets"]])
-            for method in dict.fromkeys(row["method"] for row in measured)
-        }
-        return {
-            "benchmark": "daynight",
-            "versions": package_versions(),
-            "seed": options.seed,
-            "denoise": options.denoise,
-            "jpeg": options.jpeg,
-            "rows": measured,
-            "totals": totals,
-            "published": PUBLISHED,
-        }
+    figures = collect("daynight", rows(), totals, cells, options)
+    if options.curves is not None:
+        whole = {m: of for m, of in figures["summary"].items() if of["nights_with_reference"]}
+        write_curves(
+            options.curves,
+            {
+                "position error, units of the reference": {
+                    method: of["sorted_positions"] for method, of in whole.items()
+                },
+                "rotation error, degrees": {
+                    method: of["sorted_rotations_deg"] for method, of in whole.items()
+                },
+            },
+            {method: of["nights_with_reference"] for method, of in whole.items()},
+        )
+    return figures
 
-    return collect(rows(), figures, line=row_line, json_file=options.json)
+
+def totals(rows: Sequence[DayNightRow]) -> Totals:
+    """The figures of all scenes together, by method."""
+    return {
+        method: summary([s for row in rows if row["method"] == method for s in row["subsets"]])
+        for method in dict.fromkeys(row["method"] for row in rows)
+    }
 
 
 def _row(
@@ -215,34 +221,48 @@ def _row(
     }
 
 
-HEADER = (
-    f"{'scene':24s} {'method':9s} {'night':>7s} {'day':>9s} "
-    + " ".join(f"{f'{d:g}; {deg:g}':>8s}" for d, deg in LIMITS)
-    + f" {'correct':>9s} {'matches':>9s} {'seconds':>8s}"
-)
+def _figures(row: Summary) -> Cells:
+    found = {
+        "night": f"{row['night_registered']}/{row['nights']}",
+        "day": f"{row['day_registered']}/{row['day_images']}",
+        **{limit: f"{share:.0%}" for limit, share in (row["within"] or {}).items()},
+    }
+    if row["matches"] is not None:
+        found |= {"correct": str(row["correct"]), "matches": str(row["matches"])}
+    return found
 
 
-def _figures(row: Summary) -> str:
-    shares = row["within"].values() if row["within"] else [None] * len(LIMITS)
-    within = " ".join(f"{'-':>8s}" if share is None else f"{share:8.0%}" for share in shares)
-    counts = ("-" if row[key] is None else str(row[key]) for key in ("correct", "matches"))
-    return (
-        f"{row['night_registered']:3d}/{row['nights']:<3d} "
-        f"{row['day_registered']:4d}/{row['day_images']:<4d} {within} "
-        + " ".join(f"{count:>9s}" for count in counts)
-    )
-
-
-def row_line(row: DayNightRow) -> str:
-    """One line of the table."""
+def cells(row: DayNightRow) -> Cells:
+    """A row of the table: registered nights and days, shares of nights within limits, matches."""
     kind = f" synthetic {row['severity']:g}" if row["synthetic"] else ""
-    return f"{row['scene'] + kind:24s} {row['method']:9s} {_figures(row)} {row['seconds']:8.1f}"
+    return {
+        "scene": row["scene"] + kind,
+        "method": row["method"],
+        **_figures(row),
+        "seconds": f"{row['seconds']:.1f}",
+    }
 
 
-def table_lines(result: DayNightFigures) -> list[str]:
-    """The table: registered nights and days, shares of the nights within the limits, matches."""
-    lines = [HEADER, *(row_line(row) for row in result["rows"])]
-    lines += [f"{'all':24s} {m:9s} {_figures(row)}" for m, row in result["totals"].items()]
+def table_lines(result: BenchFigures[DayNightRow, Totals]) -> list[str]:
+    """The table of all scenes, with the totals and the paper's own rows."""
+    whole = [
+        {"scene": "all", "method": method, **_figures(row)}
+        for method, row in result["summary"].items()
+    ]
+    published = [
+        {
+            "scene": "published, Aachen",
+            "method": method,
+            "night": f"{night}/98",
+            "day": f"{day}/1960",
+            **{
+                limit_name(*limit): f"{percent:.0f}%"
+                for limit, percent in zip(LIMITS[1:], within, strict=True)
+            },
+        }
+        for method, (night, day, within) in PUBLISHED.items()
+    ]
+    lines = table([*map(cells, result["rows"]), *whole, *published])
     for row in result["rows"]:
         if row["not_evaluated"]:
             why = next(s["not_evaluated"] for s in row["subsets"] if "not_evaluated" in s)
@@ -250,4 +270,4 @@ def table_lines(result: DayNightFigures) -> list[str]:
                 f"{row['scene']} {row['method']}: {row['not_evaluated']} nights registered but not "
                 f"evaluated, e.g. {why}"
             )
-    return [*lines, result["published"]]
+    return lines

@@ -1,16 +1,33 @@
-"""Figures that a benchmark measures: spreads over seeds, rows of a table, JSON."""
+"""Figures that a benchmark measures: spreads over seeds, tables, JSON."""
 
+import dataclasses
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypedDict, TypeVar
+from typing import Generic, TypedDict, TypeVar
 
 import numpy as np
 
+from jaxsfm.bench.options import BenchOptions
 from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.versions import package_versions
 
 Row = TypeVar("Row")
-Figures = TypeVar("Figures", bound=Mapping[str, object])
+Summary = TypeVar("Summary")
+Cells = dict[str, str]
+"""One row of a table as text, by the heads of its columns."""
+
+
+class BenchFigures(TypedDict, Generic[Row, Summary]):
+    """The figures of a benchmark, as JSON."""
+
+    benchmark: str
+    versions: dict[str, str]
+    options: dict[str, object]
+    """The options of the command; paths are text."""
+    rows: list[Row]
+    summary: Summary
+    """Figures over all rows."""
 
 
 class Spread(TypedDict):
@@ -28,30 +45,55 @@ def spread(values: Iterable[float]) -> Spread:
 
 
 def collect(
+    benchmark: str,
     rows: Iterable[Row],
-    figures: Callable[[list[Row]], Figures],
-    *,
-    line: Callable[[Row], str],
-    json_file: Path | None,
-) -> Figures:
+    summary: Callable[[list[Row]], Summary],
+    cells: Callable[[Row], Cells],
+    options: BenchOptions,
+) -> BenchFigures[Row, Summary]:
     """Measure all rows and return their figures.
 
     Each row is printed as soon as it is measured, and the JSON file is written anew with all rows
     so far, because a benchmark may run for hours and be interrupted.
 
     Args:
+      benchmark: the name of the benchmark.
       rows: measures one row after the other.
-      figures: joins rows to what is written and returned.
-      line: a row as one line of the table.
-      json_file: where the figures are written; None writes none.
+      summary: the figures over all rows.
+      cells: a row as text.
+      options: the options of the command.
     """
-    measured: list[Row] = []
+    figures: BenchFigures[Row, Summary] = {
+        "benchmark": benchmark,
+        "versions": package_versions(),
+        "options": json.loads(json.dumps(dataclasses.asdict(options), default=str)),
+        "rows": [],
+        "summary": summary([]),
+    }
     for row in rows:
-        measured.append(row)
-        print(line(row), flush=True)
-        if json_file is not None:
-            write_json(json_file, figures(measured))
-    return figures(measured)
+        figures["rows"].append(row)
+        figures["summary"] = summary(figures["rows"])
+        print(", ".join(f"{head} {text}" for head, text in cells(row).items()), flush=True)
+        if options.json is not None:
+            write_json(options.json, figures)
+    return figures
+
+
+def table(rows: Sequence[Cells], *, names: int = 2) -> list[str]:
+    """Rows as lines of text with a line of heads; text that a row does not have stays blank.
+
+    The first `names` columns are aligned to the left.
+    """
+    heads = list(dict.fromkeys(head for row in rows for head in row))
+    lines = [heads, *([row.get(head, "") for head in heads] for row in rows)]
+    widths = [max(len(line[k]) for line in lines) for k in range(len(heads))]
+    return [
+        "  ".join(
+            text.ljust(width) if k < names else text.rjust(width)
+            for k, (text, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
 
 
 def write_json(path: Path, figures: Mapping[str, object]) -> None:

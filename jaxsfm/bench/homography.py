@@ -15,9 +15,10 @@ from typing import NamedTuple, TypedDict
 import cv2
 import numpy as np
 
-from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, table
 from jaxsfm.bench.inputs import check_root, choose_sets, read_rows, usable_image
-from jaxsfm.bench.matches import PAIR_METHODS, Matcher, Matches, PairFigures, pair_figures
+from jaxsfm.bench.matches import Matcher, Matches
+from jaxsfm.bench.methods import PAIR_METHODS
 from jaxsfm.bench.options import HomographyOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import SUFFIXES, ImageFile
@@ -154,7 +155,7 @@ def read_sequence(folder: Path) -> list[KnownPair]:
     return [pairs[other] for other in sorted(pairs)]
 
 
-def bench_homography(options: HomographyOptions) -> PairFigures[HomographyRow, Means]:
+def bench_homography(options: HomographyOptions) -> BenchFigures[HomographyRow, Means]:
     """Run all methods on all sequences."""
     methods = options.chosen_methods(PAIR_METHODS)
     check_root(options.root)
@@ -176,12 +177,7 @@ def bench_homography(options: HomographyOptions) -> PairFigures[HomographyRow, M
                     runs = matcher.match(pair.image0, pair.image1, method)
                     yield _row(name, pair, method, runs)
 
-    return collect(
-        rows(),
-        lambda measured: pair_figures("homography", measured, means(measured), options),
-        line=row_line,
-        json_file=options.json,
-    )
+    return collect("homography", rows(), means, cells, options)
 
 
 def _row(name: str, pair: KnownPair, method: str, runs: Sequence[Matches]) -> HomographyRow:
@@ -223,32 +219,35 @@ def means(rows: Sequence[HomographyRow]) -> Means:
     return result
 
 
-HEADER = (
-    f"{'pair':20s} {'method':9s} {'matches':>8s} {'<= 3 px':>8s} "
-    + " ".join(f"{f'acc {t}':>7s}" for t in ACCURACY_PX)
-    + f" {'corner':>9s} {'seconds':>8s}"
-)
+def cells(row: HomographyRow) -> Cells:
+    """A row of the table, with the median corner error over the seeds."""
+    return {
+        "pair": row["pair"],
+        "method": row["method"],
+        "matches": f"{row['matches']['mean']:.0f}",
+        "<= 3 px": f"{row['correct']['3']['mean']:.0f}",
+        **{f"accuracy {t}": f"{row['accuracy'][str(t)]['mean']:.3f}" for t in ACCURACY_PX},
+        "corner error": f"{np.median(_with_inf(row['corner_error_px'])):.2f}",
+        "seconds": f"{row['seconds']:.2f}",
+    }
 
 
-def row_line(row: HomographyRow) -> str:
-    """One line of the table, with the median corner error over the seeds."""
-    accuracy = " ".join(f"{row['accuracy'][str(t)]['mean']:7.3f}" for t in ACCURACY_PX)
-    return (
-        f"{row['pair']:20s} {row['method']:9s} {row['matches']['mean']:8.0f} "
-        f"{row['correct']['3']['mean']:8.0f} {accuracy} "
-        f"{np.median(_with_inf(row['corner_error_px'])):9.2f} {row['seconds']:8.2f}"
-    )
+def _mean_cells(method: str, name: str, mean: dict[str, float]) -> Cells:
+    return {
+        "pair": f"mean of {name}",
+        "method": method,
+        "matches": f"{mean['matches']:.0f}",
+        "<= 3 px": f"{mean['correct_3']:.0f}",
+        **{f"accuracy {t}": f"{mean[f'accuracy_{t}']:.3f}" for t in ACCURACY_PX},
+        **{f"corner AUC {t}": f"{mean[f'corner_auc_{t}']:.3f}" for t in CORNER_PX},
+    }
 
 
-def table_lines(result: PairFigures[HomographyRow, Means]) -> list[str]:
+def table_lines(result: BenchFigures[HomographyRow, Means]) -> list[str]:
     """The table: accuracy by pair, then the means of each sequence and its areas under curves."""
-    lines = [HEADER, *(row_line(row) for row in result["rows"])]
-    for method, sets in result["means"].items():
-        for name, m in sets.items():
-            accuracy = " ".join(f"{m[f'accuracy_{t}']:7.3f}" for t in ACCURACY_PX)
-            areas = ", ".join(f"{m[f'corner_auc_{t}']:.3f}" for t in CORNER_PX)
-            lines.append(
-                f"{'mean of ' + name:20s} {method:9s} {m['matches']:8.0f} {m['correct_3']:8.0f} "
-                f"{accuracy} AUC 3, 5, 10 px: {areas}"
-            )
-    return lines
+    means_of_sets = [
+        _mean_cells(method, name, mean)
+        for method, sets in result["summary"].items()
+        for name, mean in sets.items()
+    ]
+    return table([*map(cells, result["rows"]), *means_of_sets])

@@ -4,11 +4,11 @@ import functools
 import tempfile
 import time
 from pathlib import Path
-from typing import Generic, NamedTuple, TypedDict, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.methods import KEYPOINTS, PAIR_ABLATED, method_config
+from jaxsfm.bench.methods import method_config
 from jaxsfm.bench.options import PairOptions
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database
@@ -16,30 +16,13 @@ from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.config import BackboneName, Config
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
-from jaxsfm.io.versions import package_versions
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import match_features
 from jaxsfm.sfm.refine.pair_alignment import align
 
-PAIR_METHODS = (
-    "rootsift",
-    "paper",
-    "paper-learned",
-    *KEYPOINTS,
-    "default",
-    "robust",
-    *PAIR_ABLATED,
-)
-"""The methods that the benchmarks of pairs know (`jaxsfm.bench.methods.method_config`).
-
-`rootsift` is COLMAP's own features and matcher with the ratio test, before any geometry. The others
-are verified by homographies, and aligned where the method does so, as `jaxsfm match` does.
-"""
 FEATURES = 8
 """How many images' features are held: those of two images for each of four methods."""
-Row = TypeVar("Row")
-Means = TypeVar("Means")
 
 
 class Matches(NamedTuple):
@@ -50,17 +33,6 @@ class Matches(NamedTuple):
     xy1: np.ndarray
     seconds: float
     """Time of extracting both images and of matching; the first image of a size also compiles."""
-
-
-class PairFigures(TypedDict, Generic[Row, Means]):
-    """The figures of a benchmark of pairs, as JSON."""
-
-    benchmark: str
-    versions: dict[str, str]
-    seeds: int
-    max_size: int | None
-    rows: list[Row]
-    means: Means
 
 
 class Matcher:
@@ -80,7 +52,7 @@ class Matcher:
 
         Args:
           image0, image1: two images of one folder, called by their files' names.
-          method: one of `PAIR_METHODS`.
+          method: one of `jaxsfm.bench.methods.PAIR_METHODS`.
         """
         seeds = range(self._options.seeds)
         if method == "rootsift":
@@ -121,17 +93,3 @@ def _rootsift(image0: ImageFile, image1: ImageFile) -> tuple[np.ndarray, np.ndar
             VerificationOptions(min_inliers=8),
         )
         return read_matches(database, (image0.name, image1.name), verified=False)
-
-
-def pair_figures(
-    benchmark: str, rows: list[Row], means: Means, options: PairOptions
-) -> PairFigures[Row, Means]:
-    """The figures of a benchmark of pairs, with what they were measured by."""
-    return {
-        "benchmark": benchmark,
-        "versions": package_versions(),
-        "seeds": options.seeds,
-        "max_size": options.max_size,
-        "rows": rows,
-        "means": means,
-    }

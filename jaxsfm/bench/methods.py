@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 
-from jaxsfm.config import PRESETS, Config, Keypoints, preset
+from jaxsfm.config import Config, Keypoints, preset
 
 
 def _with_pair(config: Config, **changes: int) -> Config:
@@ -31,48 +31,63 @@ Each change leaves out one idea of the preset or exchanges it for another one. `
 models and leaves matches as they are; `no-alignment` changes the matches of single pairs and leaves
 models as they are.
 """
-ABLATED = tuple(
-    f"{name}-{idea}"
-    for name in ("default", "robust")
-    for idea, without in ABLATIONS.items()
-    if without(preset(name)) != preset(name)
-)
-"""All methods PRESET-IDEA; an idea that a preset does not have cannot be left out."""
 KEYPOINTS: dict[str, Keypoints] = {"grid": "grid", "reloc": "relocalized", "learned": "learned"}
 """Methods that differ only in the place of a keypoint within its cell."""
-PAIR_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-placing"))
-RUN_ABLATED = tuple(method for method in ABLATED if not method.endswith("-no-alignment"))
+
+
+def _configs() -> dict[str, Config]:
+    paper, default = preset("paper"), preset("default")
+    unrefined = dataclasses.replace(default, aligned_octaves=0, refinement=None)
+    ablated = {
+        f"{name}-{idea}": without(preset(name))
+        for name in ("default", "robust")
+        for idea, without in ABLATIONS.items()
+        if without(preset(name)) != preset(name)  # an idea that it does not have
+    }
+    return {
+        "paper-grid": dataclasses.replace(paper, keypoints="grid"),
+        "paper-grid-80px": dataclasses.replace(paper, keypoints="grid", threshold_px=80.0),
+        "paper": paper,
+        "paper-learned": dataclasses.replace(paper, keypoints="learned"),
+        **{
+            name: dataclasses.replace(unrefined, keypoints=keypoints)
+            for name, keypoints in KEYPOINTS.items()
+        },
+        "default": default,
+        "robust": preset("robust"),
+        **ablated,
+    }
+
+
+CONFIGS = _configs()
+"""The configuration of each method.
+
+A method is a preset; the preset `paper` with other keypoints; `grid`, `reloc` or `learned`, which
+are the preset `default` without refinement and alignment; or PRESET-IDEA, which is a preset changed
+by an entry of `ABLATIONS`. `paper-grid-80px` has the threshold of the authors' experiments without
+relocalization: ten cells, because their keypoints were then counted in cells.
+"""
+PAIR_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-placing")))
+"""The methods of the benchmarks of pairs.
+
+`rootsift` is COLMAP's own features and matcher with the ratio test, before any geometry. The others
+are verified by homographies, and aligned where the method does so, as `jaxsfm match` does.
+"""
+RUN_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-alignment")))
+"""The methods of the benchmarks of whole reconstructions."""
 
 
 def method_config(method: str, *, max_size: int | None = None) -> Config:
     """The configuration of a method.
 
     Args:
-      method: the name of a preset; PRESET-IDEA, which is a preset changed by an entry of
-        `ABLATIONS`; `paper-grid` or `paper-learned`, which are the preset `paper` with keypoints at
-        cell centres or chosen by learned scores; or `grid`, `reloc` or `learned`, which are the
-        preset `default` without refinement and alignment, with keypoints at cell centres, at the
-        largest norms or chosen by learned scores.
-      max_size: the longer side of the working images in pixels; None keeps the preset's.
+      method: one of `CONFIGS`.
+      max_size: the longer side of the working images in pixels; None keeps the method's.
 
     Raises:
       ValueError: there is no such method.
     """
-    if method in PRESETS:
-        config = preset(method)
-    elif method in ABLATED:
-        name, _, idea = method.partition("-")
-        config = ABLATIONS[idea](preset(name))
-    elif method in ("paper-grid", "paper-learned"):
-        keypoints = KEYPOINTS[method.partition("-")[2]]
-        config = dataclasses.replace(preset("paper"), keypoints=keypoints)
-    elif method in KEYPOINTS:
-        config = dataclasses.replace(
-            preset("default"), aligned_octaves=0, refinement=None, keypoints=KEYPOINTS[method]
-        )
-    else:
-        raise ValueError(
-            "method must be a preset, PRESET-IDEA, paper-grid, paper-learned or one of "
-            f"{', '.join(KEYPOINTS)}; got {method!r}"
-        )
+    if method not in CONFIGS:
+        raise ValueError(f"method must be one of {', '.join(CONFIGS)}; got {method!r}")
+    config = CONFIGS[method]
     return config if max_size is None else dataclasses.replace(config, max_size=max_size)

@@ -144,12 +144,23 @@ class HomographyOptions(PairOptions):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Runs(_Sets, _Network):
-    """Options of the benchmarks of whole reconstructions."""
+    """Options of the benchmarks of whole reconstructions.
 
+    Attributes:
+      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
+        paper, default, robust: the presets. paper-grid, paper-learned: the preset paper with
+        keypoints at the centres of cells or at the largest learned scores. paper-grid-80px: the
+        same as paper-grid with the paper's threshold for it, 80 pixels. grid, reloc, learned:
+        the preset default without refinement; keypoints are at the centres of cells (grid), at the
+        largest norms (reloc) or at the largest learned scores (learned). PRESET-IDEA: as in bench
+        wxbs, and also PRESET-no-placing.
+      seed: Seed of all random choices.
+      threads: Number of COLMAP's threads; -1 uses all cores.
+    """
+
+    methods: tuple[str, ...]
     seed: int = 0
-    """Seed of all random choices."""
     threads: int = -1
-    """Number of COLMAP's threads; -1 uses all cores."""
 
     def __post_init__(self) -> None:
         from jaxsfm.runs.run_options import check_seed, check_threads
@@ -164,19 +175,23 @@ class StrechaOptions(_Runs):
 
     Attributes:
       root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
-      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
-        default, robust: the presets. grid, reloc, learned: the preset default without refinement;
-        keypoints are at the centres of cells (grid), at the largest norms (reloc) or at the largest
-        learned scores (learned). PRESET-IDEA: as in bench daynight.
       intrinsics: known: the cameras are those of the sets' K.txt and stay fixed. unknown: each
         photo has its own camera, which is guessed and refined.
+      best_pairs: Map only the N pairs of each image that have the most inliers; the paper has N =
+        5. rootsift maps all pairs.
       out: Folder for databases and models. A later run continues from what is there.
     """
 
     root: Path
     methods: tuple[str, ...] = ("rootsift,grid,reloc,default",)
     intrinsics: Literal["known", "unknown"] = "known"
+    best_pairs: int | None = None
     out: Path | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.best_pairs is not None and self.best_pairs < 1:
+            raise UserError(f"--best-pairs must be at least 1; got {self.best_pairs}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -187,10 +202,8 @@ class DayNightOptions(_Runs):
       root: Folder of the data. It has scenes (SCENE/day, SCENE/night and SCENE/reference), or
         Strecha sets, or Aachen Day-Night. In Strecha sets, one photo after the other is turned to a
         synthetic night.
-      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
-        paper, default, robust: the presets. paper-grid: the preset paper with keypoints at the
-        centres of cells. paper-learned: the preset paper with keypoints at the largest learned
-        scores. PRESET-IDEA: as in bench wxbs, and also PRESET-no-placing.
+      curves: Write the cumulative curves of the nights' position and rotation errors to this PNG
+        file (figure 4 of the paper). The errors themselves are in the --json file.
       severity: How dark the synthetic night is. 0 is day, 1 is clean, 2 is noisy, 3 is dark, 5 is
         nothing but noise.
       denoise: Whether the camera of the synthetic night removes noise.
@@ -199,6 +212,7 @@ class DayNightOptions(_Runs):
 
     root: Path
     methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default,robust",)
+    curves: Path | None = None
     severity: float = 2.0
     denoise: bool = True
     jpeg: bool = True

@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, table
 from jaxsfm.bench.inputs import check_root, choose_sets, read_rows
 from jaxsfm.bench.options import PlanesOptions
 from jaxsfm.config import PRESETS, Config, preset
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.errors import UserError
-from jaxsfm.io.versions import package_versions
 from jaxsfm.matching.pair_matching import thresholds
 
 SUFFIX = "_pts.txt"
@@ -56,15 +55,6 @@ class PlanesRow(TypedDict):
     found: Spread
     """The number of planes that were found."""
     misclassified: Spread
-
-
-class PlanesFigures(TypedDict):
-    """The figures of the benchmark, as JSON."""
-
-    benchmark: str
-    versions: dict[str, str]
-    seeds: int
-    rows: list[PlanesRow]
 
 
 def read_points(path: Path) -> LabelledPoints:
@@ -119,7 +109,7 @@ def fit_planes(points: LabelledPoints, config: Config, *, seed: int) -> np.ndarr
     return np.asarray(found.plane)
 
 
-def bench_planes(options: PlanesOptions) -> PlanesFigures:
+def bench_planes(options: PlanesOptions) -> BenchFigures[PlanesRow, None]:
     """Fit planes with all presets to all files NAME_pts.txt."""
     methods = options.chosen_methods(tuple(PRESETS))
     root = options.root
@@ -146,30 +136,22 @@ def bench_planes(options: PlanesOptions) -> PlanesFigures:
                     "misclassified": spread(misclassification(x, points.label) for x in labels),
                 }
 
-    def figures(measured: list[PlanesRow]) -> PlanesFigures:
-        return {
-            "benchmark": "planes",
-            "versions": package_versions(),
-            "seeds": options.seeds,
-            "rows": measured,
-        }
-
-    return collect(rows(), figures, line=row_line, json_file=options.json)
+    return collect("planes", rows(), lambda _: None, cells, options)
 
 
-def row_line(row: PlanesRow) -> str:
-    """One line of the table."""
+def cells(row: PlanesRow) -> Cells:
+    """A row of the table."""
     wrong = row["misclassified"]
-    return (
-        f"{row['set']:20s} {row['method']:9s} {row['points']:7d} {row['planes']:7d} "
-        f"{row['found']['mean']:7.1f} {wrong['mean']:8.1%} {wrong['min']:7.1%} {wrong['max']:7.1%}"
-    )
+    return {
+        "points": row["set"],
+        "method": row["method"],
+        "number": str(row["points"]),
+        "planes": str(row["planes"]),
+        "found": f"{row['found']['mean']:.1f}",
+        **{f"wrong, {name}": f"{wrong[name]:.1%}" for name in ("mean", "min", "max")},
+    }
 
 
-def table_lines(result: PlanesFigures) -> list[str]:
+def table_lines(result: BenchFigures[PlanesRow, None]) -> list[str]:
     """The table: misclassification by file, as mean, smallest and largest over the seeds."""
-    head = (
-        f"{'points':20s} {'method':9s} {'number':>7s} {'planes':>7s} {'found':>7s} "
-        f"{'wrong':>8s} {'min':>7s} {'max':>7s}"
-    )
-    return [head, *(row_line(row) for row in result["rows"])]
+    return table([cells(row) for row in result["rows"]])

@@ -1,18 +1,16 @@
 """`bench strecha`: the paper's comparison on standard scenes (Strecha et al., CVPR 2008)."""
 
-import dataclasses
 import json
-import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
-from jaxsfm.bench.figures import collect
-from jaxsfm.bench.methods import RUN_ABLATED, method_config
+from jaxsfm.bench.figures import BenchFigures, Cells, collect, table, write_json
+from jaxsfm.bench.methods import RUN_METHODS, method_config
 from jaxsfm.bench.options import StrechaOptions
 from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
 from jaxsfm.colmap.intrinsics import parse_intrinsics
@@ -21,22 +19,31 @@ from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import model_poses, read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
-from jaxsfm.config import preset
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import write_atomic
-from jaxsfm.io.versions import package_versions
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.evaluation import evaluate
 
-METHODS = ("rootsift", "grid", "reloc", "learned", "default", "robust", *RUN_ABLATED)
+if TYPE_CHECKING:
+    import pycolmap
+
 BASELINE = "rootsift"
 """The method that the others are compared with."""
-PUBLISHED = (
-    "published (Widya et al. 2018, mean over six full-size sets): "
-    "DoG + RootSIFT 0.17 m, 0.90 deg; dense + relocalization 0.59 m, 2.27 deg"
-)
+PUBLISHED = {"DoG + RootSIFT": (0.17, 0.90), "dense + relocalization": (0.59, 2.27)}
+"""What the paper reports (Widya et al. 2018): the means over its six sets, in full size, of the
+mean position errors (metres) and of the mean rotation errors (degrees)."""
+
+
+class ModelFigures(TypedDict):
+    """The figures of the largest model."""
+
+    points: int
+    observations: int
+    track_length: float
+    reprojection_error_px: float
+    focal_error_percent: float
+    """The largest error of a focal length."""
 
 
 class StrechaRow(TypedDict):
@@ -44,46 +51,44 @@ class StrechaRow(TypedDict):
 
     set: str
     method: str
-    registered: int
-    points: NotRequired[int]
-    observations: NotRequired[int]
-    track_length: NotRequired[float]
-    reprojection_error_px: NotRequired[float]
-    stages: NotRequired[dict[str, float]]
-    """Seconds of each stage of one of our methods."""
-    seconds: float
     images: int
     """The number of reference poses."""
-    position: NotRequired[dict[str, float]]
+    registered: int
+    stages: dict[str, float]
+    """Seconds of each stage."""
+    model: ModelFigures | None
+    position: dict[str, float] | None
     """Mean, median and largest position error, units of the reference."""
-    rotation_deg: NotRequired[dict[str, float]]
-    focal_error_percent: NotRequired[float]
-    """The largest error of a focal length."""
-    not_evaluated: NotRequired[str]
-    """Why a model could not be compared with the reference."""
+    rotation_deg: dict[str, float] | None
+    not_evaluated: str
+    """Why there are no errors; empty if there are."""
 
 
-class MethodRatios(TypedDict):
-    """Figures of a method divided by those of the baseline."""
-
-    sets: dict[str, dict[str, float]]
-    mean: dict[str, float]
+Ratios = dict[str, dict[str, dict[str, float]]]
+"""Figures divided by those of the baseline, by method and set; "mean" is the mean of the sets."""
 
 
-class StrechaFigures(TypedDict):
-    """The figures of the benchmark, as JSON."""
+class MeanErrors(TypedDict):
+    """The means over sets of a method's mean errors."""
 
-    benchmark: str
-    versions: dict[str, str]
-    intrinsics: str
-    seed: int
-    rows: list[StrechaRow]
-    ratios: dict[str, MethodRatios]
-    published: str
+    sets: int
+    """The number of sets whose models were evaluated."""
+    position: float
+    rotation_deg: float
 
 
-def _run_rootsift(each: StrechaSet, work: Path, options: StrechaOptions) -> StrechaRow:
-    """Reconstruct a set with COLMAP's own features; the model goes to `work`/sparse."""
+class StrechaSummary(TypedDict):
+    """The figures over all sets."""
+
+    means: dict[str, MeanErrors]
+    """By method."""
+    ratios: Ratios
+
+
+def _run_rootsift(
+    each: StrechaSet, work: Path, options: StrechaOptions
+) -> "tuple[pycolmap.Reconstruction | None, dict[str, float]]":
+    """The model of a set by COLMAP's own features, also written to `work`/sparse; and seconds."""
     work.mkdir(parents=True, exist_ok=True)
     photos, database = each.folder / "images", work / "database.db"
     images, _ = open_images(photos)
@@ -96,57 +101,65 @@ def _run_rootsift(each: StrechaSet, work: Path, options: StrechaOptions) -> Stre
     mapping = MapOptions(refine_intrinsics=not known, seed=seed, threads=threads)
     models, _ = build_models(database, read_two_views(database), mapping)
     write_models(models, work / "sparse")
-    row = _row(each, "rootsift", work if models else None)
-    row["seconds"] = time.monotonic() - start
-    return row
+    return models[0] if models else None, {"all": time.monotonic() - start}
 
 
-def _run_method(each: StrechaSet, method: str, work: Path, options: StrechaOptions) -> StrechaRow:
-    """Reconstruct a set with one of our methods, in the work folder `work`."""
+def _run_method(
+    each: StrechaSet, method: str, work: Path, options: StrechaOptions
+) -> "tuple[pycolmap.Reconstruction | None, dict[str, float]]":
+    """The model of a set by one of our methods, in the work folder `work`; and seconds."""
     run = RunOptions(
         intrinsics=each.camera if options.intrinsics == "known" else None,
         network=options.network,
         seed=options.seed,
         threads=options.threads,
+        best_pairs=options.best_pairs,
         progress=True,
     )
     photos, config = each.folder / "images", method_config(method)
     report = reconstruct_folder(photos, work, config=config, options=run)
-    row = _row(each, method, work if report.models else None)
-    stages = report.seconds
-    row["stages"] = stages | _matching_seconds(work, stages)
-    row["seconds"] = sum(row["stages"].values())
-    return row
+    model = read_model(work / "sparse" / "0") if report.models else None
+    return model, report.seconds | _matching_seconds(work, report.seconds)
 
 
-def _row(each: StrechaSet, method: str, work: Path | None) -> StrechaRow:
-    """The figures of the largest model in a work folder; None stands for no model."""
+def _row(
+    each: StrechaSet,
+    method: str,
+    model: "pycolmap.Reconstruction | None",
+    stages: dict[str, float],
+) -> StrechaRow:
+    """The figures of the largest model; None stands for no model."""
     row: StrechaRow = {
         "set": each.folder.name,
         "method": method,
-        "registered": 0,
-        "seconds": 0.0,
         "images": len(each.truth),
+        "registered": 0,
+        "stages": stages,
+        "model": None,
+        "position": None,
+        "rotation_deg": None,
+        "not_evaluated": "no model",
     }
-    if work is None:
+    if model is None:
         return row
-    model = read_model(work / "sparse" / "0")
+    focals = [
+        model.cameras[model.image(i).camera_id].mean_focal_length() for i in model.reg_image_ids()
+    ]
     row["registered"] = model.num_reg_images()
-    row["points"] = model.num_points3D()
-    row["observations"] = model.compute_num_observations()
-    row["track_length"] = model.compute_mean_track_length()
-    row["reprojection_error_px"] = model.compute_mean_reprojection_error()
+    row["model"] = {
+        "points": model.num_points3D(),
+        "observations": model.compute_num_observations(),
+        "track_length": model.compute_mean_track_length(),
+        "reprojection_error_px": model.compute_mean_reprojection_error(),
+        "focal_error_percent": 100 * max(abs(focal / each.focal - 1) for focal in focals),
+    }
     try:
         errors = evaluate(model_poses(model), each.truth)
     except UserError as error:
         row["not_evaluated"] = str(error)
         return row
     row["position"], row["rotation_deg"] = errors.position, errors.rotation_deg
-    focals = [
-        model.cameras[model.image(i).camera_id].mean_focal_length() for i in model.reg_image_ids()
-    ]
-    error_of_focal = np.max(np.abs(np.asarray(focals) / each.focal - 1))
-    row["focal_error_percent"] = 100 * float(error_of_focal)
+    row["not_evaluated"] = ""
     return row
 
 
@@ -165,131 +178,113 @@ def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
         stage: max(float(before.get(stage, 0.0)), stages[stage])
         for stage in ("extraction", "matching")
     }
-    write_atomic(path, json.dumps(spent).encode())
+    write_json(path, spent)
     return spent
 
 
-def _work_name(method: str) -> str:
-    """The name of a method's work folder.
-
-    Methods that differ from the preset `default` only after mapping share its matches, and so its
-    work folder.
-    """
-    if method == "rootsift":
-        return method
-    config = method_config(method)
-    usual = dataclasses.replace(preset("default"), keypoints=config.keypoints)
-    return f"dense-{config.keypoints}" if config.matching() == usual.matching() else method
-
-
-def bench_strecha(options: StrechaOptions) -> StrechaFigures:
-    """Run all methods on all sets, with the same images, camera, verification and mapper.
-
-    Methods that differ only after mapping (`default` and whichever of `reloc` and `learned` has its
-    keypoints) share extraction and matching. The time of these stages counts for each of them.
-    """
-    methods = options.chosen_methods(METHODS)
+def bench_strecha(options: StrechaOptions) -> BenchFigures[StrechaRow, StrechaSummary]:
+    """Run all methods on all sets, with the same images, camera, verification and mapper."""
+    methods = options.chosen_methods(RUN_METHODS)
     # All inputs are read before the first reconstruction, which takes minutes.
     sets = read_sets(options.root, options.chosen_sets())
 
     def rows() -> Iterator[StrechaRow]:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
             for each in sets:
-                folder = (options.out or Path(scratch)) / each.folder.name
-                folder.mkdir(parents=True, exist_ok=True)
                 for method in methods:
-                    work = folder / _work_name(method)
+                    work = (options.out or Path(scratch)) / each.folder.name / method
                     if method == "rootsift":
-                        row = _run_rootsift(each, work, options)
+                        made = _run_rootsift(each, work, options)
                     else:
-                        row = _run_method(each, method, work, options)
-                    if options.out is not None and work.name != method:
-                        _keep_model(work, folder / f"{method}-sparse")
-                    yield row
+                        made = _run_method(each, method, work, options)
+                    yield _row(each, method, *made)
 
-    def figures(measured: list[StrechaRow]) -> StrechaFigures:
-        return {
-            "benchmark": "strecha",
-            "versions": package_versions(),
-            "intrinsics": "known" if options.intrinsics == "known" else "refined from a guess",
-            "seed": options.seed,
-            "rows": measured,
-            "ratios": ratios(measured),
-            "published": PUBLISHED,
+    def summary(measured: list[StrechaRow]) -> StrechaSummary:
+        return {"means": means(measured), "ratios": ratios(measured)}
+
+    return collect("strecha", rows(), summary, cells, options)
+
+
+def means(rows: Sequence[StrechaRow]) -> dict[str, MeanErrors]:
+    """The paper's figures: the means over the sets of the mean errors, by method."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        if row["position"] is not None and row["rotation_deg"] is not None:
+            each = row["position"]["mean"], row["rotation_deg"]["mean"]
+            found.setdefault(row["method"], []).append(each)
+    return {
+        method: {
+            "sets": len(errors),
+            "position": float(np.mean([position for position, _ in errors])),
+            "rotation_deg": float(np.mean([rotation for _, rotation in errors])),
         }
-
-    return collect(rows(), figures, line=row_line, json_file=options.json)
-
-
-def _keep_model(work: Path, to: Path) -> None:
-    """Copy a model out of a work folder that several methods share."""
-    shutil.rmtree(to, ignore_errors=True)
-    if (work / "sparse").is_dir():
-        shutil.copytree(work / "sparse", to)
+        for method, errors in found.items()
+    }
 
 
-def ratios(rows: Sequence[StrechaRow]) -> dict[str, MethodRatios]:
+def ratios(rows: Sequence[StrechaRow]) -> Ratios:
     """Each method's figures divided by the baseline's, by set and as the mean of the sets."""
-    base = {row["set"]: row for row in rows if row["method"] == BASELINE and "position" in row}
-    result: dict[str, MethodRatios] = {}
-    for method in dict.fromkeys(row["method"] for row in rows):
-        per_set = {
-            row["set"]: _ratios_of(row, base[row["set"]])
-            for row in rows
-            if row["method"] == method != BASELINE and "position" in row and row["set"] in base
-        }
-        if per_set:
-            keys = next(iter(per_set.values()))
-            mean = {k: float(np.mean([v[k] for v in per_set.values()])) for k in keys}
-            result[method] = {"sets": per_set, "mean": mean}
+    figures = {(row["method"], row["set"]): of for row in rows if (of := _compared(row))}
+    result: Ratios = {}
+    for (method, name), own in figures.items():
+        base = figures.get((BASELINE, name))
+        if method != BASELINE and base is not None:
+            result.setdefault(method, {})[name] = {key: own[key] / base[key] for key in own}
+    for sets in result.values():
+        each = list(sets.values())
+        sets["mean"] = {key: float(np.mean([of[key] for of in each])) for key in each[0]}
     return result
 
 
-def _ratios_of(row: StrechaRow, base: StrechaRow) -> dict[str, float]:
-    def figures(of: StrechaRow) -> dict[str, float]:
-        assert "position" in of and "rotation_deg" in of
-        assert "points" in of and "reprojection_error_px" in of
-        return {
-            "position": of["position"]["mean"],
-            "rotation": of["rotation_deg"]["mean"],
-            "points": of["points"],
-            "reprojection_error": of["reprojection_error_px"],
-        }
-
-    below = figures(base)
-    return {name: value / below[name] for name, value in figures(row).items()}
+def _compared(row: StrechaRow) -> dict[str, float] | None:
+    """The figures of which ratios are taken; None if the model was not evaluated."""
+    if row["model"] is None or row["position"] is None or row["rotation_deg"] is None:
+        return None
+    return {
+        "position": row["position"]["mean"],
+        "rotation": row["rotation_deg"]["mean"],
+        "points": row["model"]["points"],
+        "reprojection error": row["model"]["reprojection_error_px"],
+    }
 
 
-HEADER = (
-    f"{'set':16s} {'method':9s} {'images':>7s} {'position':>9s} {'rotation':>9s} {'points':>7s} "
-    f"{'observ.':>8s} {'track':>6s} {'reproj.':>8s} {'focal':>7s} {'seconds':>8s}"
-)
+def cells(row: StrechaRow) -> Cells:
+    """A row of the table: mean errors in units of the reference and in degrees."""
+    found = {
+        "set": row["set"],
+        "method": row["method"],
+        "images": f"{row['registered']}/{row['images']}",
+    }
+    if row["position"] is not None and row["rotation_deg"] is not None:
+        found["position"] = f"{row['position']['mean']:.4f}"
+        found["rotation"] = f"{row['rotation_deg']['mean']:.4f}"
+    if (model := row["model"]) is not None:
+        found["points"] = str(model["points"])
+        found["observations"] = str(model["observations"])
+        found["track"] = f"{model['track_length']:.2f}"
+        found["reprojection"] = f"{model['reprojection_error_px']:.3f}"
+        found["focal"] = f"{model['focal_error_percent']:.2f}%"
+    return found | {"seconds": f"{sum(row['stages'].values()):.1f}"}
 
 
-def row_line(row: StrechaRow) -> str:
-    """One line of the table."""
-    head = f"{row['set']:16s} {row['method']:9s} {row['registered']:3d}/{row['images']:<3d}"
-    if "position" not in row:
-        return f"{head}   {row.get('not_evaluated', 'no model')}"
-    assert "rotation_deg" in row and "focal_error_percent" in row
-    assert "points" in row and "observations" in row
-    assert "track_length" in row and "reprojection_error_px" in row
-    return (
-        f"{head} {row['position']['mean']:9.4f} {row['rotation_deg']['mean']:9.4f} "
-        f"{row['points']:7d} {row['observations']:8d} {row['track_length']:6.2f} "
-        f"{row['reprojection_error_px']:8.3f} {row['focal_error_percent']:6.2f}% "
-        f"{row['seconds']:8.1f}"
-    )
-
-
-def table_lines(result: StrechaFigures) -> list[str]:
-    """The paper's table: mean errors in units of the reference and in degrees."""
-    lines = [HEADER, *(row_line(row) for row in result["rows"]), ""]
-    for method, figures in result["ratios"].items():
-        mean = figures["mean"]
-        lines.append(
-            f"{method} / rootsift, mean of {len(figures['sets'])} sets: "
-            f"position {mean['position']:.2f}, rotation {mean['rotation']:.2f}, "
-            f"points {mean['points']:.2f}, reprojection error {mean['reprojection_error']:.2f}"
-        )
-    return [*lines, result["published"]]
+def table_lines(result: BenchFigures[StrechaRow, StrechaSummary]) -> list[str]:
+    """The paper's table with the paper's own rows, and the ratios to RootSIFT."""
+    ours = [
+        (f"mean of {mean['sets']} sets", method, mean["position"], mean["rotation_deg"])
+        for method, mean in result["summary"]["means"].items()
+    ]
+    theirs = [("published, 6 sets", method, *errors) for method, errors in PUBLISHED.items()]
+    averages = [
+        {"set": name, "method": method, "position": f"{position:.4f}", "rotation": f"{turn:.4f}"}
+        for name, method, position, turn in [*ours, *theirs]
+    ]
+    lines = table([*map(cells, result["rows"]), *averages])
+    lines += [
+        f"{row['set']} {row['method']}: {row['not_evaluated']}"
+        for row in result["rows"]
+        if row["not_evaluated"]
+    ]
+    for method, sets in result["summary"]["ratios"].items():
+        mean = ", ".join(f"{key} {value:.2f}" for key, value in sets["mean"].items())
+        lines.append(f"{method} / {BASELINE}, mean of {len(sets) - 1} sets: {mean}")
+    return lines

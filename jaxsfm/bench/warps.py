@@ -7,15 +7,13 @@ keypoints lie within 1 and 3 pixels of each other.
 """
 
 import functools
-from collections.abc import Iterator
-from typing import TypedDict
+from collections.abc import Iterator, Sequence
 
 import jax
 
-from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, table
 from jaxsfm.bench.options import WarpsOptions
 from jaxsfm.errors import UserError
-from jaxsfm.io.versions import package_versions
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.training.objective import mean_shares, shares, warped_examples
@@ -27,21 +25,13 @@ VIEW, CROP, BATCH, BATCHES = 192, 400, 8, 8
 a seed."""
 
 
-class WarpsFigures(TypedDict):
-    """The figures of the benchmark, as JSON."""
-
-    benchmark: str
-    synthetic: bool
-    versions: dict[str, str]
-    photos: int
-    seeds: int
-    pairs_of_views: int
-    """The number of pairs for each seed."""
-    methods: dict[str, dict[str, Spread]]
-    """The spread of each share over the seeds, by method."""
+WarpsRow = dict[str, dict[str, float]]
+"""The shares of one seed, by method."""
+WarpsSummary = dict[str, dict[str, Spread]]
+"""The spread of each share over the seeds, by method."""
 
 
-def bench_warps(options: WarpsOptions) -> WarpsFigures:
+def bench_warps(options: WarpsOptions) -> BenchFigures[WarpsRow, WarpsSummary]:
     """Measure both rules on the same views."""
     methods = options.chosen_methods(METHODS)
     images, _ = open_images(options.root)
@@ -53,7 +43,7 @@ def bench_warps(options: WarpsOptions) -> WarpsFigures:
         warped_examples, weights.params, preprocessing=weights.preprocessing, size=VIEW
     )
 
-    def rows() -> Iterator[dict[str, dict[str, float]]]:
+    def rows() -> Iterator[WarpsRow]:
         """For each seed, the shares of each method."""
         for seed in range(options.seeds):
             crops, found = Crops(images, side=CROP, seed=seed), {method: [] for method in methods}
@@ -65,51 +55,43 @@ def bench_warps(options: WarpsOptions) -> WarpsFigures:
                     found[method].append(jax.device_get(shares(scores, examples)))
             yield {method: mean_shares(found[method]) for method in methods}
 
-    def figures(measured: list[dict[str, dict[str, float]]]) -> WarpsFigures:
-        return {
-            "benchmark": "warps",
-            "synthetic": True,
-            "versions": package_versions(),
-            "photos": len(images),
-            "seeds": options.seeds,
-            "pairs_of_views": BATCHES * BATCH,
-            "methods": {
-                method: {
-                    name: spread(row[method][name] for row in measured)
-                    for name in measured[0][method]
-                }
-                for method in methods
-            },
-        }
-
-    return collect(rows(), figures, line=row_line, json_file=options.json)
+    print(f"synthetic: {BATCHES * BATCH} pairs of views of {len(images)} photos for each seed")
+    return collect("warps", rows(), summary, cells, options)
 
 
-def row_line(row: dict[str, dict[str, float]]) -> str:
+def summary(rows: Sequence[WarpsRow]) -> WarpsSummary:
+    """The spread of each share over the seeds, by method."""
+    return {
+        method: {name: spread(row[method][name] for row in rows) for name in shares_of}
+        for method, shares_of in (rows[0] if rows else {}).items()
+    }
+
+
+def cells(row: WarpsRow) -> Cells:
     """The shares of one seed within 1 and 3 pixels."""
-    return ", ".join(
-        f"{method} {found['within_1']:.4f} {found['within_3']:.4f}" for method, found in row.items()
-    )
+    return {
+        method: f"{found['within_1']:.4f} {found['within_3']:.4f}" for method, found in row.items()
+    }
 
 
-def table_lines(result: WarpsFigures) -> list[str]:
+def table_lines(result: BenchFigures[WarpsRow, WarpsSummary]) -> list[str]:
     """The table: shares within 1 and 3 pixels, and the learned rule's over the norm rule's."""
-    lines = [
-        f"synthetic: {result['pairs_of_views']} pairs of views of {result['photos']} photos, "
-        f"{result['seeds']} seeds",
-        f"{'rule':8s} {'within 1 px (least, largest)':>30s} {'within 3 px (least, largest)':>30s}",
+    rules = result["summary"]
+    columns = {"within_1": "within 1 px", "within_3": "within 3 px"}
+    rows = [
+        {"rule (synthetic)": method}
+        | {
+            f"{title} (least, largest)": f"{row[name]['mean']:.4f} "
+            f"({row[name]['min']:.4f}, {row[name]['max']:.4f})"
+            for name, title in columns.items()
+        }
+        for method, row in rules.items()
     ]
-    rows = result["methods"]
-    for method, row in rows.items():
-        columns = [
-            f"{row[name]['mean']:.4f} ({row[name]['min']:.4f}, {row[name]['max']:.4f})"
-            for name in ("within_1", "within_3")
-        ]
-        lines.append(f"{method:8s} " + " ".join(f"{column:>30s}" for column in columns))
-    if rows.keys() >= set(METHODS):
+    lines = table(rows, names=1)
+    if rules.keys() >= set(METHODS):
         ratios = [
-            rows["learned"][name]["mean"] / max(rows["norm"][name]["mean"], 1e-9)
-            for name in ("within_1", "within_3")
+            f"{rules['learned'][name]['mean'] / max(rules['norm'][name]['mean'], 1e-9):.2f} {title}"
+            for name, title in columns.items()
         ]
-        lines.append(f"learned / norm: {ratios[0]:.2f} within 1 px, {ratios[1]:.2f} within 3 px")
+        lines.append(f"learned / norm: {', '.join(ratios)}")
     return lines

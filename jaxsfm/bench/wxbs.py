@@ -11,9 +11,10 @@ from typing import TypedDict
 
 import numpy as np
 
-from jaxsfm.bench.figures import Spread, collect, spread
+from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, table
 from jaxsfm.bench.inputs import check_root, choose_sets, read_rows, usable_image
-from jaxsfm.bench.matches import PAIR_METHODS, Matcher, Matches, PairFigures, pair_figures
+from jaxsfm.bench.matches import Matcher, Matches
+from jaxsfm.bench.methods import PAIR_METHODS
 from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import SUFFIXES, ImageFile
@@ -68,7 +69,7 @@ def _image(folder: Path, stem: str) -> ImageFile:
     return usable_image(found[0])
 
 
-def bench_wxbs(options: WxbsOptions) -> PairFigures[WxbsRow, Means]:
+def bench_wxbs(options: WxbsOptions) -> BenchFigures[WxbsRow, Means]:
     """Run all methods on all pairs (CATEGORY/NAME/{01,02}.png, corrs.txt)."""
     methods = options.chosen_methods(PAIR_METHODS)
     inputs = {
@@ -86,12 +87,7 @@ def bench_wxbs(options: WxbsOptions) -> PairFigures[WxbsRow, Means]:
             for method in methods:
                 yield _row(folder, method, matcher.match(image0, image1, method), marked)
 
-    return collect(
-        rows(),
-        lambda measured: pair_figures("wxbs", measured, means(measured), options),
-        line=row_line,
-        json_file=options.json,
-    )
+    return collect("wxbs", rows(), means, cells, options)
 
 
 def _folders(options: WxbsOptions) -> list[Path]:
@@ -151,24 +147,26 @@ def means(rows: Sequence[WxbsRow]) -> Means:
     return result
 
 
-def row_line(row: WxbsRow) -> str:
-    """One line of the table."""
-    maa = row["maa"]
-    return (
-        f"{row['pair']:28s} {row['method']:9s} {maa['mean']:6.3f} {maa['min']:6.3f} "
-        f"{maa['max']:6.3f} {row['matches']['mean']:8.0f} {row['seconds']:8.2f}"
-    )
+def cells(row: WxbsRow) -> Cells:
+    """A row of the table."""
+    return {
+        "pair": row["pair"],
+        "method": row["method"],
+        **_maa(row["maa"]),
+        "matches": f"{row['matches']['mean']:.0f}",
+        "seconds": f"{row['seconds']:.2f}",
+    }
 
 
-def table_lines(result: PairFigures[WxbsRow, Means]) -> list[str]:
+def _maa(figure: Spread) -> Cells:
+    return {name: f"{figure[name]:.3f}" for name in ("mean", "min", "max")}
+
+
+def table_lines(result: BenchFigures[WxbsRow, Means]) -> list[str]:
     """The table: mAA by pair and category, as mean, smallest and largest over the seeds."""
-    figures = f"{'mAA':>6s} {'min':>6s} {'max':>6s} {'matches':>8s} {'seconds':>8s}"
-    lines = [f"{'pair':28s} {'method':9s} {figures}"]
-    lines += [row_line(row) for row in result["rows"]]
-    for method, groups in result["means"].items():
-        for name, figure in groups.items():
-            lines.append(
-                f"{'mean of ' + name:28s} {method:9s} {figure['mean']:6.3f} {figure['min']:6.3f} "
-                f"{figure['max']:6.3f}"
-            )
-    return lines
+    groups = [
+        {"pair": f"mean of {name}", "method": method, **_maa(figure)}
+        for method, categories in result["summary"].items()
+        for name, figure in categories.items()
+    ]
+    return table([*map(cells, result["rows"]), *groups])

@@ -37,6 +37,8 @@ def strecha(bench: Unnamed[StrechaOptions]) -> int:
 
     For example
         $ jaxsfm bench strecha --root SETS --methods rootsift,default --json figures.json
+    compares with RootSIFT, and this makes the paper's table
+        $ jaxsfm bench strecha --root SETS --best-pairs 5 --methods rootsift,paper-grid,paper
     """
     from jaxsfm.bench.strecha import bench_strecha, table_lines
 
@@ -83,10 +85,11 @@ def daynight(bench: Unnamed[DayNightOptions]) -> int:
     compared with its reference.
 
     For example
-        $ jaxsfm bench daynight --root SETS --severity 3.25 --methods rootsift,default
+        $ jaxsfm bench daynight --root SETS --severity 3.25 --curves curves.png
     """
     from jaxsfm.bench.daynight import bench_daynight, table_lines
 
+    check_writable(bench.curves, "--curves", (".png",))
     return _run(bench_daynight, table_lines, bench)
 
 

@@ -1,6 +1,7 @@
 """`bench daynight`: scenes in every layout, the protocol's figures, a run on the rendered room."""
 
 import json
+import re
 import shutil
 
 import cv2
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.daynight import judge, summary
+from jaxsfm.bench.curves import cumulative
+from jaxsfm.bench.daynight import LIMITS, PUBLISHED, judge, summary, table_lines
 from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
 from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Subset
@@ -228,7 +230,8 @@ def test_unregistered_nights_count_in_the_shares():
     assert got["nights"] == 4 and got["night_registered"] == 3
     assert (got["day_registered"], got["day_images"]) == (12, 16)
     assert got["within"]["0.1; 1 deg"] == 0.25 == got["within"]["20; 10 deg"]
-    assert got["sorted_positions"] == [0.05, 0.05]
+    assert got["sorted_positions"] == [0.05, 0.05] and got["sorted_rotations_deg"] == [0.5, 20.0]
+    assert got["nights_with_reference"] == 4
     assert got["not_evaluated"] == 1 and got["correct"] is None
     counts = [{"matches": 5, "correct": 2}, {"matches": 3, "correct": 3}, {}, {}]
     counted = summary([row | count for row, count in zip(rows, counts, strict=True)])
@@ -238,11 +241,38 @@ def test_unregistered_nights_count_in_the_shares():
     assert summary([unknown])["within"] is None and summary([])["within"] is None
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cumulative_curve_counts_the_errors_up_to_x(seed):
+    """Against counting, at points between the errors; nights without an error count as well."""
+    rng = np.random.default_rng(seed)
+    errors, number = rng.exponential(size=20), 30
+    x, y = cumulative(errors, number)
+    for limit in rng.exponential(size=50):
+        reached = y[np.searchsorted(x, limit, side="right") - 1]
+        assert reached == pytest.approx(sum(error <= limit for error in errors) / number)
+    assert y[0] == 0 and y[-1] == pytest.approx(20 / 30)
+    with pytest.raises(ValueError, match="number must be at least 20"):
+        cumulative(errors, 19)
+
+
+def test_the_papers_rows_are_in_the_table_under_the_same_limits():
+    got = summary([])
+    lines = table_lines({"rows": [], "summary": {"paper": got}})
+    heads = lines[0]
+    for (method, (night, day, within)), line in zip(PUBLISHED.items(), lines[-3:], strict=True):
+        assert method in line and f"{night}/98" in line and f"{day}/1960" in line
+        for limit, percent in zip(LIMITS[1:], within, strict=True):
+            head = f"{limit[0]:g}; {limit[1]:g} deg"
+            end = re.search(rf"(?<!\S){re.escape(head)}", heads).end()
+            assert line[:end].endswith(f" {percent:.0f}%")
+
+
 @pytest.mark.slow
 def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
     out = tmp_path / "figures.json"
     args = ["bench", "daynight", "--root", str(simple), "--json", str(out), "--threads", "1"]
-    assert main(args) == 0
+    assert main([*args, "--curves", str(tmp_path / "curves.png")]) == 0
+    assert cv2.imread(str(tmp_path / "curves.png")).std() > 5
     figures = json.loads(out.read_text())
     rows = {row["method"]: row for row in figures["rows"]}
     assert set(rows) == {"rootsift", "paper-grid", "paper", "default", "robust"}
@@ -268,6 +298,7 @@ def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
         (["--root", "{root}", "--sets", ","], "--sets"),
         (["--root", "{root}", "--sets", "hall"], "no set 'hall'"),
         (["--root", "{root}", "--severity", "-1"], "--severity"),
+        (["--root", "{root}", "--curves", "curves.svg"], "--curves"),
         (["--root", "{root}", "--methods", "orb"], "no method 'orb'"),
     ],
 )

@@ -1,12 +1,13 @@
 """`bench strecha` on a rendered set in Strecha's layout."""
 
 import json
+import re
 import shutil
 
 import pytest
 
 from jaxsfm.bench.methods import method_config
-from jaxsfm.bench.strecha import ratios
+from jaxsfm.bench.strecha import PUBLISHED, means, ratios, table_lines
 from jaxsfm.bench.strecha_sets import find_sets
 from jaxsfm.cli.main import main
 from jaxsfm.config import preset
@@ -26,22 +27,28 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
     rows = {row["method"]: row for row in figures["rows"]}
     assert tuple(rows) == ("rootsift", "grid", "reloc", "default")
     for method, row in rows.items():
-        assert row["set"] == "room" and row["images"] == 3 and f"room             {method}" in text
-        assert row["seconds"] > 0
+        assert (
+            row["set"] == "room"
+            and row["images"] == 3
+            and re.search(rf"^room +{method} ", text, re.M)
+        )
+        assert sum(row["stages"].values()) > 0
+        assert (tmp_path / "work" / "room" / method / "sparse").is_dir()
+    models = {method: row["model"] for method, row in rows.items()}
     for method in ("grid", "reloc", "default"):  # the third view is RootSIFT's to lose: it is night
-        assert rows[method]["registered"] == 3 and rows[method]["focal_error_percent"] == 0
-    assert rows["default"]["reprojection_error_px"] < 0.5 * rows["reloc"]["reprojection_error_px"]
-    for stage in ("extraction", "matching"):  # done once, counted twice
-        assert rows["default"]["stages"][stage] == rows["reloc"]["stages"][stage]
-    assert "published" in text and (tmp_path / "work" / "room").is_dir()
-    shared = f"dense-{preset('default').keypoints}"
-    assert (tmp_path / "work" / "room" / shared / "sparse").is_dir()
+        assert rows[method]["registered"] == 3 and models[method]["focal_error_percent"] == 0
+    default, reloc = models["default"], models["reloc"]
+    assert default["reprojection_error_px"] < 0.5 * reloc["reprojection_error_px"]
+    assert "published" in text
 
     again = ["--methods", "reloc,default", "--sets", "room", "--intrinsics", "unknown"]
     assert main([*args, *again, "--out", str(tmp_path / "work")]) == 0
-    rows = json.loads(out.read_text())["rows"]
-    assert [row["method"] for row in rows] == ["reloc", "default"]
-    assert all(row["focal_error_percent"] > 0 for row in rows)
+    again = json.loads(out.read_text())["rows"]
+    assert [row["method"] for row in again] == ["reloc", "default"]
+    for row in again:
+        assert row["model"]["focal_error_percent"] > 0
+        for stage in ("extraction", "matching"):  # done once, counted in both runs
+            assert row["stages"][stage] == rows[row["method"]]["stages"][stage]
 
 
 def test_methods_differ_in_the_switch_they_name():
@@ -63,8 +70,7 @@ def row(name, method, position, points):
         "method": method,
         "position": {"mean": position},
         "rotation_deg": {"mean": 2 * position},
-        "points": points,
-        "reprojection_error_px": 0.5 * position,
+        "model": {"points": points, "reprojection_error_px": 0.5 * position},
     }
 
 
@@ -75,22 +81,50 @@ def test_ratios_are_means_of_the_sets_ratios():
         row("b", "rootsift", 2.0, 10),
         row("b", "default", 3.0, 30),
         row("c", "default", 1.0, 1),  # nothing to compare with
-        {"set": "b", "method": "grid", "registered": 0},
+        {"set": "b", "method": "grid", "model": None},
     ]
     got = ratios(rows)
-    assert set(got) == {"default"} and set(got["default"]["sets"]) == {"a", "b"}
+    assert set(got) == {"default"} and set(got["default"]) == {"a", "b", "mean"}
     assert got["default"]["mean"] == {
         "position": 1.0,
         "rotation": 1.0,
         "points": 2.5,
-        "reprojection_error": 1.0,
+        "reprojection error": 1.0,
     }
+
+
+def test_the_table_ends_with_the_means_of_the_sets_and_the_published_ones():
+    rows = [row("a", "paper", 1.0, 10), row("b", "paper", 3.0, 10), row("b", "paper-grid", 2.0, 1)]
+    rows.append({"set": "a", "method": "paper-grid", "position": None, "rotation_deg": None})
+    got = means(rows)
+    assert got == {
+        "paper": {"sets": 2, "position": 2.0, "rotation_deg": 4.0},
+        "paper-grid": {"sets": 1, "position": 2.0, "rotation_deg": 4.0},
+    }
+    lines = table_lines({"rows": [], "summary": {"means": got, "ratios": {}}})
+    assert lines[1].split() == ["mean", "of", "2", "sets", "paper", "2.0000", "4.0000"]
+    for (name, (position, rotation)), line in zip(PUBLISHED.items(), lines[-2:], strict=True):
+        assert line.startswith("published") and name in line
+        assert [float(value) for value in line.split()[-2:]] == [position, rotation]
+
+
+@pytest.mark.slow
+def test_only_the_best_pairs_are_mapped(root, tmp_path):
+    """Three views have three pairs; with one pair for each view, one of them is not mapped."""
+    args = ["bench", "strecha", "--root", str(root), "--methods", "paper", "--threads", "1"]
+    handed = []
+    for name, more in (("all", []), ("best", ["--best-pairs", "1"])):
+        assert main([*args, *more, "--out", str(tmp_path / name)]) == 0
+        report = json.loads((tmp_path / name / "room/paper/report.json").read_text())
+        handed.append(report["pairs"]["handed_on"])
+    assert handed == [3, 2]
 
 
 @pytest.mark.parametrize(
     ("args", "word"),
     [
         (["--root", "/nowhere"], "no such folder"),
+        (["--root", "{root}", "--best-pairs", "0"], "--best-pairs"),
         (["--root", "{root}", "--methods", "reloc", "--weights", "/nowhere"], "/nowhere: cannot"),
         (["--root", "{root}", "--sets", "cathedral"], "no set 'cathedral'"),
         (["--root", "{root}/room"], "no Strecha sets"),

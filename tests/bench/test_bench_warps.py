@@ -25,7 +25,7 @@ def test_untrained_scores_measure_as_the_norm_rule_does(root, tmp_path, capsys):
     save_relocalizer(relocalizer, jax.device_get(init_scores(jax.random.key(0), hidden=2)), {})
     args = ["bench", "warps", "--root", str(root), "--seeds", "1", "--json", str(out)]
     assert main([*args, "--relocalizer", str(relocalizer)]) == 0
-    rows = json.loads(out.read_text())["methods"]
+    rows = json.loads(out.read_text())["summary"]
     assert rows["norm"] == rows["learned"]
     assert 0 < rows["norm"]["within_1"]["mean"] < rows["norm"]["within_3"]["mean"] < 1
     text = capsys.readouterr().out

@@ -31,7 +31,6 @@ def groups(data: Path) -> dict[str, Callable[[], Iterator[Metric]]]:
         "homographies": homographies.measure,
         "scaling": lambda: scaling.measure_pairs(data),
         "pixels": lambda: scaling.measure_pixels(data),
-        "start": lambda: scaling.measure_start(data),
         "stage": lambda: scaling.measure_stage(data),
     }
 
@@ -61,8 +60,8 @@ def main(
     """Measure speed, and accuracy with it.
 
     Args:
-      only: groups: machine, extraction, mutual, pairs, homographies, scaling, pixels, start, stage;
-        all by default.
+      only: groups: machine, extraction, mutual, pairs, homographies, scaling, pixels, stage; all by
+        default.
       gate: exit with 1 if a ratio is worse than the baseline by more than its tolerance.
       update: write a new baseline.
       data: folder of the data sets; groups that need a missing set are skipped.

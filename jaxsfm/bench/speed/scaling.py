@@ -1,10 +1,7 @@
-"""Speed of larger jobs: many pairs, many pixels, the start, and COLMAP's SIFT."""
+"""Speed of larger jobs: many pairs, many pixels, and COLMAP's SIFT."""
 
 import dataclasses
 import itertools
-import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -89,46 +86,6 @@ def measure_pixels(data: Path) -> Iterator[Metric]:
     for longer, cost in zip(sizes, costs, strict=True):
         yield Metric(f"scaling.pixels.{longer}", cost * 1e6, "s per megapixel", "lower")
     yield Metric("scaling.pixels.largest_over_least", max(costs) / min(costs), "x", "lower", 0.2)
-
-
-SCRIPT = """
-import json, sys, time
-from jaxsfm.io.compiled_programs import keep_compiled
-keep_compiled()
-from pathlib import Path
-import jaxsfm
-from jaxsfm.matching.extraction import image_features
-images, _ = jaxsfm.open_images(Path(sys.argv[1]))
-weights = jaxsfm.load_weights()
-times = []
-for _ in range(3):
-    start = time.time()
-    image_features(weights, images[0], config=jaxsfm.preset("default"))
-    times.append((start, time.time()))
-print(json.dumps(times))
-"""
-
-
-def measure_start(data: Path) -> Iterator[Metric]:
-    """Seconds from the start of a process to its first image's features, less those of an image.
-
-    What remains is the time of the interpreter, the imports, the weights, the photos' headers and
-    of reading the compiled program from the cache.
-    """
-    folder = data / "strecha" / "fountain-P11" / "images"
-    if not folder.is_dir():
-        print(f"skipped: start (no {folder})")
-        return
-    waits = []
-    for _ in range(4):  # the first fills the cache
-        begin = time.time()
-        done = subprocess.run(
-            [sys.executable, "-c", SCRIPT, str(folder)], capture_output=True, text=True, check=True
-        )
-        times = json.loads(done.stdout.splitlines()[-1])
-        image = min(end - start for start, end in times[1:])
-        waits.append(times[0][1] - begin - image)
-    yield Metric("start.seconds", median(waits[1:]), "s", "lower")
 
 
 def measure_stage(data: Path) -> Iterator[Metric]:
