@@ -146,7 +146,7 @@ def make_templates(
     patch: Patch,
 ) -> Templates:
     """Templates around keypoints of a reference view."""
-    dx, dy = jnp.asarray([0.5, 0.0]), jnp.asarray([0.0, 0.5])
+    dx, dy = 0.5 * jnp.eye(2, dtype=xy.dtype)
 
     def one(centre):
         at = centre + patch.offsets

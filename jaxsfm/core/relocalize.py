@@ -132,8 +132,8 @@ def _hard(
         if children > FACTOR:  # blocks reach past the borders
             inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
             found = jnp.where(inside, found, -jnp.inf)
-        best = jnp.argmax(found, axis=1)
-        pick = jnp.arange(best.shape[0])
+        best = jnp.argmax(found, axis=1).astype(jnp.int32)
+        pick = jnp.arange(best.shape[0], dtype=jnp.int32)
         return (rows[pick, best], cols[pick, best]), None
 
     (row, col), _ = lax.scan(descend, (row, col), tuple(levels.T))
