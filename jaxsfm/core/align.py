@@ -117,11 +117,10 @@ def sample(
     rows = [jnp.clip(y0.astype(jnp.int32) + k, 0, bottom) * w for k in (-1, 0, 1, 2)]
     flat = image.reshape(h * w, c)
     across, down = _cubic(x - x0), _cubic(y - y0)
-    dtype = jnp.promote_types(image.dtype, xy.dtype)
-    total = jnp.zeros((*xy.shape[:-1], c), dtype)
+    total = jnp.zeros((*xy.shape[:-1], c), xy.dtype)
     for row, v in zip(rows, down, strict=True):
         line = sum(
-            flat[row + col].astype(dtype) * u[..., None]
+            flat[row + col].astype(xy.dtype) * u[..., None]
             for col, u in zip(columns, across, strict=True)
         )
         total = total + line * v[..., None]

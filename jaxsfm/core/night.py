@@ -88,7 +88,7 @@ def night(
     radiance = (jnp.clip(rgb, 0.0, 255.0) / 255.0) ** GAMMA * ((1 - dusk) + dusk * light)
     radiance = blur(radiance + dusk * glare, BLUR_PX * severity)
     brightest = jnp.max(radiance, axis=2)
-    white = (1 - dusk) + dusk * jnp.quantile(brightest, 1 - SATURATED_SHARE)
+    white = (1 - dusk) + dusk * jnp.quantile(brightest, jnp.float32(1 - SATURATED_SHARE))
     full = FULL_WELL * 10.0**-severity
     expected = jnp.minimum(radiance / jnp.maximum(white, 1e-6), 1.0) * full
     # Numbers of photons are drawn from a normal distribution. It is right from ten photons on, and

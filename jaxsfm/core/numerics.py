@@ -14,11 +14,11 @@ that decides geometry or a nearest neighbour states this precision."""
 
 
 def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """float16 and bfloat16 as float32; other types stay as they are.
+    """float16 and bfloat16 as float32; float32 and float64 stay as they are.
 
     bfloat16 has 8 binary digits, so that coordinates of a thousand pixels would be multiples of 4.
     """
-    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
+    return x.astype(jnp.float32) if jnp.finfo(x.dtype).bits < 32 else x
 
 
 def squared_norm(x: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:

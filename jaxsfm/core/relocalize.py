@@ -218,7 +218,7 @@ def expectation(walks: WalkProbabilities) -> Float[Array, "m 2"]:
 
 def window_positions(walks: WalkProbabilities) -> Float[Array, "m n 2"]:
     """(x, y) of every cell of the windows, in the row order of the flattened `walks.p`."""
-    size = walks.p.shape[1]
-    index = jnp.arange(size, dtype=jnp.promote_types(walks.p.dtype, jnp.float32))
+    size, dtype = walks.p.shape[1], at_least_float32(walks.p).dtype
+    index = jnp.arange(size, dtype=dtype)
     offsets = jnp.stack([jnp.tile(index, size), jnp.repeat(index, size)], axis=-1)
-    return walks.start[:, None].astype(index.dtype) + offsets
+    return walks.start[:, None].astype(dtype) + offsets
