@@ -96,7 +96,7 @@ def whole_numbers(rng, *channels: int):
     kernels = [
         rng.integers(-1, 2, (3, 3, *each)) for each in zip(channels, channels[1:], strict=False)
     ]
-    stack = [Layer(jnp.asarray(k, jnp.float32), jnp.ones(k.shape[3])) for k in kernels]
+    stack = [Layer(jnp.asarray(k, jnp.float32), jnp.ones(k.shape[3], jnp.float32)) for k in kernels]
     x = jnp.asarray(rng.integers(-2, 3, (2, 40, 24, channels[0])), jnp.float32)
     return stack, blocks.clear_padding(x, SIZES)
 
