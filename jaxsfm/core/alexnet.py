@@ -44,8 +44,8 @@ class _Convolution(nn.Module):
     @nn.compact
     def __call__(self) -> tuple[Array, Array]:
         """The kernel and the bias."""
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), self.shape)
-        bias = self.param("bias", nn.initializers.zeros_init(), self.shape[3:])
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), self.shape, jnp.float32)
+        bias = self.param("bias", nn.initializers.zeros_init(), self.shape[3:], jnp.float32)
         return jnp.asarray(kernel), jnp.asarray(bias)
 
 

@@ -95,6 +95,9 @@ def sample(
 ) -> tuple[Float[Array, "*n c"], Bool[Array, "*n"]]:
     """Values at (x, y) by cubic convolution, and which of the points lie inside the image.
 
+    A map may have fewer bits than the points (bfloat16). Its values are then converted to the type
+    of the points before they are interpolated, because places are computed from them.
+
     A point outside the image gets the value of the nearest edge. Bilinear interpolation would blur
     most half-way between pixels and draw alignments towards there: they were 0.05 px off on smooth
     textures instead of 0.01 (tests/core/test_align.py).
@@ -114,9 +117,12 @@ def sample(
     rows = [jnp.clip(y0.astype(jnp.int32) + k, 0, bottom) * w for k in (-1, 0, 1, 2)]
     flat = image.reshape(h * w, c)
     across, down = _cubic(x - x0), _cubic(y - y0)
-    total = jnp.zeros((*xy.shape[:-1], c), image.dtype)
+    total = jnp.zeros((*xy.shape[:-1], c), xy.dtype)
     for row, v in zip(rows, down, strict=True):
-        line = sum(flat[row + col] * u[..., None] for col, u in zip(columns, across, strict=True))
+        line = sum(
+            flat[row + col].astype(xy.dtype) * u[..., None]
+            for col, u in zip(columns, across, strict=True)
+        )
         total = total + line * v[..., None]
     return total, inside
 
@@ -146,7 +152,7 @@ def make_templates(
     patch: Patch,
 ) -> Templates:
     """Templates around keypoints of a reference view."""
-    dx, dy = jnp.asarray([0.5, 0.0]), jnp.asarray([0.0, 0.5])
+    dx, dy = 0.5 * jnp.eye(2, dtype=xy.dtype)
 
     def one(centre):
         at = centre + patch.offsets

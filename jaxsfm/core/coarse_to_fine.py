@@ -87,7 +87,7 @@ def match_windows(
         # The last chunk is moved back to fit. The rows that it repeats are written twice, alike.
         start = jnp.minimum(i * chunk, n - chunk)
         cell0 = lax.dynamic_slice(matched, (start,), (chunk,))
-        live = start + jnp.arange(chunk) < count
+        live = start + jnp.arange(chunk, dtype=jnp.int32) < count
         cell1 = jnp.where(live, coarse[cell0], 0)
         rows = _match_windows(f0, f1, shown, cell0, cell1)
         target = jnp.where(live, cell0, n)
@@ -151,7 +151,7 @@ def similarities(
         i, scores = state
         # The last chunk is moved back to fit. The products that it repeats are written twice.
         start = jnp.minimum(i * chunk, k - chunk)
-        some = lax.dynamic_slice(cells, (start, 0), (chunk, 2))
+        some = lax.dynamic_slice_in_dim(cells, start, chunk)
         a, b = rows_of(f0.fine, some[:, 0]), rows_of(f1.fine, some[:, 1])
         products = jnp.einsum("kd,kd->k", a, b, precision=HIGHEST)
         return i + 1, lax.dynamic_update_slice(scores, products, (start,))
@@ -177,7 +177,7 @@ def one_to_one(
         target = jnp.where(keep, cells[:, side], num_cells)
         best = jnp.full((num_cells,), -jnp.inf, score.dtype).at[target].max(score, mode="drop")
         wins = keep & (score == best[cells[:, side]])
-        order = jnp.where(wins, jnp.arange(k), k)
-        first = jnp.full((num_cells,), k).at[target].min(order, mode="drop")
+        order = jnp.where(wins, jnp.arange(k, dtype=jnp.int32), k)
+        first = jnp.full((num_cells,), k, jnp.int32).at[target].min(order, mode="drop")
         keep = wins & (order == first[cells[:, side]])
     return keep

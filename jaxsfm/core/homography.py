@@ -31,9 +31,9 @@ def normalisation(xy: Float[Array, "k 2"], weight: Float[Array, " k"]) -> Float[
     mean_x, mean_y = (weight * x).sum() / total, (weight * y).sum() / total
     spread = (weight * ((x - mean_x) ** 2 + (y - mean_y) ** 2)).sum() / total
     scale = jnp.sqrt(2.0 / jnp.where(spread > 0, spread, 2.0))
-    return jnp.asarray([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]]) * scale + jnp.zeros((3, 3)).at[
-        :, 2
-    ].set(jnp.stack([-scale * mean_x, -scale * mean_y, jnp.ones_like(scale)]))
+    diagonal = jnp.asarray([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 0]], scale.dtype) * scale
+    last = jnp.stack([-scale * mean_x, -scale * mean_y, jnp.ones_like(scale)])
+    return diagonal + jnp.zeros((3, 3), scale.dtype).at[:, 2].set(last)
 
 
 def apply_affine(t: Float[Array, "3 3"], xy: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
@@ -121,7 +121,7 @@ def least_squares(
     squares = jnp.stack([x * x, x * y, y * y, x, y, one])
     factors = weight * jnp.stack([one, -u, -v, u * u + v * v])
     sums = jnp.einsum("fk,sk->fs", factors, squares, precision=HIGHEST)
-    s, su, sv, suv = sums[:, jnp.asarray([[0, 1, 3], [1, 2, 4], [3, 4, 5]])]
+    s, su, sv, suv = sums[:, jnp.asarray([[0, 1, 3], [1, 2, 4], [3, 4, 5]], jnp.int32)]
     zero = jnp.zeros_like(s)
     normal = jnp.block([[s, zero, su], [zero, s, sv], [su, sv, suv]])
     _, vectors = jnp.linalg.eigh(normal)

@@ -6,6 +6,7 @@ expectation of that over random walks (`jaxsfm.core.relocalize.walk`) is a sum o
 pixels of the two cells. It is exact, without sampling.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -141,7 +142,7 @@ def peakiness(walks: WalkProbabilities) -> Float[Array, " m"]:
     """
     p = _flat(walks)
     log = jnp.log(jnp.where(p > 0, p, 1.0))
-    return 1 + jnp.sum(p * log, axis=-1) / jnp.log(p.shape[1])
+    return 1 + jnp.sum(p * log, axis=-1) / math.log(p.shape[1])
 
 
 def weighted_mean(values: Float[Array, " m"], weight: Float[Array, " m"]) -> Float[Array, ""]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxsfm.core.numerics import HIGHEST
 from jaxsfm.core.types import PRNGKey
 
 GAMMA = 2.2
@@ -52,19 +53,22 @@ def _lamp_light(key: PRNGKey, height: int, width: int) -> tuple[Array, Array]:
     diagonal = float(height**2 + width**2) ** 0.5
     y, x = jnp.mgrid[:height, :width].astype(jnp.float32)
     place, reach, colour, strength = jax.random.split(key, 4)
-    low, high = jnp.asarray([0.05, 0.05]), jnp.asarray([0.95, 0.75])
-    at = jax.random.uniform(place, (NUM_LAMPS, 2), minval=low, maxval=high)
+    low, high = (jnp.asarray(x, jnp.float32) for x in ((0.05, 0.05), (0.95, 0.75)))
+    at = jax.random.uniform(place, (NUM_LAMPS, 2), jnp.float32, minval=low, maxval=high)
     at = at * jnp.asarray([width, height], jnp.float32)
-    reaches = jax.random.uniform(reach, (NUM_LAMPS,), minval=0.06, maxval=0.16) * diagonal
-    kinds = jax.random.randint(colour, (NUM_LAMPS,), 0, len(LAMPS))
-    colours = jnp.asarray(LAMPS)[kinds] * jax.random.uniform(
-        strength, (NUM_LAMPS, 1), minval=0.4, maxval=1.0
+    reaches = diagonal * jax.random.uniform(
+        reach, (NUM_LAMPS,), jnp.float32, minval=0.06, maxval=0.16
+    )
+    kinds = jax.random.randint(colour, (NUM_LAMPS,), 0, len(LAMPS), jnp.int32)
+    colours = jnp.asarray(LAMPS, jnp.float32)[kinds] * jax.random.uniform(
+        strength, (NUM_LAMPS, 1), jnp.float32, minval=0.4, maxval=1.0
     )
     square = (x - at[:, 0, None, None]) ** 2 + (y - at[:, 1, None, None]) ** 2
     lit = 1 / (1 + square / reaches[:, None, None] ** 2) ** 2
     flare = jnp.exp(-square / (2 * (0.006 * diagonal) ** 2))
-    light = jnp.einsum("khw,kc->hwc", lit, colours) + jnp.asarray(AMBIENT)
-    return light, jnp.einsum("khw,kc->hwc", flare, colours)
+    light = jnp.einsum("khw,kc->hwc", lit, colours, precision=HIGHEST)
+    light = light + jnp.asarray(AMBIENT, jnp.float32)
+    return light, jnp.einsum("khw,kc->hwc", flare, colours, precision=HIGHEST)
 
 
 def night(
@@ -84,12 +88,12 @@ def night(
     radiance = (jnp.clip(rgb, 0.0, 255.0) / 255.0) ** GAMMA * ((1 - dusk) + dusk * light)
     radiance = blur(radiance + dusk * glare, BLUR_PX * severity)
     brightest = jnp.max(radiance, axis=2)
-    white = (1 - dusk) + dusk * jnp.quantile(brightest, 1 - SATURATED_SHARE)
+    white = (1 - dusk) + dusk * jnp.quantile(brightest, jnp.float32(1 - SATURATED_SHARE))
     full = FULL_WELL * 10.0**-severity
     expected = jnp.minimum(radiance / jnp.maximum(white, 1e-6), 1.0) * full
     # Numbers of photons are drawn from a normal distribution. It is right from ten photons on, and
     # takes a tenth of the time of a Poisson distribution.
     spread = jnp.sqrt(expected + READ_NOISE**2)
-    electrons = expected + spread * jax.random.normal(photons, rgb.shape)
+    electrons = expected + spread * jax.random.normal(photons, rgb.shape, jnp.float32)
     signal = jnp.clip(electrons / jnp.maximum(full, MIN_FULL_SCALE), 0.0, 1.0)
     return jnp.where(severity > 0, 255.0 * signal ** (1 / GAMMA), rgb)

@@ -13,6 +13,14 @@ HIGHEST = lax.Precision.HIGHEST
 that decides geometry or a nearest neighbour states this precision."""
 
 
+def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """float16 and bfloat16 as float32; float32 and float64 stay as they are.
+
+    bfloat16 has 8 binary digits, so that coordinates of a thousand pixels would be multiples of 4.
+    """
+    return x.astype(jnp.float32) if jnp.finfo(x.dtype).bits < 32 else x
+
+
 def squared_norm(x: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
     """Sum of squares over the last axis."""
     return jnp.sum(x * x, axis=-1)

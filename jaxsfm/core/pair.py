@@ -68,7 +68,7 @@ def match_pair(
         coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
     windows = c2f.match_windows(features0, features1, coarse, chunk=shape.fine_chunk)
     cells, found = c2f.correspondences(c2f.candidates(windows, features0), capacity=capacity)
-    valid = jnp.arange(cells.shape[0]) < found
+    valid = jnp.arange(cells.shape[0], dtype=jnp.int32) < found
     xy0, xy1 = features0.keypoints[cells[:, 0]], features1.keypoints[cells[:, 1]]
     planes = peel_planes(key, xy0, xy1, valid, thresholds, shape=shape)
     if shape.one_to_one == "similarity":

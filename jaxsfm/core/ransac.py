@@ -40,7 +40,8 @@ def sample_indices(key: PRNGKey, num: int, count: Int[Array, ""]) -> Int[Array, 
     """
     drawn: list[Array] = []
     for i in range(4):
-        x = jax.random.randint(jax.random.fold_in(key, i), (num,), 0, jnp.maximum(count - i, 1))
+        most = jnp.maximum(count - i, 1)
+        x = jax.random.randint(jax.random.fold_in(key, i), (num,), 0, most, jnp.int32)
         earlier = jnp.sort(jnp.stack(drawn, axis=1), axis=1) if drawn else None
         for j in range(i):
             assert earlier is not None
@@ -62,12 +63,13 @@ def hypotheses_needed(
     p = jnp.prod(jnp.maximum(i - k, 0.0) / jnp.maximum(n - k, 1.0))
     # log1p is accurate for p far below the epsilon of float32. With p = 1 one sample is enough.
     miss = jnp.log1p(-jnp.minimum(p, 1.0 - 1e-6))
-    return jnp.where(p > 0, jnp.log(1.0 - confidence) / jnp.where(p > 0, miss, -1.0), jnp.inf)
+    wrong = jnp.log(1.0 - jnp.asarray(confidence, jnp.float32))
+    return jnp.where(p > 0, wrong / jnp.where(p > 0, miss, -1.0), jnp.inf)
 
 
 def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
     xy0, xy1 = problem.xy0, problem.xy1
-    live = jnp.arange(xy0.shape[0]) < problem.num_live
+    live = jnp.arange(xy0.shape[0], dtype=jnp.int32) < problem.num_live
     return live & hg.inliers(
         h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way
     )
@@ -90,7 +92,7 @@ def count_inliers(
         start = jnp.minimum(i * chunk, k - chunk)
         x0, y0, x1, y1 = (lax.dynamic_slice_in_dim(c, start, chunk) for c in columns)
         xy0, xy1 = jnp.stack([x0, y0], axis=1), jnp.stack([x1, y1], axis=1)
-        index = start + jnp.arange(chunk)
+        index = start + jnp.arange(chunk, dtype=jnp.int32)
         # The last chunk is moved back to fit. Count only rows that no earlier chunk has counted.
         live = (index >= i * chunk) & (index < problem.num_live)
         hit = hg.inliers(h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way)
@@ -146,7 +148,7 @@ def _one_plane(
         h, num = _refit(h, num, problem, shape)
         return h, num, hypotheses_needed(num, problem.num_live, thresholds.confidence)
 
-    start = (jnp.int32(0), jnp.eye(3), jnp.int32(0), jnp.float32(jnp.inf))
+    start = (jnp.int32(0), jnp.eye(3, dtype=jnp.float32), jnp.int32(0), jnp.float32(jnp.inf))
     step, h, num, _ = lax.while_loop(more, body, start)
     return h, num, step * step_size
 

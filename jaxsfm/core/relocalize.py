@@ -22,6 +22,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxsfm.core.numerics import at_least_float32
+
 FACTOR = 2
 """Ratio of neighbouring levels."""
 LEAST_SCORE = 1e-3
@@ -132,8 +134,8 @@ def _hard(
         if children > FACTOR:  # blocks reach past the borders
             inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
             found = jnp.where(inside, found, -jnp.inf)
-        best = jnp.argmax(found, axis=1)
-        pick = jnp.arange(best.shape[0])
+        best = jnp.argmax(found, axis=1).astype(jnp.int32)
+        pick = jnp.arange(best.shape[0], dtype=jnp.int32)
         return (rows[pick, best], cols[pick, best]), None
 
     (row, col), _ = lax.scan(descend, (row, col), tuple(levels.T))
@@ -149,12 +151,17 @@ def walk(
     children: int = FACTOR,
 ) -> WalkProbabilities:
     """Where a random walk ends that takes the children of a block with probabilities proportional
-    to score^(1 / temperature). Arguments are those of `relocalize`."""
+    to score^(1 / temperature). Arguments are those of `relocalize`.
+
+    Scores of 16 bits are converted to float32 first, because places are computed from the
+    probabilities.
+    """
     _check(scores, children, temperature)
     first = _first_child(children)
-    p = jnp.ones((row.shape[0], 1, 1), scores[0].dtype)
+    levels = [at_least_float32(level) for level in scores]
+    p = jnp.ones((row.shape[0], 1, 1), levels[0].dtype)
     row0, col0 = row, col
-    for level in scores:
+    for level in levels:
         child_p = _child_probabilities(level, row0, col0, p.shape[1], temperature, children)
         size = FACTOR * (p.shape[1] - 1) + children
         below = jnp.zeros((p.shape[0], size, size), p.dtype)
@@ -202,15 +209,16 @@ def _child_probabilities(
 
 def expectation(walks: WalkProbabilities) -> Float[Array, "m 2"]:
     """Mean place (x, y) where walks end, in cells of the finest map."""
-    index = jnp.arange(walks.p.shape[1], dtype=walks.p.dtype)
-    x = jnp.sum(walks.p * index, axis=(1, 2))
-    y = jnp.sum(walks.p * index[:, None], axis=(1, 2))
-    return walks.start.astype(walks.p.dtype) + jnp.stack([x, y], axis=-1)
+    p = at_least_float32(walks.p)
+    index = jnp.arange(p.shape[1], dtype=p.dtype)
+    x = jnp.sum(p * index, axis=(1, 2))
+    y = jnp.sum(p * index[:, None], axis=(1, 2))
+    return walks.start.astype(p.dtype) + jnp.stack([x, y], axis=-1)
 
 
 def window_positions(walks: WalkProbabilities) -> Float[Array, "m n 2"]:
     """(x, y) of every cell of the windows, in the row order of the flattened `walks.p`."""
-    size = walks.p.shape[1]
-    index = jnp.arange(size, dtype=walks.p.dtype)
+    size, dtype = walks.p.shape[1], at_least_float32(walks.p).dtype
+    index = jnp.arange(size, dtype=dtype)
     offsets = jnp.stack([jnp.tile(index, size), jnp.repeat(index, size)], axis=-1)
-    return walks.start[:, None].astype(walks.p.dtype) + offsets
+    return walks.start[:, None].astype(dtype) + offsets

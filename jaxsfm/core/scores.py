@@ -55,7 +55,7 @@ def score(x: Float[Array, "*batch h w c"], head: Head | None) -> Float[Array, "*
         return square
     unit = x * inverse_norm(x)[..., None]
     hidden = nn.relu(jnp.matmul(unit, head.kernel, precision=HIGHEST) + head.bias)
-    row, col = (jnp.arange(side) % head.place.shape[0] for side in x.shape[-3:-1])
+    row, col = (jnp.arange(side, dtype=jnp.int32) % head.place.shape[0] for side in x.shape[-3:-1])
     exponent = jnp.matmul(hidden, head.out, precision=HIGHEST) + head.place[row[:, None], col]
     return square * jnp.exp(jnp.clip(exponent, -MOST_EXPONENT, MOST_EXPONENT))
 

@@ -76,8 +76,8 @@ class Parameters(nn.Module):
     def __call__(self) -> Layer:
         """The kernel and the bias."""
         shape = (3, 3, self.inputs, self.features)
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
-        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,))
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), shape, jnp.float32)
+        bias = self.param("bias", nn.initializers.zeros_init(), (self.features,), jnp.float32)
         return Layer(jnp.asarray(kernel), jnp.asarray(bias))
 
 

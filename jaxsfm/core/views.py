@@ -47,7 +47,7 @@ def random_homography(key: PRNGKey, strength: Float[Array, ""]) -> Float[Array, 
         aspect ratios of 0.7-1.4, a shear of up to 0.3, and a perspective that changes the scale
         across the view by up to a third.
     """
-    u = strength * jax.random.uniform(key, (6,), minval=-1.0, maxval=1.0)
+    u = strength * jax.random.uniform(key, (6,), jnp.float32, minval=-1.0, maxval=1.0)
     scale, aspect = jnp.exp(0.6 * u[0]), jnp.exp(0.35 * u[1])
     turn, shear = 0.6 * u[2], 0.3 * u[3]
     cos, sin = jnp.cos(turn), jnp.sin(turn)
@@ -95,13 +95,13 @@ def change_light(
     exposure, gains, contrast, focus, noisy, noise = jax.random.split(key, 6)
 
     def draw(key, low, high, shape=()):
-        return strength * jax.random.uniform(key, shape, minval=low, maxval=high)
+        return strength * jax.random.uniform(key, shape, jnp.float32, minval=low, maxval=high)
 
     linear = (jnp.clip(rgb, 0.0, 255.0) / 255.0) ** 2.2
     linear = linear * jnp.exp(draw(exposure, -1.0, 0.4)) * jnp.exp(draw(gains, -0.3, 0.3, (3,)))
     value = blur(jnp.clip(linear, 0.0, 1.0), draw(focus, 0.0, 1.2)) ** (1 / 2.2)
     value = 255.0 * ((value - 0.5) * jnp.exp(draw(contrast, -0.4, 0.4)) + 0.5)
-    value = value + draw(noisy, 0.0, 6.0) * jax.random.normal(noise, rgb.shape)
+    value = value + draw(noisy, 0.0, 6.0) * jax.random.normal(noise, rgb.shape, jnp.float32)
     return jnp.clip(value, 0.0, 255.0)
 
 
@@ -118,16 +118,17 @@ def view_pair(key: PRNGKey, photo: Float[Array, "s s 3"], *, size: int) -> ViewP
     to_unit = jnp.asarray([[1 / half, 0, -1], [0, 1 / half, -1], [0, 0, 1]], jnp.float32)
 
     def view_to_photo(key, place, strength):
-        shift = (side - 1) / 2 + jax.random.uniform(place, (2,), minval=-0.2, maxval=0.2) * half
-        to_photo = (jnp.eye(3) * half).at[:2, 2].set(shift).at[2, 2].set(1.0)
+        moved = jax.random.uniform(place, (2,), jnp.float32, minval=-0.2, maxval=0.2)
+        shift = (side - 1) / 2 + moved * half
+        to_photo = (jnp.eye(3, dtype=jnp.float32) * half).at[:2, 2].set(shift).at[2, 2].set(1.0)
         h = jnp.matmul(random_homography(key, strength), to_unit, precision=HIGHEST)
         return jnp.matmul(to_photo, h, precision=HIGHEST)
 
     h0 = view_to_photo(keys[0], keys[1], jnp.float32(0.2))
-    h1 = view_to_photo(keys[2], keys[3], jax.random.uniform(keys[4]))
+    h1 = view_to_photo(keys[2], keys[3], jax.random.uniform(keys[4], (), jnp.float32))
     view0 = change_light(keys[5], sample_view(photo, h0, size=size), jnp.float32(0.5))
     seen = sample_view(photo, h1, size=size)
-    dark, severity = jax.random.uniform(keys[6], (2,))
+    dark, severity = jax.random.uniform(keys[6], (2,), jnp.float32)
     view1 = jnp.where(
         dark < NIGHT_SHARE,
         night(keys[7], seen, MOST_SEVERE * severity),

@@ -92,5 +92,5 @@ def fit_vocabulary(
     made = Vocabulary(mean, axes * scales, jnp.zeros((words, directions), sample.dtype))
     flat = whitened(sample, made)
     # The descriptors come first, in random order, and the zero rows after them.
-    order = jnp.argsort(jnp.where(live, jax.random.uniform(key, (rows,)), 1.0))
+    order = jnp.argsort(jnp.where(live, jax.random.uniform(key, (rows,), jnp.float32), 1.0))
     return made._replace(centres=lloyd(flat, flat[order[:words]]))

@@ -74,5 +74,5 @@ def conv3x3(
         pairs = [jnp.stack([v.reshape(rows, across, -1) for v in line], axis=2) for line in y]
         return jnp.stack(pairs, axis=1).reshape(2 * rows, 2 * across, -1)
 
-    out = lax.map(strip, 2 * rows * jnp.arange(strips))
+    out = lax.map(strip, 2 * rows * jnp.arange(strips, dtype=jnp.int32))
     return out.reshape(2 * rows * strips, 2 * across, -1)[:h, :w]

@@ -164,7 +164,7 @@ def test_a_shift_that_is_only_a_change_of_gain_leaves_the_place_open():
     """exp(x / 5) moved along x is itself times a number: nothing tells where it lies along x."""
     x, y = grid()[..., 0], grid()[..., 1]
     image = np.exp((x - 40) / 5) * (2 + np.cos(y / 2))
-    size, at = jnp.asarray(SIZE, jnp.int32), jnp.asarray([[40.0, 32.0]])
+    size, at = jnp.asarray(SIZE, jnp.int32), jnp.asarray([[40.0, 32.0]], jnp.float32)
     t = make_templates(jnp.asarray(image[..., None], jnp.float32), size, at, PATCH)
     hessian = np.asarray(t.hessian[0])
     assert hessian[0, 0] < 1e-3 * hessian[1, 1]
@@ -231,7 +231,7 @@ def test_sampling_is_exact_on_pixels_and_parabolas_and_clamped_outside():
     rng = rng_of(0)
     image = jnp.asarray(rng.normal(size=(5, 6, 2)), jnp.float32)
     size = jnp.asarray([5, 6], jnp.int32)
-    at = jnp.asarray([[0.0, 0.0], [5.0, 4.0], [2.0, 3.0], [-3.0, 2.0], [7.0, 9.0]])
+    at = jnp.asarray([[0.0, 0.0], [5.0, 4.0], [2.0, 3.0], [-3.0, 2.0], [7.0, 9.0]], jnp.float32)
     values, inside = sample(image, size, at)
     np.testing.assert_array_equal(np.asarray(inside), [True, True, True, False, False])
     np.testing.assert_allclose(values[0], image[0, 0])
@@ -241,7 +241,7 @@ def test_sampling_is_exact_on_pixels_and_parabolas_and_clamped_outside():
     np.testing.assert_allclose(values[4], image[4, 5], rtol=1e-6)
     y, x = np.mgrid[:9, :9].astype(np.float32)
     parabola = jnp.asarray((0.3 * x * x - y * y + x * y)[..., None])
-    at = jnp.asarray([[2.3, 4.8], [5.5, 3.25]])
+    at = jnp.asarray([[2.3, 4.8], [5.5, 3.25]], jnp.float32)
     want = 0.3 * at[:, 0] ** 2 - at[:, 1] ** 2 + at[:, 0] * at[:, 1]
     got = sample(parabola, jnp.asarray([9, 9], jnp.int32), at)[0][:, 0]
     np.testing.assert_allclose(got, want, rtol=1e-5)
@@ -254,7 +254,7 @@ def test_where_a_keypoint_ends_follows_the_map_and_its_gradient_is_finite():
     one = jnp.asarray(f(grid()), jnp.float32)
     size = jnp.asarray(SIZE, jnp.int32)
     at = jnp.asarray(ref, jnp.float32)[None]
-    affine = jnp.eye(2)[None]
+    affine = jnp.eye(2, dtype=jnp.float32)[None]
     pixels = jnp.asarray(grid(), jnp.float32)
 
     def end(t, image):
@@ -262,10 +262,10 @@ def test_where_a_keypoint_ends_follows_the_map_and_its_gradient_is_finite():
         templates = make_templates(one, size, at, PATCH)
         return align(moved, size, templates, at, affine, PATCH).xy[0]
 
-    jacobian = jax.jacobian(end)(jnp.asarray([0.3, -0.4]), one)
+    jacobian = jax.jacobian(end)(jnp.asarray([0.3, -0.4], jnp.float32), one)
     np.testing.assert_allclose(jacobian, np.eye(2), atol=0.1)
     for image in (one, jnp.zeros_like(one)):
-        gradient = jax.grad(lambda m: end(jnp.zeros(2), m).sum())(image)  # noqa: B023
+        gradient = jax.grad(lambda m: end(jnp.zeros(2, jnp.float32), m).sum())(image)  # noqa: B023
         assert jnp.isfinite(gradient).all()
 
 

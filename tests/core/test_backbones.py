@@ -79,12 +79,17 @@ def test_alexnets_strips_give_the_same_for_any_height(image, monkeypatch):
 
 
 def test_alexnet_takes_no_learned_scores():
-    head = Head(jnp.zeros((64, 2)), jnp.zeros(2), jnp.zeros(2), jnp.zeros((8, 8)))
+    head = Head(
+        jnp.zeros((64, 2), jnp.float32),
+        jnp.zeros(2, jnp.float32),
+        jnp.zeros(2, jnp.float32),
+        jnp.zeros((8, 8), jnp.float32),
+    )
     with pytest.raises(ValueError, match="heads"):
         AlexNet().apply(
             random_params("alexnet"),
-            jnp.zeros((1, 16, 16, 3)),
-            jnp.asarray([[16, 16]]),
+            jnp.zeros((1, 16, 16, 3), jnp.float32),
+            jnp.asarray([[16, 16]], jnp.int32),
             (head, None, None),
             method="levels",
         )
@@ -133,7 +138,7 @@ def test_features_are_made_of_any_backbone_with_octaves(name, image):
     rgb = np.clip(128 + 40 * image, 0, 255).astype(np.uint8)
     settings = Extraction(PLAIN, num_coarse=12, backbone=name, octaves=2, centred=True)
     features = extract(
-        random_params(name), jnp.asarray(rgb), jnp.asarray([64, 48]), settings=settings
+        random_params(name), jnp.asarray(rgb), jnp.asarray([64, 48], jnp.int32), settings=settings
     )
     backbone = BACKBONES[name]
     assert [f.shape for f in features.fine] == [(48, backbone.fine), (12, backbone.fine)]

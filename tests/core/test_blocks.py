@@ -36,7 +36,10 @@ def way(monkeypatch):
 def layers(rng, *channels: int) -> list[Layer]:
     def layer(inputs, outputs):
         kernel = rng.normal(size=(3, 3, inputs, outputs)) / (3 * inputs**0.5)
-        return Layer(jnp.asarray(kernel, jnp.float32), jnp.asarray(rng.normal(size=outputs) / 10))
+        return Layer(
+            jnp.asarray(kernel, jnp.float32),
+            jnp.asarray(rng.normal(size=outputs) / 10, jnp.float32),
+        )
 
     return [layer(*each) for each in zip(channels, channels[1:], strict=False)]
 
@@ -93,7 +96,7 @@ def whole_numbers(rng, *channels: int):
     kernels = [
         rng.integers(-1, 2, (3, 3, *each)) for each in zip(channels, channels[1:], strict=False)
     ]
-    stack = [Layer(jnp.asarray(k, jnp.float32), jnp.ones(k.shape[3])) for k in kernels]
+    stack = [Layer(jnp.asarray(k, jnp.float32), jnp.ones(k.shape[3], jnp.float32)) for k in kernels]
     x = jnp.asarray(rng.integers(-2, 3, (2, 40, 24, channels[0])), jnp.float32)
     return stack, blocks.clear_padding(x, SIZES)
 
@@ -123,7 +126,7 @@ def test_products_of_bfloat16_are_the_cpus_bit_for_bit(way):
     rng = rng_of(2)
     x = jnp.asarray(rng.integers(-40, 40, (1, 9, 8, 4)), jnp.float32) / 7
     kernel = jnp.asarray(rng.integers(-3, 4, (3, 3, 4, 5)), jnp.float32)
-    layer, made = Layer(kernel, jnp.full((5,), 0.1)), []
+    layer, made = Layer(kernel, jnp.full((5,), 0.1, jnp.float32)), []
     for name in ("cpu", "default"):
         way(name)
         made.append(np.asarray(blocks.conv(x, layer, bfloat16=True)))

@@ -23,9 +23,9 @@ def features(rng, coarse_grid, fine_grid) -> JoinedFeatures:
     fine[:used] = unit_rows(rng, used, 8)
     fine[rng.integers(0, used)] = 0  # a cell where nothing is seen
     return JoinedFeatures(
-        coarse=jnp.zeros((N, 8)),
+        coarse=jnp.zeros((N, 8), jnp.float32),
         fine=jnp.asarray(fine),
-        keypoints=jnp.zeros((M, 2)),
+        keypoints=jnp.zeros((M, 2), jnp.float32),
         coarse_grid=jnp.asarray(coarse_grid, jnp.int32),
         fine_grid=jnp.asarray(fine_grid, jnp.int32),
     )

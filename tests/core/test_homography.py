@@ -11,7 +11,9 @@ from tolerances import HOMOGRAPHY_PX, UNIT
 from jaxsfm.core import homography as hg
 
 SQUARE = np.asarray([[100, 100], [900, 150], [850, 900], [120, 800]], np.float32)
-NORMALISE = jnp.asarray([[1 / 350, 0, -500 / 350], [0, 1 / 350, -500 / 350], [0, 0, 1]])
+NORMALISE = jnp.asarray(
+    [[1 / 350, 0, -500 / 350], [0, 1 / 350, -500 / 350], [0, 0, 1]], jnp.float32
+)
 
 
 def solve(xy0, xy1):
@@ -56,7 +58,9 @@ def test_least_squares_is_as_good_as_opencvs_on_noisy_points(seed):
     h = random_homography(rng, strength=0.5)
     xy0 = rng.uniform(0, 1000, (60, 2)).astype(np.float32)
     xy1 = (oracles.transfer(h, xy0) + rng.normal(0, 1, (60, 2))).astype(np.float32)
-    ours = np.asarray(hg.least_squares(jnp.asarray(xy0), jnp.asarray(xy1), jnp.ones(60)))
+    ours = np.asarray(
+        hg.least_squares(jnp.asarray(xy0), jnp.asarray(xy1), jnp.ones(60, jnp.float32))
+    )
     reference = oracles.homography(xy0, xy1)
 
     def rms(m):
@@ -109,7 +113,8 @@ def test_two_way_inliers_swap_with_the_images():
     xy0 = rng.uniform(0, 1000, (80, 2)).astype(np.float32)
     xy1 = (oracles.transfer(h, xy0) + rng.normal(0, 6, (80, 2))).astype(np.float32)
     n0, n1 = (hg.apply_affine(NORMALISE, jnp.asarray(x)) for x in (xy0, xy1))
-    m = hg.orient(jnp.asarray(NORMALISE @ h @ np.linalg.inv(NORMALISE), jnp.float32))
+    to_unit = np.asarray(NORMALISE, np.float64)
+    m = hg.orient(jnp.asarray(to_unit @ h @ np.linalg.inv(to_unit), jnp.float32))
     t = jnp.float32(10 / 350)
     forward = hg.inliers(m, n0, n1, t, t, two_way=True)
     backward = hg.inliers(hg.orient(hg.adjugate(m)), n1, n0, t, t, two_way=True)
@@ -118,19 +123,19 @@ def test_two_way_inliers_swap_with_the_images():
 
 
 def test_points_behind_the_camera_are_no_inliers():
-    h = hg.orient(jnp.asarray([[1.0, 0, 0], [0, 1, 0], [-2, 0, 1]]))
-    xy0 = jnp.asarray([[0.1, 0.0], [1.0, 0.0]])  # w = 0.8 and -1
+    h = hg.orient(jnp.asarray([[1.0, 0, 0], [0, 1, 0], [-2, 0, 1]], jnp.float32))
+    xy0 = jnp.asarray([[0.1, 0.0], [1.0, 0.0]], jnp.float32)  # w = 0.8 and -1
     xy1 = xy0 / (1 - 2 * xy0[:, :1])
     np.testing.assert_array_equal(hg.transfer_inliers(h, xy0, xy1, jnp.float32(0.1)), [True, False])
 
 
 def test_normalised_points_have_mean_zero_and_radius_root_two():
     xy = jnp.asarray(rng_of(0).uniform(0, 2000, (50, 2)), jnp.float32)
-    out = np.asarray(hg.apply_affine(hg.normalisation(xy, jnp.ones(50)), xy))
+    out = np.asarray(hg.apply_affine(hg.normalisation(xy, jnp.ones(50, jnp.float32)), xy))
     np.testing.assert_allclose(out.mean(0), 0, atol=1e-5)
     np.testing.assert_allclose((out**2).sum(1).mean(), 2.0, **UNIT)
-    same = jnp.ones((5, 2))
-    assert np.isfinite(hg.normalisation(same, jnp.ones(5))).all()
+    same = jnp.ones((5, 2), jnp.float32)
+    assert np.isfinite(hg.normalisation(same, jnp.ones(5, jnp.float32))).all()
 
 
 def test_an_affinity_is_its_matrix():
@@ -160,8 +165,10 @@ def test_the_error_of_a_transfer_is_its_squared_distance_and_infinite_behind_the
     ours = hg.transfer_error(jnp.asarray(h, jnp.float32), *points)
     expected = [((oracles.transfer(m, xy0) - xy1) ** 2).sum(1) for m in h]
     np.testing.assert_allclose(ours, expected, rtol=1e-3, atol=HOMOGRAPHY_PX)
-    behind = jnp.asarray([[1.0, 0, 0], [0, 1, 0], [-2, 0, 1]])
-    away = hg.transfer_error(behind, jnp.asarray([[1.0, 0.0], [0.5, 0.0]]), jnp.zeros((2, 2)))
+    behind = jnp.asarray([[1.0, 0, 0], [0, 1, 0], [-2, 0, 1]], jnp.float32)
+    away = hg.transfer_error(
+        behind, jnp.asarray([[1.0, 0.0], [0.5, 0.0]], jnp.float32), jnp.zeros((2, 2), jnp.float32)
+    )
     assert np.isinf(away).all()
 
 
@@ -178,7 +185,7 @@ def test_vmap_equals_loop():
     rng = rng_of(1)
     xy1 = np.stack([oracles.transfer(random_homography(rng, strength=1), SQUARE) for _ in range(5)])
     xy1 = jnp.asarray(xy1 / 1000, jnp.float32)
-    xy0 = jnp.asarray(SQUARE / 1000)
+    xy0 = jnp.asarray(SQUARE / 1000, jnp.float32)
     batch, valid = jax.vmap(hg.from_four_points, in_axes=(None, 0))(xy0, xy1)
     for i in range(5):
         h, ok = hg.from_four_points(xy0, xy1[i])

@@ -23,7 +23,7 @@ from jaxsfm.core.losses import (
 from jaxsfm.core.relocalize import WalkProbabilities, walk, window_positions
 from jaxsfm.sfm.epipolar import sampson_error
 
-IDENTITY = jnp.eye(3)
+IDENTITY = jnp.eye(3, dtype=jnp.float32)
 
 
 def random_walks(seed: int, *, cells: int = 5, temperature: float = 1.0) -> WalkProbabilities:
@@ -164,21 +164,23 @@ def test_cells_under_a_homography_hold_the_mapped_centres(seed):
 
 def test_cells_that_a_homography_turns_over_are_not_seen():
     """Points behind the camera, whose coordinates lie inside the other view all the same."""
-    h = jnp.asarray([[-1.0, 0, 0], [0, -1, 0], [-1 / 30, 0, 1]])
-    cells = cells_under_homography(h, jnp.zeros((81, 2)), rows=9, cols=9)
+    h = jnp.asarray([[-1.0, 0, 0], [0, -1, 0], [-1 / 30, 0, 1]], jnp.float32)
+    cells = cells_under_homography(h, jnp.zeros((81, 2), jnp.float32), rows=9, cols=9)
     assert not cells.weight.any()
-    front = cells_under_homography(-h, jnp.zeros((81, 2)), rows=9, cols=9)
+    front = cells_under_homography(-h, jnp.zeros((81, 2), jnp.float32), rows=9, cols=9)
     np.testing.assert_array_equal(front.weight, cells.weight)
 
 
 def test_means_of_nothing_are_zero_and_have_finite_gradients():
-    values = jnp.asarray([jnp.nan, 3.0, 5.0])
-    assert float(weighted_mean(values, jnp.asarray([0.0, 1.0, 3.0]))) == 4.5
-    assert float(weighted_mean(values, jnp.zeros(3))) == 0
-    assert float(share_within(jnp.asarray([0.5, 4.0, 1.0]), jnp.asarray([True] * 3), px=1.0)) == (
-        pytest.approx(2 / 3)
+    values = jnp.asarray([jnp.nan, 3.0, 5.0], jnp.float32)
+    assert float(weighted_mean(values, jnp.asarray([0.0, 1.0, 3.0], jnp.float32))) == 4.5
+    assert float(weighted_mean(values, jnp.zeros(3, jnp.float32))) == 0
+    assert float(
+        share_within(jnp.asarray([0.5, 4.0, 1.0], jnp.float32), jnp.asarray([True] * 3), px=1.0)
+    ) == (pytest.approx(2 / 3))
+    gradient = jax.grad(lambda w: weighted_mean(jnp.ones(3, jnp.float32), w))(
+        jnp.zeros(3, jnp.float32)
     )
-    gradient = jax.grad(lambda w: weighted_mean(jnp.ones(3), w))(jnp.zeros(3))
     assert bool(jnp.isfinite(gradient).all())
 
 

@@ -19,7 +19,7 @@ def test_the_constants_of_the_model_are_what_they_were():
 
 @pytest.mark.parametrize("severity", [0.0, 1.0])
 def test_no_severity_is_the_photo_and_a_night_is_darker(severity):
-    photo = jnp.full((40, 60, 3), 128.0)
+    photo = jnp.full((40, 60, 3), 128.0, jnp.float32)
     seen = np.asarray(night.night(jax.random.key(0), photo, jnp.float32(severity)))
     assert seen.shape == photo.shape and seen.min() >= 0 and seen.max() <= 255
     if severity == 0:

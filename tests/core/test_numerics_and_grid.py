@@ -43,14 +43,14 @@ def test_unit_rows_have_norm_one(seed, size):
 
 
 def test_the_unit_of_zero_is_zero_with_a_finite_gradient():
-    zero = jnp.zeros((2, 4))
+    zero = jnp.zeros((2, 4), jnp.float32)
     np.testing.assert_array_equal(numerics.unit(zero), zero)
     assert np.isfinite(jax.grad(lambda x: numerics.unit(x).sum())(zero)).all()
 
 
 def test_the_gradient_of_unit_is_that_of_finite_differences():
-    x = jnp.asarray([[0.5, -1.0, 2.0]])
-    weight = jnp.asarray([1.0, 2.0, -1.0])
+    x = jnp.asarray([[0.5, -1.0, 2.0]], jnp.float32)
+    weight = jnp.asarray([1.0, 2.0, -1.0], jnp.float32)
     f = lambda x: (numerics.unit(x) * weight[None]).sum()  # noqa: E731
     step = 1e-2
     numeric = [(f(x.at[0, i].add(step)) - f(x.at[0, i].add(-step))) / (2 * step) for i in range(3)]
@@ -80,7 +80,8 @@ def test_compaction_lists_the_set_entries_in_order(seed, size):
 @pytest.mark.parametrize("count", [1, 2, 5])
 @pytest.mark.parametrize("batch_size", [1, 3, 8])
 def test_a_batch_is_its_items_and_one_batch_is_no_loop(count, batch_size):
-    items = jnp.arange(3.0 * count).reshape(count, 3), jnp.arange(count)
+    rows = jnp.arange(3 * count, dtype=jnp.float32).reshape(count, 3)
+    items = rows, jnp.arange(count, dtype=jnp.int32)
 
     def one(item):
         return {"sum": item[0].sum() * item[1].astype(jnp.float32), "row": item[0]}

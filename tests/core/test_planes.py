@@ -61,7 +61,7 @@ def test_every_member_is_nearest_to_its_own_plane():
     plane = np.asarray(found.plane)
     errors = np.stack(
         [
-            np.linalg.norm(oracles.transfer(h, np.asarray(xy0)) - xy1, axis=1)
+            np.linalg.norm(oracles.transfer(h, np.asarray(xy0)) - np.asarray(xy1), axis=1)
             for h in np.asarray(found.homographies, np.float64)[np.asarray(found.num_inliers) > 0]
         ]
     )
@@ -179,7 +179,7 @@ def test_planes_end_in_order_of_their_members():
 def test_without_planes_nothing_is_a_member():
     xy0, xy1, _ = two_walls(2, 0.1)
     none = nearest_plane(
-        jnp.zeros((3, 3, 3)),
+        jnp.zeros((3, 3, 3), jnp.float32),
         jnp.zeros(3, bool),
         Correspondences(xy0, xy1, jnp.ones(len(xy0), bool)),
         jnp.float32(4),

@@ -99,4 +99,4 @@ def test_equally_near_rows_come_in_their_order_and_nothing_is_near_itself():
 @pytest.mark.parametrize("k", [0, 3])
 def test_more_neighbours_than_there_are_is_an_error(k):
     with pytest.raises(ValueError, match=f"1..2, .*; got {k}"):
-        nearest(jnp.eye(3), k=k)
+        nearest(jnp.eye(3, dtype=jnp.float32), k=k)

@@ -186,7 +186,7 @@ def test_scores_of_zero_walk_softly_to_the_middle_of_the_cell():
 
 
 def test_what_cannot_be_walked_is_refused():
-    scores = [jnp.ones((2 * 2**k, 2 * 2**k)) for k in range(3)]
+    scores = [jnp.ones((2 * 2**k, 2 * 2**k), jnp.float32) for k in range(3)]
     row = col = jnp.zeros((1,), jnp.int32)
     for wrong, words in (
         ({"scores": []}, "at least one level"),

@@ -81,7 +81,7 @@ def test_scores_of_zeros_are_zero_and_have_finite_gradients():
 def test_scores_stay_finite_whatever_was_learned():
     params = jax.tree.map(lambda x: jnp.full_like(x, 1e4), random_scores(0))
     for sign in (1.0, -1.0):
-        params["params"]["pool1"]["out"] = jnp.full((5,), sign * 1e4)
+        params["params"]["pool1"]["out"] = jnp.full((5,), sign * 1e4, jnp.float32)
         for found in Scores(5).apply(params, random_maps(1)):
             assert bool(jnp.isfinite(found).all())
 

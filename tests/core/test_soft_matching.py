@@ -19,7 +19,7 @@ from jaxsfm.core.soft_matching import (
 )
 from jaxsfm.core.vgg import init_shapes
 
-CAMERA = jnp.asarray([[40.0, 0, 16], [0, 40.0, 16], [0, 0, 1]])
+CAMERA = jnp.asarray([[40.0, 0, 16], [0, 40.0, 16], [0, 0, 1]], jnp.float32)
 
 
 def descriptors(seed: int, n: int) -> jax.Array:
@@ -56,10 +56,10 @@ def test_cold_weights_find_what_the_pipeline_finds():
 def test_nothing_to_match_costs_nothing_and_has_finite_gradients():
     def cost(a, b):
         weights = soft_mutual(a, b, temperature=0.1)
-        xy = jnp.ones((4, 2))
-        return epipolar_loss(weights, xy, xy, jnp.eye(3))
+        xy = jnp.ones((4, 2), jnp.float32)
+        return epipolar_loss(weights, xy, xy, jnp.eye(3, dtype=jnp.float32))
 
-    zeros = jnp.zeros((4, 8))
+    zeros = jnp.zeros((4, 8), jnp.float32)
     assert float(cost(zeros, zeros)) == 0
     gradient = jax.grad(cost)(zeros, zeros)
     assert bool(jnp.isfinite(gradient).all())
@@ -85,12 +85,15 @@ def test_the_true_pose_has_no_epipolar_error(seed):
     pose = [jnp.asarray(x, jnp.float32) for x in (rotation, translation)]
     f = fundamental_matrix(CAMERA, CAMERA, *pose)
     f = f / jnp.linalg.norm(f)
-    found = epipolar_loss(jnp.eye(30), project(points), project(moved), f)
+    found = epipolar_loss(jnp.eye(30, dtype=jnp.float32), project(points), project(moved), f)
     assert float(found) < 1e-3
     across = np.cross(translation, np.roll(translation, 1) + [0, 0, 1])  # at right angles
     across *= np.linalg.norm(translation) / np.linalg.norm(across)
     wrong = fundamental_matrix(CAMERA, CAMERA, pose[0], jnp.asarray(across, jnp.float32))
-    assert float(epipolar_loss(jnp.eye(30), project(points), project(moved), wrong)) > 0.01
+    assert (
+        float(epipolar_loss(jnp.eye(30, dtype=jnp.float32), project(points), project(moved), wrong))
+        > 0.01
+    )
 
 
 @pytest.mark.slow

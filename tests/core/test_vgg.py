@@ -79,7 +79,7 @@ def test_bfloat16_rounds_operands_and_results_and_adds_in_float32(weights, photo
     expected = np.asarray(exact.astype(jnp.bfloat16).astype(jnp.float32)) + layer["bias"]
     # Half-way between two of bfloat16's numbers float32's sum may choose the other.
     assert (np.asarray(ours[0]) == expected).mean() > 0.999
-    images, sizes = jnp.asarray(photo[None]), jnp.asarray([photo.shape[:2]])
+    images, sizes = jnp.asarray(photo[None]), jnp.asarray([photo.shape[:2]], jnp.int32)
     exact = VGG16().apply(weights.params, images, sizes, method="levels")
     half = VGG16(bfloat16=True).apply(weights.params, images, sizes, method="levels")
     for name in ("pool3", "pool4"):
@@ -94,7 +94,7 @@ def test_bfloat16_rounds_operands_and_results_and_adds_in_float32(weights, photo
 def test_strips_of_any_height_give_the_same(weights, photo, monkeypatch, rows):
     def levels():
         jax.clear_caches()  # what was compiled before has other strips
-        images, sizes = jnp.asarray(photo[None]), jnp.asarray([[50, 70]])
+        images, sizes = jnp.asarray(photo[None]), jnp.asarray([[50, 70]], jnp.int32)
         return VGG16().apply(weights.params, images, sizes, method="levels")
 
     expected = levels()

@@ -48,7 +48,7 @@ def test_the_second_view_is_the_first_one_mapped(photo, monkeypatch):
 
 def test_views_sample_the_photo_where_the_homography_says(photo):
     """At whole pixels: the mean of four samples around each, a 3 x 3 filter."""
-    shift = jnp.asarray([[1.0, 0, 30], [0, 1, 50], [0, 0, 1]])
+    shift = jnp.asarray([[1.0, 0, 30], [0, 1, 50], [0, 0, 1]], jnp.float32)
     view = sample_view(photo, shift, size=96)
     kernel = np.outer([1, 6, 1], [1, 6, 1]) / 64
     expected = cv2.filter2D(np.asarray(photo), -1, kernel)[50:146, 30:126]

@@ -58,4 +58,4 @@ def test_a_sample_that_lies_in_a_plane_or_in_a_point_gives_finite_words(key):
 @pytest.mark.parametrize("shape", [(3, 8), (50, 2)])
 def test_too_small_a_sample_is_an_error(key, shape):
     with pytest.raises(ValueError, match=f"4 rows of 3 channels; got {shape[0]} of {shape[1]}"):
-        fit_vocabulary(key, jnp.zeros(shape), words=4, directions=3)
+        fit_vocabulary(key, jnp.zeros(shape, jnp.float32), words=4, directions=3)
