@@ -7,6 +7,10 @@ the wrong singular vector, and here it is the true solution.
 
 Correspondences are compacted first, so the amount of work follows their number and not the capacity
 of their list. Random numbers depend on (key, plane, step) and not on the capacity either.
+
+Everything here may be vmapped. The lanes of a batch take their steps together until the last one
+has finished. A lane that has finished is left as it is, and refits run in those steps only in which
+a lane has found a better hypothesis (`jaxsfm.core.lanes`).
 """
 
 from typing import NamedTuple
@@ -17,6 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsfm.core import homography as hg
+from jaxsfm.core.lanes import anywhere
 from jaxsfm.core.numerics import compact
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.planes import settle
@@ -97,58 +102,86 @@ def count_inliers(
         return i + 1, counts + jnp.sum(hit & live, axis=1, dtype=jnp.int32)
 
     start = (jnp.int32(0), jnp.zeros((h.shape[0],), jnp.int32))
-    return lax.while_loop(lambda s: s[0] * chunk < problem.num_live, body, start)[1]
+    return lax.while_loop(lambda s: anywhere(s[0] * chunk < problem.num_live), body, start)[1]
 
 
-def _refit(h: Array, num: Array, problem: _Problem, shape: PairShape) -> tuple[Array, Array]:
-    """Least squares on the inliers, at most `local_refits` times, as long as inliers are gained."""
+def _refit(
+    h: Array, num: Array, problem: _Problem, shape: PairShape, *, wanted: Array | bool = True
+) -> tuple[Array, Array]:
+    """Least squares on the inliers, at most `local_refits` times, as long as inliers are gained.
+
+    Lanes where it is not `wanted` keep h and num.
+    """
 
     def body(state):
-        i, h, num, _ = state
+        i, h, num, gaining = state
         weight = _inliers(h, problem, shape).astype(jnp.float32)
         candidate = hg.least_squares(problem.xy0, problem.xy1, weight)
         count = _inliers(candidate, problem, shape).sum(dtype=jnp.int32)
-        better = count > num
-        return i + 1, jnp.where(better, candidate, h), jnp.maximum(count, num), better
+        better = gaining & (count > num)
+        return i + 1, jnp.where(better, candidate, h), jnp.where(better, count, num), better
 
     def more(state):
-        return (state[0] < shape.local_refits) & state[3]
+        return (state[0] < shape.local_refits) & anywhere(state[3])
 
-    _, h, num, _ = lax.while_loop(more, body, (jnp.int32(0), h, num, jnp.bool_(True)))
+    _, h, num, _ = lax.while_loop(more, body, (jnp.int32(0), h, num, jnp.asarray(wanted)))
     return h, num
+
+
+class _Search(NamedTuple):
+    """The best homography so far, and how long to look for a better one."""
+
+    steps: Int[Array, ""]
+    h: Float[Array, "3 3"]
+    num: Int[Array, ""]
+    needed: Float[Array, ""]
+    """Number of hypotheses after which the search ends."""
 
 
 def _one_plane(
     key: PRNGKey, problem: _Problem, thresholds: Thresholds, active: Array, shape: PairShape
 ) -> tuple[Array, Array, Array]:
     """The best homography (normalised), its number of inliers, and the number of hypotheses."""
-    step_size = shape.hypotheses_per_step
+    step_size, together = shape.hypotheses_per_step, shape.steps_at_once
 
-    def more(state):
-        step, _, _, needed = state
-        used = (step * step_size).astype(jnp.float32)
-        return active & (used < jnp.minimum(needed, shape.max_hypotheses))
+    def more(search):
+        used = (search.steps * step_size).astype(jnp.float32)
+        return active & (used < jnp.minimum(search.needed, shape.max_hypotheses))
+
+    def improve(search, h, num, wanted):
+        # In lanes where it is not wanted, nothing changes.
+        h, num = jnp.where(wanted, h, search.h), jnp.where(wanted, num, search.num)
+        h, num = _refit(h, num, problem, shape, wanted=wanted)
+        needed = hypotheses_needed(num, problem.num_live, thresholds.confidence)
+        return h, num, jnp.where(wanted, needed, search.needed)
+
+    def look(search, found):
+        h, num = found
+        going = more(search)
+        wanted = going & (num > jnp.maximum(search.num, 4))
+        best = lax.cond(
+            anywhere(wanted),
+            lambda: improve(search, h, num, wanted),
+            lambda: (search.h, search.num, search.needed),
+        )
+        return _Search(search.steps + going, *best), None
 
     def body(state):
-        step, h, num, needed = state
-        index = sample_indices(jax.random.fold_in(key, step), step_size, problem.num_live)
-        batch, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
-        counts = jnp.where(valid, count_inliers(batch, problem, shape=shape), 0)
-        best = jnp.argmax(counts)
-        h, num, needed = lax.cond(
-            counts[best] > jnp.maximum(num, 4),
-            lambda: _improve(batch[best], counts[best]),
-            lambda: (h, num, needed),
-        )
-        return step + 1, h, num, needed
+        first, search = state
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, first + i))(jnp.arange(together))
+        index = jax.vmap(lambda k: sample_indices(k, step_size, problem.num_live))(keys)
+        h, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
+        scored = problem._replace(num_live=jnp.where(more(search), problem.num_live, 0))
+        counts = count_inliers(h.reshape(-1, 3, 3), scored, shape=shape).reshape(valid.shape)
+        counts = jnp.where(valid, counts, 0)
+        best, each = jnp.argmax(counts, axis=1), jnp.arange(together)
+        search, _ = lax.scan(look, search, (h[each, best], counts[each, best]))
+        return first + together, search
 
-    def _improve(h, num):
-        h, num = _refit(h, num, problem, shape)
-        return h, num, hypotheses_needed(num, problem.num_live, thresholds.confidence)
-
-    start = (jnp.int32(0), jnp.eye(3), jnp.int32(0), jnp.float32(jnp.inf))
-    step, h, num, _ = lax.while_loop(more, body, start)
-    return h, num, step * step_size
+    start = _Search(jnp.int32(0), jnp.eye(3), jnp.int32(0), jnp.float32(jnp.inf))
+    state = (jnp.int32(0), start)
+    _, search = lax.while_loop(lambda state: anywhere(more(state[1])), body, state)
+    return search.h, search.num, search.steps * step_size
 
 
 def peel_planes(
