@@ -8,11 +8,12 @@ the wrong singular vector, and here it is the true solution.
 Correspondences are compacted first, so the amount of work follows their number and not the capacity
 of their list. Random numbers depend on (key, plane, step) and not on the capacity either.
 
-Everything here may be vmapped. The lanes of a batch take their steps together until the last one
-has finished. A lane that has finished is left as it is, and refits run in those steps only in which
-a lane has found a better hypothesis (`jaxsfm.core.lanes`).
+Everything here may be vmapped (`jaxsfm.core.lanes`). A CPU computes the lanes of a batch in turn.
+Elsewhere they take their steps together until the last one has finished. A lane that has finished
+is left as it is, and refits run in those steps only in which a lane has found a better hypothesis.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -21,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsfm.core import homography as hg
-from jaxsfm.core.lanes import anywhere
+from jaxsfm.core.lanes import anywhere, in_turn_on_cpus
 from jaxsfm.core.numerics import compact
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.planes import settle
@@ -164,7 +165,7 @@ def _one_plane(
             lambda: improve(search, h, num, wanted),
             lambda: (search.h, search.num, search.needed),
         )
-        return _Search(search.steps + going, *best), None
+        return _Search(search.steps + going.astype(jnp.int32), *best), None
 
     def body(state):
         first, search = state
@@ -204,6 +205,13 @@ def peel_planes(
       xy0, xy1: pixels of the working images.
       valid: which rows are correspondences.
     """
+    whole = in_turn_on_cpus(functools.partial(_peel, shape=shape))
+    return whole(key, xy0, xy1, valid, thresholds)
+
+
+def _peel(
+    key: PRNGKey, xy0: Array, xy1: Array, valid: Array, thresholds: Thresholds, shape: PairShape
+) -> Planes:
     k = xy0.shape[0]
     weight = valid.astype(jnp.float32)
     t0, t1 = hg.normalisation(xy0, weight), hg.normalisation(xy1, weight)
