@@ -1,12 +1,12 @@
-"""Loops and conditions under `vmap`, so that a batch costs what its items cost one by one.
+"""Batches by `vmap`, so that they cost what their items cost one by one.
 
 JAX turns a condition on a vmapped value into a selection: both of its branches are computed, for
 every lane and in every turn of the loop around it. A condition on `anywhere` keeps its meaning,
 because all lanes share its value: what no lane asks for is not computed. Its branches must then
 leave the other lanes as they are.
 
-A loop of a batch still runs as long as its slowest lane needs. An accelerator, which is not full
-with one lane, gains more from the batch than it loses by that. A CPU is full with one lane, so it
+A vmapped loop runs every lane as long as the slowest one needs. An accelerator, which one lane does
+not fill, gains more from the batch than it loses by that. A CPU is filled by one lane, so it
 computes the lanes in turn (`in_turn_on_cpus`).
 """
 

@@ -46,7 +46,8 @@ def sample_indices(key: PRNGKey, num: int, count: Int[Array, ""]) -> Int[Array, 
     """
     drawn: list[Array] = []
     for i in range(4):
-        x = jax.random.randint(jax.random.fold_in(key, i), (num,), 0, jnp.maximum(count - i, 1))
+        most = jnp.maximum(count - i, 1)
+        x = jax.random.randint(jax.random.fold_in(key, i), (num,), 0, most, jnp.int32)
         earlier = jnp.sort(jnp.stack(drawn, axis=1), axis=1) if drawn else None
         for j in range(i):
             assert earlier is not None
@@ -68,12 +69,13 @@ def hypotheses_needed(
     p = jnp.prod(jnp.maximum(i - k, 0.0) / jnp.maximum(n - k, 1.0))
     # log1p is accurate for p far below the epsilon of float32. With p = 1 one sample is enough.
     miss = jnp.log1p(-jnp.minimum(p, 1.0 - 1e-6))
-    return jnp.where(p > 0, jnp.log(1.0 - confidence) / jnp.where(p > 0, miss, -1.0), jnp.inf)
+    wrong = jnp.log(1.0 - jnp.asarray(confidence, jnp.float32))
+    return jnp.where(p > 0, wrong / jnp.where(p > 0, miss, -1.0), jnp.inf)
 
 
 def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
     xy0, xy1 = problem.xy0, problem.xy1
-    live = jnp.arange(xy0.shape[0]) < problem.num_live
+    live = jnp.arange(xy0.shape[0], dtype=jnp.int32) < problem.num_live
     return live & hg.inliers(
         h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way
     )
@@ -96,14 +98,14 @@ def count_inliers(
         start = jnp.minimum(i * chunk, k - chunk)
         x0, y0, x1, y1 = (lax.dynamic_slice_in_dim(c, start, chunk) for c in columns)
         xy0, xy1 = jnp.stack([x0, y0], axis=1), jnp.stack([x1, y1], axis=1)
-        index = start + jnp.arange(chunk)
+        index = start + jnp.arange(chunk, dtype=jnp.int32)
         # The last chunk is moved back to fit. Count only rows that no earlier chunk has counted.
         live = (index >= i * chunk) & (index < problem.num_live)
         hit = hg.inliers(h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way)
         return i + 1, counts + jnp.sum(hit & live, axis=1, dtype=jnp.int32)
 
     start = (jnp.int32(0), jnp.zeros((h.shape[0],), jnp.int32))
-    return lax.while_loop(lambda s: anywhere(s[0] * chunk < problem.num_live), body, start)[1]
+    return lax.while_loop(lambda s: s[0] * chunk < problem.num_live, body, start)[1]
 
 
 def _refit(
@@ -111,32 +113,30 @@ def _refit(
 ) -> tuple[Array, Array]:
     """Least squares on the inliers, at most `local_refits` times, as long as inliers are gained.
 
-    Lanes where it is not `wanted` keep h and num.
+    Where it is not `wanted`, h and num stay as they are.
     """
 
     def body(state):
-        i, h, num, gaining = state
+        i, h, num, _ = state
         weight = _inliers(h, problem, shape).astype(jnp.float32)
         candidate = hg.least_squares(problem.xy0, problem.xy1, weight)
         count = _inliers(candidate, problem, shape).sum(dtype=jnp.int32)
-        better = gaining & (count > num)
-        return i + 1, jnp.where(better, candidate, h), jnp.where(better, count, num), better
+        better = count > num
+        return i + 1, jnp.where(better, candidate, h), jnp.maximum(count, num), better
 
     def more(state):
-        return (state[0] < shape.local_refits) & anywhere(state[3])
+        return (state[0] < shape.local_refits) & state[3]
 
     _, h, num, _ = lax.while_loop(more, body, (jnp.int32(0), h, num, jnp.asarray(wanted)))
     return h, num
 
 
 class _Search(NamedTuple):
-    """The best homography so far, and how long to look for a better one."""
+    """The best homography so far, and the number of steps that led to it."""
 
     steps: Int[Array, ""]
     h: Float[Array, "3 3"]
     num: Int[Array, ""]
-    needed: Float[Array, ""]
-    """Number of hypotheses after which the search ends."""
 
 
 def _one_plane(
@@ -147,41 +147,38 @@ def _one_plane(
 
     def more(search):
         used = (search.steps * step_size).astype(jnp.float32)
-        return active & (used < jnp.minimum(search.needed, shape.max_hypotheses))
-
-    def improve(search, h, num, wanted):
-        # In lanes where it is not wanted, nothing changes.
-        h, num = jnp.where(wanted, h, search.h), jnp.where(wanted, num, search.num)
-        h, num = _refit(h, num, problem, shape, wanted=wanted)
-        needed = hypotheses_needed(num, problem.num_live, thresholds.confidence)
-        return h, num, jnp.where(wanted, needed, search.needed)
+        needed = hypotheses_needed(search.num, problem.num_live, thresholds.confidence)
+        return active & (used < jnp.minimum(needed, shape.max_hypotheses))
 
     def look(search, found):
         h, num = found
         going = more(search)
-        wanted = going & (num > jnp.maximum(search.num, 4))
-        best = lax.cond(
-            anywhere(wanted),
-            lambda: improve(search, h, num, wanted),
-            lambda: (search.h, search.num, search.needed),
+        better = going & (num > jnp.maximum(search.num, 4))
+        h, num = jnp.where(better, h, search.h), jnp.where(better, num, search.num)
+        h, num = lax.cond(
+            anywhere(better),
+            lambda: _refit(h, num, problem, shape, wanted=better),
+            lambda: (h, num),
         )
-        return _Search(search.steps + going.astype(jnp.int32), *best), None
+        return _Search(search.steps + going.astype(jnp.int32), h, num), None
 
     def body(state):
         first, search = state
-        keys = jax.vmap(lambda i: jax.random.fold_in(key, first + i))(jnp.arange(together))
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, first + i))(
+            jnp.arange(together, dtype=jnp.int32)
+        )
         index = jax.vmap(lambda k: sample_indices(k, step_size, problem.num_live))(keys)
         h, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
         scored = problem._replace(num_live=jnp.where(more(search), problem.num_live, 0))
         counts = count_inliers(h.reshape(-1, 3, 3), scored, shape=shape).reshape(valid.shape)
         counts = jnp.where(valid, counts, 0)
-        best, each = jnp.argmax(counts, axis=1), jnp.arange(together)
+        best, each = jnp.argmax(counts, axis=1), jnp.arange(together, dtype=jnp.int32)
         search, _ = lax.scan(look, search, (h[each, best], counts[each, best]))
         return first + together, search
 
-    start = _Search(jnp.int32(0), jnp.eye(3), jnp.int32(0), jnp.float32(jnp.inf))
+    start = _Search(jnp.int32(0), jnp.eye(3, dtype=jnp.float32), jnp.int32(0))
     state = (jnp.int32(0), start)
-    _, search = lax.while_loop(lambda state: anywhere(more(state[1])), body, state)
+    _, search = lax.while_loop(lambda state: more(state[1]), body, state)
     return search.h, search.num, search.steps * step_size
 
 

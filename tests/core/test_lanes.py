@@ -1,4 +1,4 @@
-"""Laws of conditions and loops that all lanes of a batch share."""
+"""Laws of conditions that the lanes of a batch share, and of lanes that take turns."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxsfm.core.lanes import anywhere
+from jaxsfm.core.lanes import anywhere, in_turn_on_cpus
 
 
 def counted(calls):
@@ -44,16 +44,34 @@ def test_a_branch_that_no_lane_wants_is_not_computed(wanted):
     assert bool(calls) == any(wanted)
 
 
-def test_a_loop_ends_with_its_last_lane_and_its_counter_is_shared():
-    def one(end):
-        def body(state):
-            turn, total = state
-            return turn + 1, total + jnp.where(turn < end, turn, 0)
+def test_lanes_in_turn_are_the_function_with_and_without_batched_arguments():
+    """Trees of arguments and results, keys, and vmaps in vmaps."""
 
-        start = (jnp.int32(0), jnp.int32(0))
-        return lax.while_loop(lambda s: anywhere(s[0] < end), body, start)
+    def draw(key, scale, pair):
+        return {"x": scale * jax.random.uniform(key, (3,)) + pair[0], "y": pair[1]}
 
-    ends = np.asarray([0, 5, 3])
-    turns, totals = jax.jit(jax.vmap(one, out_axes=(None, 0)))(jnp.asarray(ends))
-    assert turns == 5
-    np.testing.assert_array_equal(totals, [sum(range(e)) for e in ends])
+    in_turn = in_turn_on_cpus(draw)
+    keys = jax.random.split(jax.random.key(0), 6).reshape(2, 3)
+    pair = jnp.arange(6.0).reshape(2, 3), jnp.float32(7)
+    axes = 0, None, (0, None)
+    for vmapped in (jax.vmap, lambda f, axes: jax.vmap(jax.vmap(f, axes), axes)):
+        some = (keys, pair) if vmapped is not jax.vmap else (keys[0], (pair[0][0], pair[1]))
+        ours, theirs = (
+            jax.jit(vmapped(f, axes))(some[0], jnp.float32(2), some[1]) for f in (in_turn, draw)
+        )
+        for name in ("x", "y"):
+            np.testing.assert_array_equal(ours[name], theirs[name])
+
+
+def test_on_a_cpu_each_lane_of_a_loop_takes_its_own_turns_only():
+    calls: list[int] = []
+    add = counted(calls)
+
+    def count_to(end):
+        return lax.while_loop(lambda x: x < end, add, jnp.int32(0))
+
+    ends = jnp.asarray([1, 6, 0])
+    found = jax.jit(jax.vmap(in_turn_on_cpus(count_to)))(ends)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, ends)
+    assert len(calls) == 7
