@@ -15,7 +15,10 @@ class PairShape:
     max_hypotheses: int = 10_000
     """Largest number of minimal samples for a plane."""
     hypotheses_per_step: int = 64
-    """Number of samples that are solved and scored between two looks at the stopping rule."""
+    """Number of samples of a step. After each step RANSAC looks at its stopping rule."""
+    steps_at_once: int = 1
+    """Number of steps whose samples are solved and scored together. Steps that the stopping rule
+    then leaves out count for nothing, so other numbers give the same planes."""
     two_way: bool = False
     """Inliers are tested in both images, instead of in image 1 only."""
     local_refits: int = 1
@@ -42,6 +45,7 @@ class PairShape:
             "max_planes",
             "max_hypotheses",
             "hypotheses_per_step",
+            "steps_at_once",
             "local_refits",
             "coarse_columns",
             "coarse_tile",

@@ -7,8 +7,13 @@ the wrong singular vector, and here it is the true solution.
 
 Correspondences are compacted first, so the amount of work follows their number and not the capacity
 of their list. Random numbers depend on (key, plane, step) and not on the capacity either.
+
+Everything here may be vmapped (`jaxsfm.core.lanes`). A CPU computes the lanes of a batch in turn.
+Elsewhere they take their steps together until the last one has finished. A lane that has finished
+is left as it is, and refits run in those steps only in which a lane has found a better hypothesis.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -17,6 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsfm.core import homography as hg
+from jaxsfm.core.lanes import anywhere, in_turn_on_cpus
 from jaxsfm.core.numerics import compact
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.planes import settle
@@ -102,8 +108,13 @@ def count_inliers(
     return lax.while_loop(lambda s: s[0] * chunk < problem.num_live, body, start)[1]
 
 
-def _refit(h: Array, num: Array, problem: _Problem, shape: PairShape) -> tuple[Array, Array]:
-    """Least squares on the inliers, at most `local_refits` times, as long as inliers are gained."""
+def _refit(
+    h: Array, num: Array, problem: _Problem, shape: PairShape, *, wanted: Array | bool = True
+) -> tuple[Array, Array]:
+    """Least squares on the inliers, at most `local_refits` times, as long as inliers are gained.
+
+    Where it is not `wanted`, h and num stay as they are.
+    """
 
     def body(state):
         i, h, num, _ = state
@@ -116,41 +127,59 @@ def _refit(h: Array, num: Array, problem: _Problem, shape: PairShape) -> tuple[A
     def more(state):
         return (state[0] < shape.local_refits) & state[3]
 
-    _, h, num, _ = lax.while_loop(more, body, (jnp.int32(0), h, num, jnp.bool_(True)))
+    _, h, num, _ = lax.while_loop(more, body, (jnp.int32(0), h, num, jnp.asarray(wanted)))
     return h, num
+
+
+class _Search(NamedTuple):
+    """The best homography so far, and the number of steps that led to it."""
+
+    steps: Int[Array, ""]
+    h: Float[Array, "3 3"]
+    num: Int[Array, ""]
 
 
 def _one_plane(
     key: PRNGKey, problem: _Problem, thresholds: Thresholds, active: Array, shape: PairShape
 ) -> tuple[Array, Array, Array]:
     """The best homography (normalised), its number of inliers, and the number of hypotheses."""
-    step_size = shape.hypotheses_per_step
+    step_size, together = shape.hypotheses_per_step, shape.steps_at_once
 
-    def more(state):
-        step, _, _, needed = state
-        used = (step * step_size).astype(jnp.float32)
+    def more(search):
+        used = (search.steps * step_size).astype(jnp.float32)
+        needed = hypotheses_needed(search.num, problem.num_live, thresholds.confidence)
         return active & (used < jnp.minimum(needed, shape.max_hypotheses))
 
-    def body(state):
-        step, h, num, needed = state
-        index = sample_indices(jax.random.fold_in(key, step), step_size, problem.num_live)
-        batch, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
-        counts = jnp.where(valid, count_inliers(batch, problem, shape=shape), 0)
-        best = jnp.argmax(counts)
-        h, num, needed = lax.cond(
-            counts[best] > jnp.maximum(num, 4),
-            lambda: _improve(batch[best], counts[best]),
-            lambda: (h, num, needed),
+    def look(search, found):
+        h, num = found
+        going = more(search)
+        better = going & (num > jnp.maximum(search.num, 4))
+        h, num = jnp.where(better, h, search.h), jnp.where(better, num, search.num)
+        h, num = lax.cond(
+            anywhere(better),
+            lambda: _refit(h, num, problem, shape, wanted=better),
+            lambda: (h, num),
         )
-        return step + 1, h, num, needed
+        return _Search(search.steps + going.astype(jnp.int32), h, num), None
 
-    def _improve(h, num):
-        h, num = _refit(h, num, problem, shape)
-        return h, num, hypotheses_needed(num, problem.num_live, thresholds.confidence)
+    def body(state):
+        first, search = state
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, first + i))(
+            jnp.arange(together, dtype=jnp.int32)
+        )
+        index = jax.vmap(lambda k: sample_indices(k, step_size, problem.num_live))(keys)
+        h, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
+        scored = problem._replace(num_live=jnp.where(more(search), problem.num_live, 0))
+        counts = count_inliers(h.reshape(-1, 3, 3), scored, shape=shape).reshape(valid.shape)
+        counts = jnp.where(valid, counts, 0)
+        best, each = jnp.argmax(counts, axis=1), jnp.arange(together, dtype=jnp.int32)
+        search, _ = lax.scan(look, search, (h[each, best], counts[each, best]))
+        return first + together, search
 
-    start = (jnp.int32(0), jnp.eye(3, dtype=jnp.float32), jnp.int32(0), jnp.float32(jnp.inf))
-    step, h, num, _ = lax.while_loop(more, body, start)
-    return h, num, step * step_size
+    start = _Search(jnp.int32(0), jnp.eye(3, dtype=jnp.float32), jnp.int32(0))
+    state = (jnp.int32(0), start)
+    _, search = lax.while_loop(lambda state: more(state[1]), body, state)
+    return search.h, search.num, search.steps * step_size
 
 
 def peel_planes(
@@ -173,6 +202,13 @@ def peel_planes(
       xy0, xy1: pixels of the working images.
       valid: which rows are correspondences.
     """
+    whole = in_turn_on_cpus(functools.partial(_peel, shape=shape))
+    return whole(key, xy0, xy1, valid, thresholds)
+
+
+def _peel(
+    key: PRNGKey, xy0: Array, xy1: Array, valid: Array, thresholds: Thresholds, shape: PairShape
+) -> Planes:
     k = xy0.shape[0]
     weight = valid.astype(jnp.float32)
     t0, t1 = hg.normalisation(xy0, weight), hg.normalisation(xy1, weight)

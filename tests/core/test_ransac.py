@@ -7,10 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+import tolerances
 from hypothesis import given, settings
 from strategies import random_homography, rng_of, seeds
 
 from jaxsfm.config import PRESETS, PairShape
+from jaxsfm.core import homography as hg
 from jaxsfm.core import ransac
 from jaxsfm.core.types import Thresholds
 
@@ -117,6 +119,87 @@ def test_the_capacity_and_the_chunks_change_nothing(key):
     np.testing.assert_array_equal(wide.plane[:K], planes.plane)
     chunked = run(key, xy0, xy1, shape=dataclasses.replace(SHAPE, score_chunk=64))
     np.testing.assert_array_equal(chunked.plane, planes.plane)
+
+
+def test_steps_that_are_scored_together_give_the_same_planes(key):
+    """Bit for bit: also where later steps of the last turn would have found a better plane."""
+    shape = dataclasses.replace(SHAPE, max_hypotheses=90, hypotheses_per_step=4)
+    for seed in range(10):
+        # With so little confidence the first plane will do.
+        limits = Thresholds(np.float32(3), np.int32(8), np.float32([0.001, 0.999][seed % 2]))
+        xy0, xy1, _, _ = scene(seed, [[], [150, 80], [250]][seed % 3], noise=4.0)
+        one = run(key, xy0, xy1, shape=shape, thresholds=limits)
+        together = dataclasses.replace(shape, steps_at_once=3)
+        some = run(key, xy0, xy1, shape=together, thresholds=limits)
+        for x, y in zip(some, one, strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def pairs_of_a_batch():
+    """Keys and correspondences of pairs that differ in all that decides about their loops."""
+    scenes = [scene(s, sizes)[:2] for s, sizes in enumerate(([150, 80], [], [300], [60, 50, 40]))]
+    live = np.asarray([K, K, 350, 10])
+    xy0, xy1 = (jnp.asarray(np.stack(xy)) for xy in zip(*scenes, strict=True))
+    return jax.random.split(jax.random.key(3), 4), xy0, xy1, jnp.arange(K) < live[:, None]
+
+
+def counted(monkeypatch, module, name: str) -> list[int]:
+    """An entry for every lane and every time that a function is computed."""
+    calls: list[int] = []
+    function = getattr(module, name)
+
+    def noted(*args):
+        # The argument makes the call a call of every lane.
+        jax.debug.callback(lambda _: calls.append(1), jax.tree.leaves(args[-1])[0])
+        return function(*args)
+
+    monkeypatch.setattr(module, name, noted)
+    return calls
+
+
+def calls_of(run, calls, *args) -> int:
+    calls.clear()
+    jax.block_until_ready(run(*args))
+    jax.effects_barrier()
+    return len(calls)
+
+
+def test_on_a_cpu_a_batch_is_its_pairs_bit_for_bit_and_draws_no_more_samples(monkeypatch):
+    pairs = pairs_of_a_batch()
+    each = [run(*(x[i] for x in pairs)) for i in range(4)]
+    calls = counted(monkeypatch, ransac, "sample_indices")
+    batch = jax.jit(jax.vmap(lambda *pair: ransac.peel_planes(*pair, THRESHOLDS, shape=SHAPE)))
+    planes = batch(*pairs)
+    assert np.asarray(planes.num_inliers[:, 0] > 0).tolist() == [True, False, True, False]
+    for i, one in enumerate(each):
+        for x, y in zip(planes, one, strict=True):
+            np.testing.assert_array_equal(x[i], y)
+    steps = sum(int(one.num_hypotheses.sum()) for one in each) // SHAPE.hypotheses_per_step
+    assert calls_of(batch, calls, *pairs) == steps > 30
+
+
+def test_lanes_together_have_the_planes_of_each_and_refit_only_where_one_does(monkeypatch):
+    """The way of accelerators. A condition that became a selection would refit in every step."""
+    pairs = pairs_of_a_batch()
+    limits = jax.tree.map(jnp.asarray, THRESHOLDS)
+    shape = dataclasses.replace(SHAPE, steps_at_once=2)
+    calls = counted(monkeypatch, hg, "least_squares")
+    together, alone = (
+        jax.jit(vmapped(lambda *pair: ransac._peel(*pair, limits, shape=shape)))
+        for vmapped in (jax.vmap, lambda f: f)
+    )
+    planes, total = together(*pairs), calls_of(together, calls, *pairs)
+    refits = []
+    for i in range(4):
+        pair = [x[i] for x in pairs]
+        one = alone(*pair)
+        refits.append(calls_of(alone, calls, *pair))
+        for x, y in zip(planes, one, strict=True):
+            if x.ndim == 4:  # vmapped sums may round differently
+                np.testing.assert_allclose(x[i], y, **tolerances.UNIT)
+            else:
+                np.testing.assert_array_equal(x[i], y)
+    assert max(refits) <= total / 4 <= sum(refits) < 100
 
 
 def problem_of(xy0, xy1, *, live: int, threshold: float) -> ransac._Problem:

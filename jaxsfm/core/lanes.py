@@ -1,0 +1,70 @@
+"""Batches by `vmap`, so that they cost what their items cost one by one.
+
+JAX turns a condition on a vmapped value into a selection: both of its branches are computed, for
+every lane and in every turn of the loop around it. A condition on `anywhere` keeps its meaning,
+because all lanes share its value: what no lane asks for is not computed. Its branches must then
+leave the other lanes as they are.
+
+A vmapped loop runs every lane as long as the slowest one needs. An accelerator, which one lane does
+not fill, gains more from the batch than it loses by that. A CPU is filled by one lane, so it
+computes the lanes in turn (`in_turn_on_cpus`).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+@jax.custom_batching.custom_vmap
+def anywhere(wanted: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Whether `wanted` holds in any lane; without `vmap` it is `wanted` itself."""
+    return wanted
+
+
+@anywhere.def_vmap
+def _any_lane(lanes: int, batched: list[bool], wanted: Array) -> tuple[Array, bool]:
+    del lanes, batched  # without a batched argument this rule is not used
+    return anywhere(jnp.any(wanted, axis=0)), False
+
+
+def in_turn_on_cpus(function: Callable[P, T]) -> Callable[P, T]:
+    """`function`, whose vmapped lanes follow each other on CPUs and run together elsewhere.
+
+    Without `vmap` it is `function`. On CPUs a lane of a batch is computed by the program of a
+    single item, so its result is that of the item bit for bit. Arguments are positional and are
+    arrays or trees of arrays.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def single(*args):
+        return function(*args)
+
+    @single.def_vmap
+    def batch(lanes, batched, *args):
+        del lanes
+        leaves, tree = jax.tree.flatten(args)
+        axes = [0 if b else None for b in jax.tree.leaves(batched)]
+
+        def in_turn(*leaves):
+            def lane(some):
+                rest = iter(some)
+                each = [next(rest) if b == 0 else x for b, x in zip(axes, leaves, strict=True)]
+                return single(*tree.unflatten(each))
+
+            return lax.map(lane, [x for b, x in zip(axes, leaves, strict=True) if b == 0])
+
+        def together(*leaves):
+            return jax.vmap(lambda *each: function(*tree.unflatten(each)), in_axes=axes)(*leaves)
+
+        found = lax.platform_dependent(*leaves, cpu=in_turn, default=together)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return functools.wraps(function)(single)

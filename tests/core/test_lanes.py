@@ -1,0 +1,77 @@
+"""Laws of conditions that the lanes of a batch share, and of lanes that take turns."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from jaxsfm.core.lanes import anywhere, in_turn_on_cpus
+
+
+def counted(calls):
+    """A function that notes that it was computed, and adds one."""
+
+    def function(x):
+        jax.debug.callback(lambda: calls.append(1))
+        return x + 1
+
+    return function
+
+
+def test_it_is_its_argument_for_one_and_any_for_a_batch():
+    for wanted in (False, True):
+        assert bool(anywhere(jnp.bool_(wanted))) == wanted
+    table = np.asarray([[False, False], [False, True], [True, True]])
+    seen = jax.vmap(lambda x: anywhere(x))(jnp.asarray(table[:, 0]))
+    assert seen.tolist() == [True] * 3
+    seen = jax.vmap(jax.vmap(anywhere))(jnp.asarray(table[:2] & False))
+    assert not np.asarray(seen).any()
+    assert np.asarray(jax.vmap(jax.vmap(anywhere))(jnp.asarray(table))).all()
+
+
+@pytest.mark.parametrize("wanted", [[False] * 3, [False, True, False]])
+def test_a_branch_that_no_lane_wants_is_not_computed(wanted):
+    calls: list[int] = []
+    add = counted(calls)
+
+    def one(x, w):
+        return lax.cond(anywhere(w), lambda: jnp.where(w, add(x), x), lambda: x)
+
+    found = jax.jit(jax.vmap(one))(jnp.arange(3), jnp.asarray(wanted))
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, np.arange(3) + np.asarray(wanted))
+    assert bool(calls) == any(wanted)
+
+
+def test_lanes_in_turn_are_the_function_with_and_without_batched_arguments():
+    """Trees of arguments and results, keys, and vmaps in vmaps."""
+
+    def draw(key, scale, pair):
+        return {"x": scale * jax.random.uniform(key, (3,)) + pair[0], "y": pair[1]}
+
+    in_turn = in_turn_on_cpus(draw)
+    keys = jax.random.split(jax.random.key(0), 6).reshape(2, 3)
+    pair = jnp.arange(6.0).reshape(2, 3), jnp.float32(7)
+    axes = 0, None, (0, None)
+    for vmapped in (jax.vmap, lambda f, axes: jax.vmap(jax.vmap(f, axes), axes)):
+        some = (keys, pair) if vmapped is not jax.vmap else (keys[0], (pair[0][0], pair[1]))
+        ours, theirs = (
+            jax.jit(vmapped(f, axes))(some[0], jnp.float32(2), some[1]) for f in (in_turn, draw)
+        )
+        for name in ("x", "y"):
+            np.testing.assert_array_equal(ours[name], theirs[name])
+
+
+def test_on_a_cpu_each_lane_of_a_loop_takes_its_own_turns_only():
+    calls: list[int] = []
+    add = counted(calls)
+
+    def count_to(end):
+        return lax.while_loop(lambda x: x < end, add, jnp.int32(0))
+
+    ends = jnp.asarray([1, 6, 0])
+    found = jax.jit(jax.vmap(in_turn_on_cpus(count_to)))(ends)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, ends)
+    assert len(calls) == 7
