@@ -444,14 +444,14 @@ def calls() -> dict[str, Call]:
             _bind(pair.match_pair, shape=_pair_shape("default")),
             (KEY, f0, f1, THRESHOLDS),
             (2,),
-            (),
+            (1, 2),
             slow=True,
         ),
         "pair.match_pair[paper]": Call(
             _bind(pair.match_pair, shape=_pair_shape("paper")),
             (KEY, f0, f1, Thresholds(10.0, 26, 0.999)),
             (2,),
-            (),
+            (1, 2),
             slow=True,
         ),
         "planes.nearest_plane": Call(

@@ -94,6 +94,18 @@ def test_coordinates_are_float32_also_where_features_are_bfloat16(name):
         assert {found[k] for k in call.coordinates} == {np.dtype(np.float32)}
 
 
+@pytest.mark.parametrize(
+    "name", [k for k, c in CALLS.items() if c.coordinates and c.features and not c.slow | c.traced]
+)
+def test_coordinates_of_bfloat16_features_are_those_of_the_same_numbers_in_float32(name):
+    call = CALLS[name]
+    low = [in_bfloat16(x) if k in call.features else x for k, x in enumerate(call.args)]
+    high = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == jnp.bfloat16 else x, low)
+    ours, expected = (jax.tree.leaves(jax.jit(call.function)(*args)) for args in (low, high))
+    for k in call.coordinates:
+        np.testing.assert_allclose(ours[k], expected[k], rtol=1e-6)
+
+
 @EVERY
 def test_every_product_states_its_precision(name):
     for equation in program(name):
@@ -105,7 +117,7 @@ def test_every_product_states_its_precision(name):
 def test_the_laws_of_matching_hold_where_jax_has_64_bits():
     """The tests of some modules, in a process that is started with JAX_ENABLE_X64=1."""
     here = Path(__file__).parent
-    modules = [str(here / f"test_{name}.py") for name in ("coarse_to_fine", "matching", "octaves")]
+    modules = [str(here / f"test_{name}.py") for name in ("coarse_to_fine", "matching")]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *modules]
     done = subprocess.run(
         command, env=os.environ | {"JAX_ENABLE_X64": "1"}, capture_output=True, text=True
