@@ -22,6 +22,7 @@ from jaxsfm.core import (
     blocks,
     consensus,
     grid,
+    lanes,
     losses,
     matching,
     night,
@@ -398,6 +399,10 @@ def calls() -> dict[str, Call]:
         "homography.transfer_inliers": Call(hg.transfer_inliers, (hs, xy0, xy1, reach)),
         "homography.transfer_error": Call(hg.transfer_error, (hs, xy0, xy1)),
         "homography.inliers": Call(_bind(hg.inliers, two_way=True), (hs, xy0, xy1, reach, reach)),
+        "lanes.anywhere": Call(jax.vmap(lanes.anywhere), (few.valid,)),
+        "lanes.in_turn_on_cpus": Call(
+            lambda x: jax.vmap(lanes.in_turn_on_cpus(numerics.unit))(x), (x,)
+        ),
         "losses.cells_under_homography": Call(
             _bind(losses.cells_under_homography, rows=5, cols=6), (H, _floats(1, 30, 2))
         ),
