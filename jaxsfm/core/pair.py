@@ -8,6 +8,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from jaxsfm.core import coarse_to_fine as c2f
@@ -54,6 +55,25 @@ def match_pair(
       features0, features1: features of the two working images.
       thresholds: pixels of the working images.
     """
+    # The platform is known when the program is compiled, which may be on another machine.
+    return lax.platform_dependent(
+        key,
+        features0,
+        features1,
+        jax.tree.map(jnp.asarray, thresholds),
+        cpu=functools.partial(_match_pair, shape=shape),
+        default=functools.partial(_match_pair, shape=shape.for_accelerators()),
+    )
+
+
+def _match_pair(
+    key: PRNGKey,
+    features0: JoinedFeatures,
+    features1: JoinedFeatures,
+    thresholds: Thresholds,
+    *,
+    shape: PairShape,
+) -> PairMatches:
     num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
     capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
     if shape.consensus:

@@ -5,10 +5,20 @@ from typing import Literal
 
 OneToOne = Literal["first", "similarity"]
 
+ACCELERATOR_FACTORS = {"steps_at_once": 8, "score_chunk": 8, "fine_chunk": 8}
+"""How many times as much an accelerator computes at once. The sizes in `PairShape` are those of a
+CPU, whose caches they fill. An accelerator has thousands of lanes to fill, and every turn of a loop
+costs it the start of several kernels. The factors follow from that and from the memory that a pair
+may take (`jaxsfm.matching.execution`); they have not been measured. None of them changes a
+result."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairShape:
-    """The static settings of the pair program. Another value of any field is another program."""
+    """The static settings of the pair program. Another value of any field is another program.
+
+    Sizes of what is computed at once are those of a CPU (`for_accelerators`).
+    """
 
     max_planes: int = 5
     """Largest number of homographies of a pair (paper, section 4)."""
@@ -62,3 +72,8 @@ class PairShape:
                 "PairShape.correspondences_per_cell must be positive; "
                 f"got {self.correspondences_per_cell}"
             )
+
+    def for_accelerators(self) -> "PairShape":
+        """The same settings with more computed at once (`ACCELERATOR_FACTORS`)."""
+        larger = {name: getattr(self, name) * by for name, by in ACCELERATOR_FACTORS.items()}
+        return dataclasses.replace(self, **larger)

@@ -1,0 +1,202 @@
+"""Laws of the programs on platforms that are not here: they lower, and take their own sizes.
+
+Lowering is the part of compiling that needs no device. That results are equal is tested where the
+ways of the platforms can be run on a CPU: tests/core/test_blocks.py for the network,
+tests/core/test_ransac.py for planes, and here for the sizes of chunks.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from strategies import rng_of
+
+from jaxsfm.config import PRESETS, PairShape
+from jaxsfm.core import align, features, pair, ransac, relocalize, sharded, soft_matching
+from jaxsfm.core.backbones import BACKBONES
+from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.scores import init_scores
+from jaxsfm.core.types import JoinedFeatures, Thresholds
+from jaxsfm.core.vgg import Preprocessing
+
+PLATFORMS = ("cpu", "cuda", "tpu")
+HEIGHT, WIDTH, COARSE = 128, 192, 96
+
+
+def shaped(*shape: int, dtype=jnp.float32) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+SIZE = shaped(2, dtype=jnp.int32)
+IMAGE = shaped(HEIGHT, WIDTH, 3, dtype=jnp.uint8)
+KEY = jax.eval_shape(lambda: jax.random.key(0))
+LIMITS = Thresholds(shaped(), shaped(dtype=jnp.int32), shaped())
+
+
+def parameters(backbone: str) -> dict:
+    kernels = BACKBONES[backbone].kernels
+    layers = {name: {"kernel": shaped(*s), "bias": shaped(s[-1])} for name, s in kernels.items()}
+    return {"params": layers}
+
+
+def settings_of(preset: str, **changes) -> features.Extraction:
+    config = PRESETS[preset]
+    fixed = features.Extraction(
+        Preprocessing(1.0, (0.5, 0.5, 0.5), (0.2, 0.2, 0.2)),
+        num_coarse=COARSE,
+        octaves=config.octaves,
+        centred=config.centred,
+    )
+    return fixed._replace(**changes)
+
+
+def described(preset: str):
+    settings = settings_of(preset)
+    extract = functools.partial(features.extract, settings=settings)
+    return jax.eval_shape(extract, parameters("vgg16"), IMAGE, SIZE)
+
+
+def joined(preset: str):
+    return jax.eval_shape(join_octaves, described(preset))
+
+
+def extraction(settings: features.Extraction, *, learned: bool = False):
+    params = parameters(settings.backbone)
+    heads = jax.eval_shape(init_scores, KEY) if learned else None
+    extract = functools.partial(features.extract, settings=settings)
+    return lambda p, s, image, size: extract(p, image, size, scores=s), (params, heads, IMAGE, SIZE)
+
+
+def matching(preset: str):
+    match = functools.partial(pair.match_pair, shape=PRESETS[preset].pair)
+    return match, (KEY, joined(preset), joined(preset), LIMITS)
+
+
+def batch_of_pairs():
+    mesh = sharded.device_mesh(jax.devices()[:1])
+    side = jax.tree.map(lambda x: shaped(1, *x.shape, dtype=x.dtype), joined("default"))
+    match = functools.partial(sharded.match_batch, mesh=mesh, shape=PRESETS["default"].pair)
+    ids = shaped(1, 2, 2, dtype=jnp.uint32)
+    return match, (KEY, ids, ((side, side), (side, side)), LIMITS)
+
+
+def alignment():
+    patch = jax.eval_shape(lambda: align.square_patch(7))
+    image, xy = shaped(HEIGHT, WIDTH, 1), shaped(9, 2)
+    templates = jax.eval_shape(align.make_templates, image, SIZE, xy, patch)
+    return align.align, (image, SIZE, templates, xy, shaped(9, 2, 2), patch)
+
+
+def templates():
+    patch = jax.eval_shape(lambda: align.square_patch(7))
+    return align.make_templates, (shaped(HEIGHT, WIDTH, 1), SIZE, shaped(9, 2), patch)
+
+
+def soft_pair():
+    image, heads = shaped(HEIGHT, WIDTH, 3), jax.eval_shape(init_scores, KEY)
+    gradient = jax.value_and_grad(soft_matching.pair_loss, argnums=(0, 1))
+    given = parameters("vgg16"), heads, (image, image), (SIZE, SIZE), shaped(3, 3)
+    return gradient, given
+
+
+def walks(variant):
+    scores = [shaped(HEIGHT // s, WIDTH // s) for s in (4, 2, 1)]
+    cells = shaped(4 * COARSE, dtype=jnp.int32)
+    return functools.partial(relocalize.relocalize, variant=variant), (scores, cells, cells)
+
+
+def planes():
+    peel = functools.partial(ransac.peel_planes, shape=PRESETS["default"].pair)
+    return peel, (KEY, shaped(500, 2), shaped(500, 2), shaped(500, dtype=jnp.bool_), LIMITS)
+
+
+PROGRAMS = {
+    "extract default": lambda: extraction(settings_of("default")),
+    "extract paper": lambda: extraction(settings_of("paper")),
+    "extract paper-grid": lambda: extraction(settings_of("paper", relocalized=False)),
+    "extract paper-learned": lambda: extraction(settings_of("paper"), learned=True),
+    "extract bfloat16": lambda: extraction(settings_of("paper", bfloat16=True)),
+    "extract vgg19": lambda: extraction(settings_of("paper", backbone="vgg19")),
+    "extract alexnet": lambda: extraction(settings_of("paper", backbone="alexnet")),
+    "store": lambda: (features.stored, (described("default"),)),
+    "join octaves": lambda: (join_octaves, (described("default"),)),
+    "match default": lambda: matching("default"),
+    "match paper": lambda: matching("paper"),
+    "match robust": lambda: matching("robust"),
+    "match a batch": batch_of_pairs,
+    "ransac": planes,
+    "relocalize": lambda: walks("hard"),
+    "relocalize softly": lambda: walks("soft"),
+    "relocalize straight-through": lambda: walks("straight-through"),
+    "soft matching and its gradient": soft_pair,
+    "templates": templates,
+    "align": alignment,
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_every_program_lowers_for_every_platform(name):
+    function, given = PROGRAMS[name]()
+    traced = jax.jit(function).trace(*given)
+    for platform in PLATFORMS:
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        assert "func.func public @main" in text
+
+
+def test_accelerators_score_more_hypotheses_at_once_than_cpus():
+    function, given = matching("paper")
+    traced = jax.jit(function).trace(*given)
+    larger = PRESETS["paper"].pair.for_accelerators()
+    at_once = larger.hypotheses_per_step * larger.steps_at_once
+    assert at_once == 512
+    for platform in PLATFORMS:
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        assert (f"tensor<{at_once}x3x3xf32>" in text) == (platform != "cpu")
+
+
+def test_only_what_changes_no_result_differs_between_platforms():
+    ours = PairShape(hypotheses_per_step=32, score_chunk=100, fine_chunk=3)
+    larger = ours.for_accelerators()
+    changed = {
+        name: (value, getattr(larger, name))
+        for name, value in dataclasses.asdict(ours).items()
+        if getattr(larger, name) != value
+    }
+    assert changed == {"steps_at_once": (1, 8), "score_chunk": (100, 800), "fine_chunk": (3, 24)}
+
+
+def views_of_one_wall(rng):
+    """Joined features of two images whose cells match along a shift, with some noise."""
+    rows, cols, channels = 12, 16, 24
+    wall = rng.normal(size=(2 * rows, 2 * cols + 4, channels))
+
+    def view(shift):
+        fine = wall[:, shift : shift + 2 * cols] + 0.2 * rng.normal(size=(2 * rows, 2 * cols, 24))
+        coarse = fine.reshape(rows, 2, cols, 2, channels).mean((1, 3))
+        unit = [
+            (x / np.linalg.norm(x, axis=-1, keepdims=True)).reshape(-1, channels)
+            for x in (coarse, fine)
+        ]
+        row, col = np.mgrid[: 2 * rows, : 2 * cols]
+        keypoints = np.stack([8 * col + 3.5, 8 * row + 3.5], -1).reshape(-1, 2)
+        keypoints = keypoints + rng.uniform(-3, 3, keypoints.shape)
+        grids = np.int32([rows, cols]), np.int32([2 * rows, 2 * cols])
+        coarse, fine, keypoints = (np.float32(x) for x in (*unit, keypoints))
+        return JoinedFeatures(coarse, fine, keypoints, *grids)
+
+    return view(0), view(4)
+
+
+def test_the_sizes_of_accelerators_give_the_cpus_matches_bit_for_bit():
+    rng = rng_of(0)
+    limits = Thresholds(jnp.float32(10), jnp.int32(26), jnp.float32(0.999))
+    given = jax.random.key(1), *views_of_one_wall(rng), limits
+    shape = dataclasses.replace(PRESETS["default"].pair, max_hypotheses=1000)
+    ours = pair.match_pair(*given, shape=shape)
+    match = jax.jit(functools.partial(pair._match_pair, shape=shape.for_accelerators()))
+    assert ours.num_coarse > 100 and ours.num_inliers[0] > 100
+    for x, y in zip(match(*given), ours, strict=True):
+        np.testing.assert_array_equal(x, y)
