@@ -49,6 +49,9 @@ def _configs() -> dict[str, Config]:
         "paper-grid-80px": dataclasses.replace(paper, keypoints="grid", threshold_px=80.0),
         "paper": paper,
         "paper-learned": dataclasses.replace(paper, keypoints="learned"),
+        "paper-k4": dataclasses.replace(paper, children=4),
+        "paper-conv4": dataclasses.replace(paper, layers="conv4_3/conv3_3"),
+        "paper-pool5": dataclasses.replace(paper, layers="pool5/conv5_3"),
         **{
             name: dataclasses.replace(unrefined, keypoints=keypoints)
             for name, keypoints in KEYPOINTS.items()
@@ -65,15 +68,19 @@ CONFIGS = _configs()
 A method is a preset; the preset `paper` with other keypoints; `grid`, `reloc` or `learned`, which
 are the preset `default` without refinement and alignment; or PRESET-IDEA, which is a preset changed
 by an entry of `ABLATIONS`. `paper-grid-80px` has the threshold of the authors' experiments without
-relocalization: ten cells, because their keypoints were then counted in cells.
+relocalization: ten cells, because their keypoints were then counted in cells. `paper-k4`,
+`paper-conv4` and `paper-pool5` are `paper` with K = 4 or with another pair of layers.
 """
-PAIR_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-placing")))
+NAIVE = "paper-naive"
+"""The preset `paper` without relocalization: its matches are followed down to pixels
+(`jaxsfm.core.naive`)."""
+PAIR_METHODS = ("rootsift", NAIVE, *(name for name in CONFIGS if not name.endswith("-no-placing")))
 """The methods of the benchmarks of pairs.
 
 `rootsift` is COLMAP's own features and matcher with the ratio test, before any geometry. The others
 are verified by homographies, and aligned where the method does so, as `jaxsfm match` does.
 """
-RUN_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-alignment")))
+RUN_METHODS = ("rootsift", NAIVE, *(name for name in CONFIGS if not name.endswith("-no-alignment")))
 """The methods of the benchmarks of whole reconstructions."""
 
 
@@ -81,13 +88,13 @@ def method_config(method: str, *, max_size: int | None = None) -> Config:
     """The configuration of a method.
 
     Args:
-      method: one of `CONFIGS`.
+      method: one of `CONFIGS`, or `NAIVE`, which has that of `paper`.
       max_size: the longer side of the working images in pixels; None keeps the method's.
 
     Raises:
       ValueError: there is no such method.
     """
-    if method not in CONFIGS:
-        raise ValueError(f"method must be one of {', '.join(CONFIGS)}; got {method!r}")
-    config = CONFIGS[method]
+    if method not in (*CONFIGS, NAIVE):
+        raise ValueError(f"method must be one of {', '.join([*CONFIGS, NAIVE])}; got {method!r}")
+    config = CONFIGS["paper" if method == NAIVE else method]
     return config if max_size is None else dataclasses.replace(config, max_size=max_size)

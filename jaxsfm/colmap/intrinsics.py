@@ -5,6 +5,7 @@ COLMAP model count them as COLMAP does, where that centre is (0.5, 0.5).
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2  # noqa: F401  before pycolmap: see jaxsfm.colmap.database
@@ -17,7 +18,7 @@ from jaxsfm.io.images import shown_name
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Intrinsics:
-    """One camera for all images."""
+    """A known camera."""
 
     model: str
     """Name of a COLMAP camera model."""
@@ -35,6 +36,15 @@ class Intrinsics:
         )
         camera.has_prior_focal_length = True
         return camera
+
+
+KnownCameras = Intrinsics | Mapping[str, Intrinsics]
+"""One camera of all images, or the cameras of all images by their names."""
+
+
+def camera_of(known: KnownCameras, name: str) -> Intrinsics:
+    """The known camera of an image."""
+    return known if isinstance(known, Intrinsics) else known[name]
 
 
 def _numbers(texts: list[str], where: str) -> list[float]:
@@ -98,15 +108,20 @@ def parse_intrinsics(text: str) -> Intrinsics:
     return Intrinsics(model=model, params=tuple(values))
 
 
-def check_fits(intrinsics: Intrinsics, sizes: dict[str, tuple[int, int]]) -> None:
-    """Check that one camera fits images: they have one size, and hold its principal point.
+def check_fits(intrinsics: KnownCameras, sizes: dict[str, tuple[int, int]]) -> None:
+    """Check that cameras fit their images: these hold the principal point, and the images of one
+    camera have one size.
 
     Args:
       sizes: image name -> (width, height).
 
     Raises:
-      UserError: it does not fit.
+      UserError: a camera does not fit.
     """
+    if not isinstance(intrinsics, Intrinsics):
+        for name, size in sizes.items():
+            check_fits(intrinsics[name], {name: size})
+        return
     by_size: dict[tuple[int, int], list[str]] = {}
     for name, size in sizes.items():
         by_size.setdefault(size, []).append(name)
