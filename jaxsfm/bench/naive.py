@@ -28,7 +28,7 @@ _join = jax.jit(join_octaves)
 def _maps(params: dict, image: jax.Array, size: jax.Array) -> list[jax.Array]:
     """pool2, pool1 and conv1_2 of a preprocessed image, in float16."""
     found = VGG16().apply(params, image[None], size[None], method="walked")
-    return [level[0].astype(jnp.float16) for level in reversed(found)]
+    return [level[0].astype(jnp.float16) for level in reversed(jax.tree.leaves(found))]
 
 
 def match_pairs_naively(

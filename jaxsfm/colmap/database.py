@@ -149,7 +149,7 @@ def write_database(
         camera_id = None
         for image in sorted(images, key=lambda i: i.name):
             if camera_id is None or not isinstance(intrinsics, Intrinsics):
-                known = intrinsics and camera_of(intrinsics, image.name)
+                known = None if intrinsics is None else camera_of(intrinsics, image.name)
                 camera_id = db.write_camera(camera_for(image, known))
             ids[image.name] = db.write_image(pycolmap.Image(name=image.name, camera_id=camera_id))
             xy = tables[image.name][1] if image.name in tables else empty

@@ -150,14 +150,14 @@ def extract(
     """
     x = preprocess(image, settings.preprocessing)
     network = BACKBONES[settings.backbone].module(bfloat16=settings.bfloat16)
-    fine_stride = FINE_STRIDES[settings.layers]
-    # Only VGG has other pairs of layers.
-    layers = {} if settings.layers == PAPER_LAYERS else {"layers": settings.layers}
+    maps_of = functools.partial(network.apply, method="levels")
+    if settings.layers != PAPER_LAYERS:  # only VGG has others
+        maps_of = functools.partial(maps_of, layers=settings.layers)
     levels: list[Levels] = []
     for k in range(settings.octaves):
         # Keypoints come from the first octave.
         heads = heads_of(scores if k == 0 else None)
-        maps = network.apply(params, x[None], (size >> k)[None], heads, method="levels", **layers)
+        maps = maps_of(params, x[None], (size >> k)[None], heads)
         assert isinstance(maps, Levels)
         levels.append(maps)
         if k + 1 < settings.octaves:
@@ -167,7 +167,7 @@ def extract(
         size,
         num_coarse=settings.num_coarse,
         num_fine=4 * settings.num_coarse,
-        fine_stride=fine_stride,
+        fine_stride=FINE_STRIDES[settings.layers],
         walk=settings.walk,
         centred=settings.centred,
     )
