@@ -35,6 +35,11 @@ KEYPOINTS: dict[str, Keypoints] = {"grid": "grid", "reloc": "relocalized", "lear
 """Methods that differ only in the place of a keypoint within its cell."""
 
 
+NAIVE = "paper-naive"
+"""The method that has the settings of `paper` but follows matches down to pixels
+(`jaxsfm.core.naive`) instead of relocalizing keypoints."""
+
+
 def _configs() -> dict[str, Config]:
     paper, default = preset("paper"), preset("default")
     unrefined = dataclasses.replace(default, aligned_octaves=0, refinement=None)
@@ -48,6 +53,7 @@ def _configs() -> dict[str, Config]:
         "paper-grid": dataclasses.replace(paper, keypoints="grid"),
         "paper-grid-80px": dataclasses.replace(paper, keypoints="grid", threshold_px=80.0),
         "paper": paper,
+        NAIVE: paper,
         "paper-learned": dataclasses.replace(paper, keypoints="learned"),
         "paper-k4": dataclasses.replace(paper, children=4),
         "paper-conv4": dataclasses.replace(paper, layers="conv4_3/conv3_3"),
@@ -71,16 +77,13 @@ by an entry of `ABLATIONS`. `paper-grid-80px` has the threshold of the authors' 
 relocalization: ten cells, because their keypoints were then counted in cells. `paper-k4`,
 `paper-conv4` and `paper-pool5` are `paper` with K = 4 or with another pair of layers.
 """
-NAIVE = "paper-naive"
-"""The preset `paper` without relocalization: its matches are followed down to pixels
-(`jaxsfm.core.naive`)."""
-PAIR_METHODS = ("rootsift", NAIVE, *(name for name in CONFIGS if not name.endswith("-no-placing")))
+PAIR_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-placing")))
 """The methods of the benchmarks of pairs.
 
 `rootsift` is COLMAP's own features and matcher with the ratio test, before any geometry. The others
 are verified by homographies, and aligned where the method does so, as `jaxsfm match` does.
 """
-RUN_METHODS = ("rootsift", NAIVE, *(name for name in CONFIGS if not name.endswith("-no-alignment")))
+RUN_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-alignment")))
 """The methods of the benchmarks of whole reconstructions."""
 
 
@@ -88,13 +91,13 @@ def method_config(method: str, *, max_size: int | None = None) -> Config:
     """The configuration of a method.
 
     Args:
-      method: one of `CONFIGS`, or `NAIVE`, which has that of `paper`.
+      method: one of `CONFIGS`.
       max_size: the longer side of the working images in pixels; None keeps the method's.
 
     Raises:
       ValueError: there is no such method.
     """
-    if method not in (*CONFIGS, NAIVE):
-        raise ValueError(f"method must be one of {', '.join([*CONFIGS, NAIVE])}; got {method!r}")
-    config = CONFIGS["paper" if method == NAIVE else method]
+    if method not in CONFIGS:
+        raise ValueError(f"method must be one of {', '.join(CONFIGS)}; got {method!r}")
+    config = CONFIGS[method]
     return config if max_size is None else dataclasses.replace(config, max_size=max_size)

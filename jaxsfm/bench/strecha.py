@@ -201,10 +201,10 @@ def cells(row: StrechaRow) -> Cells:
 def table_lines(result: BenchFigures[StrechaRow, StrechaSummary]) -> list[str]:
     """The paper's table with the paper's own rows, and the ratios to RootSIFT."""
     ours = [
-        (f"mean of {mean['sets']} sets", method, mean["position"], mean["rotation_deg"])
+        (f"mean, sets: {mean['sets']}", method, mean["position"], mean["rotation_deg"])
         for method, mean in result["summary"]["means"].items()
     ]
-    theirs = [("published, 6 sets", method, *errors) for method, errors in PUBLISHED.items()]
+    theirs = [("published, sets: 6", method, *errors) for method, errors in PUBLISHED.items()]
     averages = [
         {"set": name, "method": method, "position": f"{position:.4f}", "rotation": f"{turn:.4f}"}
         for name, method, position, turn in [*ours, *theirs]
@@ -217,5 +217,5 @@ def table_lines(result: BenchFigures[StrechaRow, StrechaSummary]) -> list[str]:
     ]
     for method, sets in result["summary"]["ratios"].items():
         mean = ", ".join(f"{key} {value:.2f}" for key, value in sets["mean"].items())
-        lines.append(f"{method} / {BASELINE}, mean of {len(sets) - 1} sets: {mean}")
+        lines.append(f"{method} / {BASELINE} (sets: {len(sets) - 1}): {mean}")
     return lines

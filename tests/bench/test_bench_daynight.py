@@ -7,6 +7,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxsfm.bench import scenes
 from jaxsfm.bench.curves import cumulative
@@ -123,12 +124,18 @@ def poses_on_arc(names):
 def test_the_night_camera_is_judged_after_a_similarity_from_the_day():
     names = ["a", "b", "c", "d", "n"]
     truth = poses_on_arc(names)
+    turned = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
+    truth["n"] = CameraPose(turned, truth["n"].centre)
     moved = {name: CameraPose(pose.rotation, 3 * pose.centre + 5) for name, pose in truth.items()}
     moved["n"] = CameraPose(moved["n"].rotation, moved["n"].centre + [0.6, 0, 0])
     subset = Subset(names[:4], "n")
     row = judge(SubsetModel(moved, None), subset, truth)
     assert row["registered"] and row["day_registered"] == 4
     assert row["position"] == pytest.approx(0.2) and row["rotation_deg"] < 1e-6
+    w, x, y, z, *t = row["pose"]  # from the world of the reference to the camera
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+    np.testing.assert_allclose(rotation, truth["n"].rotation, atol=1e-9)
+    np.testing.assert_allclose(-rotation.T @ t, truth["n"].centre + [0.2, 0, 0], atol=1e-9)
     del moved["n"]
     assert "position" not in judge(SubsetModel(moved, None), subset, truth)
     lonely = {name: truth[name] for name in ("a", "n")}

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 import jaxsfm
 from jaxsfm.config import Config, preset
 from jaxsfm.core.features import stored
+from jaxsfm.core.layers import FINE_STRIDES
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.sharded import device_mesh
 from jaxsfm.errors import UserError
@@ -147,6 +148,18 @@ def test_features_are_the_programs_rounded_once(weights, images):
         np.testing.assert_array_equal(one, other)
     assert found.dense.coarse[0].dtype == np.float16
     assert found.capacity == feature_capacity(image.size)
+
+
+@given(
+    st.tuples(st.integers(48, 5000), st.integers(48, 5000)),
+    st.sampled_from(sorted(FINE_STRIDES.values())),
+)
+def test_a_capacity_holds_the_cells_of_its_image(size, stride):
+    capacity = feature_capacity(size, fine_stride=stride)
+    fine = [side // stride for side in size]
+    coarse = [side // (2 * stride) for side in size]
+    assert capacity.num_coarse >= coarse[0] * coarse[1] and capacity.columns == coarse[0]
+    assert 4 * capacity.num_coarse >= fine[0] * fine[1]
 
 
 @pytest.mark.slow
