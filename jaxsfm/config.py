@@ -8,6 +8,7 @@ not recompile a program. This module imports neither jax nor cv2.
 import dataclasses
 from typing import Literal, get_args
 
+from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS, Layers
 from jaxsfm.core.pair_shape import PairShape as PairShape
 
 Keypoints = Literal["relocalized", "learned", "grid"]
@@ -22,7 +23,10 @@ EXTRACTED_BY = (
     "centred",
     "backbone",
     "convolutions",
+    "layers",
     "keypoints",
+    "children",
+    "walked_levels",
 )
 """Fields of `Config` that the features of an image depend on."""
 
@@ -99,6 +103,17 @@ class Config:
     """Where the keypoint of a fine cell lies: at the pixel that it walks to by the largest norms
     (the rule of the paper) or by learned scores (`jaxsfm.io.relocalizer`), or at the centre of the
     cell."""
+    layers: Layers = PAPER_LAYERS
+    """The layers of the coarse and of the fine descriptors. The paper's have cells of 16 and of 8
+    pixels. conv4_3/conv3_3 has cells of 8 and 4 pixels, so matching a pair takes about 16 times as
+    long; pool5/conv5_3 has cells of 32 and 16 pixels. Maps of convolutions are not rectified."""
+    children: int = 2
+    """Number of children per axis among which a keypoint is relocalized at each level (K in the
+    paper). With more than two, keypoints of neighbouring cells may coincide."""
+    walked_levels: int | None = None
+    """The number of levels that a keypoint is relocalized in. None stands for all of them, down to
+    conv1_2. With fewer, the keypoint lies at the centre of the cell where it ends; with 0, at the
+    centre of its fine cell, as with keypoints="grid"."""
     threshold_px: float = 10.0
     """Largest transfer error of an inlier of a homography, pixels of the working image."""
     min_inliers: int = 26
@@ -115,6 +130,11 @@ class Config:
     (`jaxsfm.sfm.view_graph`)."""
     refinement: Refinement | None = None
     """Settings of the refinement. With `None` the model of the mapper is not refined."""
+
+    @property
+    def fine_stride(self) -> int:
+        """Side of a fine cell, pixels of the working image; a coarse cell is twice as long."""
+        return FINE_STRIDES[self.layers]
 
     def extraction(self) -> "Config":
         """The settings that the features of an image depend on; the others have their defaults."""
@@ -139,6 +159,7 @@ class Config:
             ("backbone", get_args(BackboneName)),
             ("convolutions", get_args(Convolutions)),
             ("keypoints", get_args(Keypoints)),
+            ("layers", get_args(Layers)),
         ):
             if getattr(self, name) not in words:
                 raise ValueError(f"{name} must be one of {words}; got {getattr(self, name)!r}")
@@ -146,6 +167,16 @@ class Config:
             raise ValueError(
                 f"keypoints 'learned' are scored from maps of vgg16; got backbone {self.backbone!r}"
             )
+        if self.layers != PAPER_LAYERS:
+            if self.backbone == "alexnet" or self.keypoints == "learned":
+                raise ValueError(
+                    "layers other than pool4/pool3 need a VGG and keypoints that are not learned; "
+                    f"got {self.layers!r} of {self.backbone} with {self.keypoints!r}"
+                )
+        if self.children < 2 or self.children % 2:
+            raise ValueError(f"children must be even and at least 2; got {self.children}")
+        if self.walked_levels is not None and self.walked_levels < 0:
+            raise ValueError(f"walked_levels must be at least 0; got {self.walked_levels}")
         if not self.threshold_px > 0:
             raise ValueError(f"threshold_px must be positive; got {self.threshold_px}")
         if self.min_inliers < 4:

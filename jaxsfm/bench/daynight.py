@@ -9,22 +9,18 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NotRequired, TypedDict
 
 from jaxsfm.bench import scenes
+from jaxsfm.bench.aachen import PAIRS, aachen_scene, write_submission
 from jaxsfm.bench.curves import write_curves
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.methods import RUN_METHODS
+from jaxsfm.bench.night_protocol import LIMITS, SubsetRow, Summary, judge, limit_name, summary
 from jaxsfm.bench.options import DayNightOptions
-from jaxsfm.bench.scenes import Scene, Subset
-from jaxsfm.bench.subset_models import SubsetModel, dense_models, rootsift_models
-from jaxsfm.colmap.poses import Poses
+from jaxsfm.bench.scenes import Scene
+from jaxsfm.bench.subset_models import dense_models, rootsift_models
 from jaxsfm.errors import UserError
-from jaxsfm.sfm.evaluation import evaluate
 
-LIMITS = ((0.1, 1.0), (0.5, 10.0), (1.0, 10.0), (5.0, 10.0), (10.0, 10.0), (20.0, 10.0))
-"""Limits of the position error (units of the reference, metres for Strecha and Aachen) and of the
-rotation error (degrees)."""
 PUBLISHED = {
     "DoG + RootSIFT": (48, 1910, (15.31, 25.61, 36.73, 35.71, 39.80)),
     "dense, no relocalization": (95, 1924, (5.10, 14.29, 45.92, 61.22, 69.39)),
@@ -33,41 +29,6 @@ PUBLISHED = {
 """What the paper reports (Widya et al. 2018, table 2) for 98 subsets of Aachen, each of 20 day
 photos and a night photo: registered night photos, registered day photos, and the percentages of the
 night photos within 0.5, 1, 5, 10 and 20 m and 10 degrees."""
-
-
-class SubsetRow(TypedDict):
-    """The figures of one subset."""
-
-    night: str
-    """The name of the night photo."""
-    registered: bool
-    has_truth: bool
-    """Whether the night photo has a reference pose."""
-    day_registered: int
-    day_images: int
-    matches: NotRequired[int]
-    correct: NotRequired[int]
-    not_evaluated: NotRequired[str]
-    position: NotRequired[float]
-    rotation_deg: NotRequired[float]
-
-
-class Summary(TypedDict):
-    """The figures of several subsets."""
-
-    nights: int
-    night_registered: int
-    day_images: int
-    day_registered: int
-    matches: int | None
-    correct: int | None
-    nights_with_reference: int
-    """The number of nights that `within` counts, registered or not."""
-    within: dict[str, float] | None
-    not_evaluated: int
-    sorted_positions: list[float]
-    """The position errors of the nights that were evaluated, units of the reference."""
-    sorted_rotations_deg: list[float]
 
 
 class DayNightRow(Summary):
@@ -85,81 +46,24 @@ Totals = dict[str, Summary]
 """The figures of all scenes, by method."""
 
 
-def judge(made: SubsetModel, subset: Subset, truth: Poses) -> SubsetRow:
-    """Count a subset's registered cameras and matches, and measure the night camera's errors."""
-    poses = made.poses
-    day = [name for name in subset.day if name in poses]
-    row: SubsetRow = {
-        "night": subset.night,
-        "registered": subset.night in poses,
-        "has_truth": subset.night in truth,
-        "day_registered": len(day),
-        "day_images": len(subset.day),
-    }
-    if made.matches is not None:
-        row["matches"], row["correct"] = made.matches.number, made.matches.correct
-    if not row["registered"] or subset.night not in truth:
-        return row
-    known = {name: truth[name] for name in (*subset.day, subset.night) if name in truth}
-    try:
-        errors = evaluate(poses, known, align_on=[name for name in day if name in known])
-    except UserError as error:  # too few day cameras, or all on one line
-        row["not_evaluated"] = str(error)
-        return row
-    night = errors.images[subset.night]
-    row["position"], row["rotation_deg"] = night.position, night.rotation_deg
-    return row
-
-
-def limit_name(position: float, rotation_deg: float) -> str:
-    """The name of a limit in tables and figures."""
-    return f"{position:g}; {rotation_deg:g} deg"
-
-
-def summary(rows: Sequence[SubsetRow]) -> Summary:
-    """The figures of several subsets together.
-
-    The share of nights within a limit is that of all nights with a reference pose, registered or
-    not. It is None if no night has a reference pose.
-    """
-    judged = [
-        (row["position"], row["rotation_deg"])
-        for row in rows
-        if "position" in row and "rotation_deg" in row
-    ]
-    matches = [row["matches"] for row in rows if "matches" in row]
-    correct = [row["correct"] for row in rows if "correct" in row]
-    known = sum(row["has_truth"] for row in rows)
-    within = {
-        limit_name(d, deg): sum(p <= d and r <= deg for p, r in judged) / known
-        for d, deg in LIMITS
-        if known
-    }
-    return {
-        "nights": len(rows),
-        "night_registered": sum(row["registered"] for row in rows),
-        "day_images": sum(row["day_images"] for row in rows),
-        "day_registered": sum(row["day_registered"] for row in rows),
-        "matches": sum(matches) if matches else None,
-        "correct": sum(correct) if correct else None,
-        "nights_with_reference": known,
-        "within": within or None,
-        "not_evaluated": sum("not_evaluated" in row for row in rows),
-        "sorted_positions": sorted(position for position, _ in judged),
-        "sorted_rotations_deg": sorted(rotation for _, rotation in judged),
-    }
-
-
 def bench_daynight(options: DayNightOptions) -> BenchFigures[DayNightRow, Totals]:
     """Run all methods on all subsets of all scenes (`jaxsfm.bench.scenes`)."""
     methods = options.chosen_methods(RUN_METHODS)
     folders = scenes.find_scenes(options.root, options.chosen_sets())
+    aachen = (options.root / scenes.PHOTOS).is_dir()
+    if not aachen and (options.subsets or options.poses):
+        raise UserError("--subsets and --poses are for Aachen Day-Night only")
+    if aachen and options.subsets is None:
+        print(
+            f"The subsets are those of {PAIRS}. The paper's own 98 subsets do not come with "
+            "the data; --subsets takes a file of them."
+        )
     ready: dict[str, Scene] = {}
     for name, folder in folders.items():  # all inputs are read before the first long run
-        if scenes.is_strecha(folder):
+        if aachen:
+            ready[name] = aachen_scene(folder, options.subsets)
+        elif scenes.is_strecha(folder):
             scenes.check_strecha(folder)
-        elif (folder / scenes.AACHEN_PAIRS).is_file():
-            ready[name] = scenes.aachen_scene(folder)
         else:
             ready[name] = scenes.simple_scene(folder)
 
@@ -175,20 +79,29 @@ def bench_daynight(options: DayNightOptions) -> BenchFigures[DayNightRow, Totals
 
     figures = collect("daynight", rows(), totals, cells, options)
     if options.curves is not None:
-        whole = {m: of for m, of in figures["summary"].items() if of["nights_with_reference"]}
-        write_curves(
-            options.curves,
-            {
-                "position error, units of the reference": {
-                    method: of["sorted_positions"] for method, of in whole.items()
-                },
-                "rotation error, degrees": {
-                    method: of["sorted_rotations_deg"] for method, of in whole.items()
-                },
-            },
-            {method: of["nights_with_reference"] for method, of in whole.items()},
-        )
+        _write_curves(options.curves, figures["summary"])
+    if options.poses is not None:
+        for row in figures["rows"]:
+            poses = {s["night"]: s["pose"] for s in row["subsets"] if "pose" in s}
+            print(write_submission(options.poses, row["method"], poses))
     return figures
+
+
+def _write_curves(path: Path, whole: Totals) -> None:
+    judged = {method: of for method, of in whole.items() if of["nights_with_reference"]}
+    if not judged:
+        print(f"--curves {path}: not written, because no night photo has a reference pose")
+        return
+    positions = {method: of["sorted_positions"] for method, of in judged.items()}
+    rotations = {method: of["sorted_rotations_deg"] for method, of in judged.items()}
+    write_curves(
+        path,
+        {
+            "position error, units of the reference": positions,
+            "rotation error, degrees": rotations,
+        },
+        {method: of["nights_with_reference"] for method, of in judged.items()},
+    )
 
 
 def totals(rows: Sequence[DayNightRow]) -> Totals:

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.methods import method_config
+from jaxsfm.bench.methods import NAIVE, method_config
+from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.options import PairOptions
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database
@@ -61,6 +62,8 @@ class Matcher:
             taken = time.monotonic() - start
             return [Matches(xy0, xy1, taken)] * len(seeds)  # nothing is random
         config = method_config(method, max_size=self._options.max_size)
+        if method == NAIVE:
+            return [self._naive(image0, image1, config, seed) for seed in seeds]
         (features0, seconds0), (features1, seconds1) = (
             self._extract(image, config.extraction()) for image in (image0, image1)
         )
@@ -73,11 +76,24 @@ class Matcher:
             results.append(Matches(found.keypoints0.astype(np.float64), xy1, taken))
         return results
 
-    def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
+    def _naive(self, image0: ImageFile, image1: ImageFile, config: Config, seed: int) -> Matches:
+        start = time.monotonic()
+        images = {image.name: image for image in (image0, image1)}
+        weights = self._weights_of(config)
+        pair = (image0.name, image1.name)
+        (found,) = match_pairs_naively(weights, images, [pair], config=config, seed=seed)
+        xy0, xy1 = (xy.astype(np.float64) for xy in (found.keypoints0, found.keypoints1))
+        return Matches(xy0, xy1, time.monotonic() - start)
+
+    def _weights_of(self, config: Config) -> Weights:
         if config.backbone not in self._weights:
             self._weights[config.backbone] = chosen_weights(self._options.network, config.backbone)
+        return self._weights[config.backbone]
+
+    def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
+        weights = self._weights_of(config)
         start = time.monotonic()
-        features = image_features(self._weights[config.backbone], image, config=config)
+        features = image_features(weights, image, config=config)
         return features, time.monotonic() - start
 
 

@@ -35,6 +35,11 @@ KEYPOINTS: dict[str, Keypoints] = {"grid": "grid", "reloc": "relocalized", "lear
 """Methods that differ only in the place of a keypoint within its cell."""
 
 
+NAIVE = "paper-naive"
+"""The method that has the settings of `paper` but follows matches down to pixels
+(`jaxsfm.core.naive`) instead of relocalizing keypoints."""
+
+
 def _configs() -> dict[str, Config]:
     paper, default = preset("paper"), preset("default")
     unrefined = dataclasses.replace(default, aligned_octaves=0, refinement=None)
@@ -48,7 +53,11 @@ def _configs() -> dict[str, Config]:
         "paper-grid": dataclasses.replace(paper, keypoints="grid"),
         "paper-grid-80px": dataclasses.replace(paper, keypoints="grid", threshold_px=80.0),
         "paper": paper,
+        NAIVE: paper,
         "paper-learned": dataclasses.replace(paper, keypoints="learned"),
+        "paper-k4": dataclasses.replace(paper, children=4),
+        "paper-conv4": dataclasses.replace(paper, layers="conv4_3/conv3_3"),
+        "paper-pool5": dataclasses.replace(paper, layers="pool5/conv5_3"),
         **{
             name: dataclasses.replace(unrefined, keypoints=keypoints)
             for name, keypoints in KEYPOINTS.items()
@@ -65,7 +74,8 @@ CONFIGS = _configs()
 A method is a preset; the preset `paper` with other keypoints; `grid`, `reloc` or `learned`, which
 are the preset `default` without refinement and alignment; or PRESET-IDEA, which is a preset changed
 by an entry of `ABLATIONS`. `paper-grid-80px` has the threshold of the authors' experiments without
-relocalization: ten cells, because their keypoints were then counted in cells.
+relocalization: ten cells, because their keypoints were then counted in cells. `paper-k4`,
+`paper-conv4` and `paper-pool5` are `paper` with K = 4 or with another pair of layers.
 """
 PAIR_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-placing")))
 """The methods of the benchmarks of pairs.

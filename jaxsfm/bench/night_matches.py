@@ -1,14 +1,18 @@
 """Count the right matches of a night photo whose camera and pose are known."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.colmap.database import read_matches
+from jaxsfm.colmap.intrinsics import camera_of
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.two_views import rays_of
+
+if TYPE_CHECKING:
+    import pycolmap
 
 CORRECT_PX = 4.0
 """The largest distance of a right match from the true epipolar line. In images of 1000 px height a
@@ -50,17 +54,24 @@ def night_matches(database: Path, scene: Scene, subset: Subset) -> NightMatches 
     """
     if scene.camera is None or subset.night not in scene.truth:
         return None
-    night = scene.camera.camera(scene.images[subset.night].size)
+
+    def camera(name: str) -> "pycolmap.Camera":
+        assert scene.camera is not None
+        return camera_of(scene.camera, name).camera(scene.images[name].size)
+
+    night = camera(subset.night)
     number = correct = 0
     for name in subset.day:
         if name not in scene.truth:
             continue
-        day = scene.camera.camera(scene.images[name].size)
         xy0, xy1 = read_matches(database, (name, subset.night), verified=True)
         if not len(xy0):
             continue
         far = night.mean_focal_length() * epipolar_distance(
-            rays_of(day, xy0), rays_of(night, xy1), scene.truth[name], scene.truth[subset.night]
+            rays_of(camera(name), xy0),
+            rays_of(night, xy1),
+            scene.truth[name],
+            scene.truth[subset.night],
         )
         number += len(far)
         correct += int((far <= CORRECT_PX).sum())

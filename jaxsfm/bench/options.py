@@ -99,7 +99,8 @@ class PairOptions(_Sets, _Network, _Seeds):
     Attributes:
       methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
         paper, default, robust: the presets. paper-learned: the preset paper with keypoints at the
-        largest learned scores. grid, reloc, learned: the preset default without alignment;
+        largest learned scores. paper-naive, paper-k4, paper-conv4, paper-pool5: as in bench
+        strecha. grid, reloc, learned: the preset default without alignment;
         keypoints are at the centres of cells (grid), at the largest norms (reloc) or at the largest
         learned scores (learned). PRESET-no-IDEA: default or robust without one idea, which is
         octaves, centring, consensus, competition or alignment; for robust also enlarging.
@@ -150,7 +151,10 @@ class _Runs(_Sets, _Network):
       methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
         paper, default, robust: the presets. paper-grid, paper-learned: the preset paper with
         keypoints at the centres of cells or at the largest learned scores. paper-grid-80px: the
-        same as paper-grid with the paper's threshold for it, 80 pixels. grid, reloc, learned:
+        same as paper-grid with the paper's threshold for it, 80 pixels. paper-naive: the preset
+        paper, with matches that are followed down to pixels instead of relocalization. paper-k4: K
+        = 4 instead of 2. paper-conv4, paper-pool5: the layers conv4_3/conv3_3 or pool5/conv5_3
+        instead of pool4/pool3. grid, reloc, learned:
         the preset default without refinement; keypoints are at the centres of cells (grid), at the
         largest norms (reloc) or at the largest learned scores (learned). PRESET-IDEA: as in bench
         wxbs, and also PRESET-no-placing.
@@ -202,6 +206,11 @@ class DayNightOptions(_Runs):
       root: Folder of the data. It has scenes (SCENE/day, SCENE/night and SCENE/reference), or
         Strecha sets, or Aachen Day-Night. In Strecha sets, one photo after the other is turned to a
         synthetic night.
+      subsets: Aachen only: a file with the subsets, such as the 98 of the paper. Each line names a
+        night photo and then its day photos, as paths below images_upright. Without it, the subsets
+        are those of image_pairs_to_match.txt.
+      poses: Aachen only: write the poses of the night photos to FOLDER/Aachen_eval_METHOD.txt, for
+        the evaluation server, because the reference poses of these photos are not public.
       curves: Write the cumulative curves of the nights' position and rotation errors to this PNG
         file (figure 4 of the paper). The errors themselves are in the --json file.
       severity: How dark the synthetic night is. 0 is day, 1 is clean, 2 is noisy, 3 is dark, 5 is
@@ -212,6 +221,8 @@ class DayNightOptions(_Runs):
 
     root: Path
     methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default,robust",)
+    subsets: Path | None = None
+    poses: Path | None = None
     curves: Path | None = None
     severity: float = 2.0
     denoise: bool = True

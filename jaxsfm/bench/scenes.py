@@ -5,8 +5,7 @@
 * Simple scenes: SCENE/day/*, SCENE/night/* and SCENE/reference (Strecha .camera files, or a COLMAP
   model whose image names, or their stems, are those of the photos). If all photos share a known
   camera, SCENE/intrinsics.txt holds it as MODEL:p1,p2,.. (COLMAP's pixels) or as a 3 x 3 matrix.
-* Aachen Day-Night: images_upright/, 3D-models/**/ (a COLMAP model) and image_pairs_to_match.txt,
-  whose lines pair each night photo with its day photos.
+* Aachen Day-Night (`jaxsfm.bench.aachen`), which has a folder images_upright.
 """
 
 import shutil
@@ -21,13 +20,14 @@ from jaxsfm.bench.inputs import check_root, choose_sets, usable_image
 from jaxsfm.bench.night import synthetic_night
 from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.strecha_sets import strecha_intrinsics
-from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, parse_intrinsics
+from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import Poses, read_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, find_images, inspect_image, read_image
 from jaxsfm.sfm.evaluation import pair_names
 
-AACHEN_PAIRS = "image_pairs_to_match.txt"
+PHOTOS = "images_upright"
+"""The folder of Aachen's photos."""
 NIGHT = "night/"
 
 
@@ -47,8 +47,8 @@ class Scene(NamedTuple):
     subsets: list[Subset]
     truth: Poses
     """Reference poses by the photos' names; a photo without one is only counted as registered."""
-    camera: Intrinsics | None
-    """The camera of all photos; None if it is guessed and refined."""
+    camera: KnownCameras | None
+    """The known cameras; None if they are guessed and refined."""
     synthetic: bool
 
 
@@ -103,8 +103,8 @@ def simple_scene(folder: Path) -> Scene:
     names = {
         part: [f"{part}/{name}" for name in find_images(folder / part)] for part in ("day", "night")
     }
-    images = _inspected(folder, [n for part in names.values() for n in part])
-    truth = _reference(folder.name, images, read_poses(folder / "reference", option="--root"))
+    images = inspected(folder, [n for part in names.values() for n in part])
+    truth = reference_of(folder.name, images, read_poses(folder / "reference", option="--root"))
     if sum(name in truth for name in names["day"]) < 3:
         raise UserError(
             f"--root: {folder / 'reference'} has fewer than 3 of the day photos (by name, or by a "
@@ -115,48 +115,24 @@ def simple_scene(folder: Path) -> Scene:
     return Scene(folder, images, subsets, truth, camera, False)
 
 
-def _inspected(folder: Path, names: Sequence[str]) -> dict[str, ImageFile]:
+def inspected(folder: Path, names: Sequence[str]) -> dict[str, ImageFile]:
+    """The photos in a folder, checked.
+
+    Raises:
+      UserError: one of them cannot be used.
+    """
     return {name: usable_image(folder / name, name=name) for name in names}
 
 
-def _reference(scene: str, images: dict[str, ImageFile], poses: Poses) -> Poses:
+def reference_of(scene: str, images: dict[str, ImageFile], poses: Poses) -> Poses:
+    """The poses of those photos that a reference has, by the photos' names.
+
+    Raises:
+      UserError: the reference is empty.
+    """
     if not poses:
         raise UserError(f"--root: the reference of {scene} has no poses")
     return {name: poses[other] for name, other in pair_names(list(images), poses).items()}
-
-
-def aachen_scene(root: Path) -> Scene:
-    """Read Aachen Day-Night; each subset is one night photo with the day photos paired with it.
-
-    Cameras are guessed from EXIF and refined.
-    """
-    folder = root / "images_upright"
-    if not folder.is_dir():
-        raise UserError(f"--root {root}: {AACHEN_PAIRS} but no folder images_upright")
-    models = sorted(
-        path.parent
-        for pattern in ("images.bin", "images.txt")
-        for path in (root / "3D-models").rglob(pattern)
-    )
-    if not models:
-        raise UserError(f"--root {root}: no COLMAP model below 3D-models")
-    paired: dict[str, set[str]] = {}
-    try:
-        lines = (root / AACHEN_PAIRS).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--root: {root / AACHEN_PAIRS} cannot be read as text") from error
-    for line in lines:
-        names = line.split()
-        dark = [name for name in names if "night" in name.split("/")]
-        if len(names) == 2 and len(dark) == 1:
-            paired.setdefault(dark[0], set()).update(set(names) - set(dark))
-    if not paired:
-        raise UserError(f"--root: {root / AACHEN_PAIRS} pairs no night photo with day photos")
-    wanted = sorted({*paired, *(name for day in paired.values() for name in day)})
-    images = _inspected(folder, wanted)
-    subsets = [Subset(sorted(day), night) for night, day in sorted(paired.items())]
-    truth = _reference(root.name, images, read_poses(models[0], option="--root"))
-    return Scene(folder, images, subsets, truth, None, False)
 
 
 def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
@@ -170,7 +146,7 @@ def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
     """
     check_root(root)
     root = root.resolve()  # so that it has a name
-    if (root / AACHEN_PAIRS).is_file():
+    if (root / PHOTOS).is_dir():
         found = {root.name: root}
     else:
         found = {path.parent.name: path.parent for path in root.glob("*/night") if path.is_dir()}
@@ -178,7 +154,7 @@ def find_scenes(root: Path, names: Sequence[str] | None) -> dict[str, Path]:
     if not found:
         raise UserError(
             f"--root {root}: no scenes in it (SCENE/day and SCENE/night, Strecha sets, or Aachen's "
-            f"{AACHEN_PAIRS})"
+            f"{PHOTOS})"
         )
     return {folder.name: folder for folder in choose_sets(found, names, root)}
 

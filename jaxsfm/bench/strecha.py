@@ -1,28 +1,19 @@
 """`bench strecha`: the paper's comparison on standard scenes (Strecha et al., CVPR 2008)."""
 
-import json
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
-from jaxsfm.bench.figures import BenchFigures, Cells, collect, table, write_json
-from jaxsfm.bench.methods import RUN_METHODS, method_config
+from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
+from jaxsfm.bench.methods import RUN_METHODS
 from jaxsfm.bench.options import StrechaOptions
+from jaxsfm.bench.strecha_models import set_model
 from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
-from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.mapper import MapOptions, build_models
-from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.poses import model_poses, read_model
-from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
+from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import UserError
-from jaxsfm.matching.pipeline import open_images
-from jaxsfm.runs.reconstruct import reconstruct_folder
-from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.evaluation import evaluate
 
 if TYPE_CHECKING:
@@ -85,43 +76,6 @@ class StrechaSummary(TypedDict):
     ratios: Ratios
 
 
-def _run_rootsift(
-    each: StrechaSet, work: Path, options: StrechaOptions
-) -> "tuple[pycolmap.Reconstruction | None, dict[str, float]]":
-    """The model of a set by COLMAP's own features, also written to `work`/sparse; and seconds."""
-    work.mkdir(parents=True, exist_ok=True)
-    photos, database = each.folder / "images", work / "database.db"
-    images, _ = open_images(photos)
-    start = time.monotonic()
-    known = options.intrinsics == "known"
-    camera = parse_intrinsics(each.camera) if known else None
-    seed, threads = options.seed, options.threads
-    verification = VerificationOptions(seed=seed, threads=threads)
-    write_rootsift_database(database, photos, images, camera, verification)
-    mapping = MapOptions(refine_intrinsics=not known, seed=seed, threads=threads)
-    models, _ = build_models(database, read_two_views(database), mapping)
-    write_models(models, work / "sparse")
-    return models[0] if models else None, {"all": time.monotonic() - start}
-
-
-def _run_method(
-    each: StrechaSet, method: str, work: Path, options: StrechaOptions
-) -> "tuple[pycolmap.Reconstruction | None, dict[str, float]]":
-    """The model of a set by one of our methods, in the work folder `work`; and seconds."""
-    run = RunOptions(
-        intrinsics=each.camera if options.intrinsics == "known" else None,
-        network=options.network,
-        seed=options.seed,
-        threads=options.threads,
-        best_pairs=options.best_pairs,
-        progress=True,
-    )
-    photos, config = each.folder / "images", method_config(method)
-    report = reconstruct_folder(photos, work, config=config, options=run)
-    model = read_model(work / "sparse" / "0") if report.models else None
-    return model, report.seconds | _matching_seconds(work, report.seconds)
-
-
 def _row(
     each: StrechaSet,
     method: str,
@@ -163,25 +117,6 @@ def _row(
     return row
 
 
-def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
-    """Seconds of extraction and matching in a work folder, also if an earlier run did them.
-
-    A stage that is reused took its time once. The longest time measured so far is what counts, and
-    it is stored in the work folder.
-    """
-    path = work / "bench_seconds.json"
-    try:
-        before = json.loads(path.read_text())
-    except (OSError, ValueError):
-        before = {}
-    spent = {
-        stage: max(float(before.get(stage, 0.0)), stages[stage])
-        for stage in ("extraction", "matching")
-    }
-    write_json(path, spent)
-    return spent
-
-
 def bench_strecha(options: StrechaOptions) -> BenchFigures[StrechaRow, StrechaSummary]:
     """Run all methods on all sets, with the same images, camera, verification and mapper."""
     methods = options.chosen_methods(RUN_METHODS)
@@ -193,11 +128,7 @@ def bench_strecha(options: StrechaOptions) -> BenchFigures[StrechaRow, StrechaSu
             for each in sets:
                 for method in methods:
                     work = (options.out or Path(scratch)) / each.folder.name / method
-                    if method == "rootsift":
-                        made = _run_rootsift(each, work, options)
-                    else:
-                        made = _run_method(each, method, work, options)
-                    yield _row(each, method, *made)
+                    yield _row(each, method, *set_model(each, method, work, options))
 
     def summary(measured: list[StrechaRow]) -> StrechaSummary:
         return {"means": means(measured), "ratios": ratios(measured)}
@@ -270,10 +201,10 @@ def cells(row: StrechaRow) -> Cells:
 def table_lines(result: BenchFigures[StrechaRow, StrechaSummary]) -> list[str]:
     """The paper's table with the paper's own rows, and the ratios to RootSIFT."""
     ours = [
-        (f"mean of {mean['sets']} sets", method, mean["position"], mean["rotation_deg"])
+        (f"mean, sets: {mean['sets']}", method, mean["position"], mean["rotation_deg"])
         for method, mean in result["summary"]["means"].items()
     ]
-    theirs = [("published, 6 sets", method, *errors) for method, errors in PUBLISHED.items()]
+    theirs = [("published, sets: 6", method, *errors) for method, errors in PUBLISHED.items()]
     averages = [
         {"set": name, "method": method, "position": f"{position:.4f}", "rotation": f"{turn:.4f}"}
         for name, method, position, turn in [*ours, *theirs]
@@ -286,5 +217,5 @@ def table_lines(result: BenchFigures[StrechaRow, StrechaSummary]) -> list[str]:
     ]
     for method, sets in result["summary"]["ratios"].items():
         mean = ", ".join(f"{key} {value:.2f}" for key, value in sets["mean"].items())
-        lines.append(f"{method} / {BASELINE}, mean of {len(sets) - 1} sets: {mean}")
+        lines.append(f"{method} / {BASELINE} (sets: {len(sets) - 1}): {mean}")
     return lines

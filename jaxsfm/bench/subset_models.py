@@ -5,7 +5,8 @@ import shutil
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxsfm.bench.methods import method_config
+from jaxsfm.bench.methods import NAIVE, method_config
+from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Scene
@@ -98,7 +99,11 @@ def dense_models(
     for k, subset in enumerate(scene.subsets):
         pairs = exhaustive_pairs([*subset.day, subset.night])
         missing = [pair for pair in pairs if pair not in results]
-        for result in match_pairs(features, capacities, missing, config=config, seed=options.seed):
+        for result in (
+            match_pairs_naively(weights, scene.images, missing, config=config, seed=options.seed)
+            if method == NAIVE
+            else match_pairs(features, capacities, missing, config=config, seed=options.seed)
+        ):
             results[result.pair] = result
         made = reconstruct(
             [scene.images[name] for name in sorted({*subset.day, subset.night})],

@@ -37,7 +37,6 @@ def strecha(bench: Unnamed[StrechaOptions]) -> int:
 
     For example
         $ jaxsfm bench strecha --root SETS --methods rootsift,default --json figures.json
-    compares with RootSIFT, and this makes the paper's table
         $ jaxsfm bench strecha --root SETS --best-pairs 5 --methods rootsift,paper-grid,paper
     """
     from jaxsfm.bench.strecha import bench_strecha, table_lines
@@ -90,6 +89,8 @@ def daynight(bench: Unnamed[DayNightOptions]) -> int:
     from jaxsfm.bench.daynight import bench_daynight, table_lines
 
     check_writable(bench.curves, "--curves", (".png",))
+    submission = bench.poses and bench.poses / "Aachen_eval_METHOD.txt"
+    check_writable(submission, "--poses", (".txt",))
     return _run(bench_daynight, table_lines, bench)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, camera_of
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile, shown_name
@@ -97,7 +97,7 @@ def write_database(
     path: Path,
     images: list[ImageFile],
     results: Mapping[Pair, PairResult],
-    intrinsics: Intrinsics | None,
+    intrinsics: KnownCameras | None,
 ) -> None:
     """Write a new COLMAP database with cameras, images, keypoints and matches.
 
@@ -105,7 +105,7 @@ def write_database(
       path: a file there is replaced.
       images: all images. Those without matches get no keypoints.
       results: the matches. Each is read twice, and none is held in memory.
-      intrinsics: one camera for all images; None: one for each.
+      intrinsics: the known cameras; None: a guessed one for each image.
 
     Raises:
       ValueError: the results are inconsistent. Nothing is written then.
@@ -136,8 +136,9 @@ def write_database(
         ids = {}
         camera_id = None
         for image in sorted(images, key=lambda i: i.name):
-            if camera_id is None or intrinsics is None:
-                camera_id = db.write_camera(camera_for(image, intrinsics))
+            if camera_id is None or not isinstance(intrinsics, Intrinsics):
+                known = None if intrinsics is None else camera_of(intrinsics, image.name)
+                camera_id = db.write_camera(camera_for(image, known))
             ids[image.name] = db.write_image(pycolmap.Image(name=image.name, camera_id=camera_id))
             xy = tables[image.name][1] if image.name in tables else empty
             db.write_keypoints(ids[image.name], (xy + PIXEL_OFFSET).astype(np.float32))

@@ -5,6 +5,7 @@ COLMAP model count them as COLMAP does, where that centre is (0.5, 0.5).
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from jaxsfm.io.images import shown_name
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Intrinsics:
-    """One camera for all images."""
+    """A known camera."""
 
     model: str
     params: tuple[float, ...]
@@ -33,6 +34,15 @@ class Intrinsics:
         )
         camera.has_prior_focal_length = True
         return camera
+
+
+KnownCameras = Intrinsics | Mapping[str, Intrinsics]
+"""One camera of all images, or the cameras of all images by their names."""
+
+
+def camera_of(known: KnownCameras, name: str) -> Intrinsics:
+    """The known camera of an image."""
+    return known if isinstance(known, Intrinsics) else known[name]
 
 
 def _numbers(texts: list[str], where: str) -> list[float]:
@@ -95,12 +105,17 @@ def parse_intrinsics(text: str) -> Intrinsics:
     return Intrinsics(model=model, params=tuple(values))
 
 
-def check_fits(intrinsics: Intrinsics, sizes: dict[str, tuple[int, int]]) -> None:
-    """Raise UserError unless all images have one size and hold the camera's principal point.
+def check_fits(intrinsics: KnownCameras, sizes: dict[str, tuple[int, int]]) -> None:
+    """Raise UserError unless all images hold the principal point of their camera, and the images of
+    one camera have one size.
 
     Args:
       sizes: image name -> (width, height).
     """
+    if not isinstance(intrinsics, Intrinsics):
+        for name, size in sizes.items():
+            check_fits(intrinsics[name], {name: size})
+        return
     by_size: dict[tuple[int, int], list[str]] = {}
     for name, size in sizes.items():
         by_size.setdefault(size, []).append(name)

@@ -1,12 +1,12 @@
 """COLMAP's own features as the baseline: RootSIFT, exhaustive matching, the same verification."""
 
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras
 from jaxsfm.colmap.native import native
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
@@ -18,15 +18,15 @@ def write_rootsift_database(
     path: Path,
     folder: Path,
     images: list[ImageFile],
-    intrinsics: Intrinsics | None,
+    intrinsics: KnownCameras | None,
     verification: VerificationOptions,
     *,
     pairs: Iterable[Pair] | None = None,
 ) -> None:
     """Write a new database with COLMAP's DoG + RootSIFT features, matched and verified.
 
-    COLMAP's defaults are used throughout. If intrinsics are given, there is one camera for all
-    images; otherwise one per image, from EXIF or with 1.2 x the longer side as focal length.
+    COLMAP's defaults are used throughout. Without known cameras there is one per image, from EXIF
+    or with 1.2 x the longer side as focal length.
 
     Args:
       verification: its threads are those of extraction and matching too. Pairs with fewer matches
@@ -40,7 +40,7 @@ def write_rootsift_database(
     path.unlink(missing_ok=True)
     reader = pycolmap.ImageReaderOptions()
     mode = pycolmap.CameraMode.PER_IMAGE
-    if intrinsics is not None:
+    if isinstance(intrinsics, Intrinsics):
         reader.camera_model = intrinsics.model
         reader.camera_params = ",".join(repr(float(p)) for p in intrinsics.params)
         mode = pycolmap.CameraMode.SINGLE
@@ -61,6 +61,8 @@ def write_rootsift_database(
             reader_options=reader,
             extraction_options=extraction,
         )
+        if isinstance(intrinsics, Mapping):
+            _set_cameras(path, images, intrinsics)
         options = {"matching_options": matching, "verification_options": two_view}
         if pairs is None:
             pycolmap.match_exhaustive(path, **options)
@@ -77,3 +79,13 @@ def write_rootsift_database(
         there = {image.name for image in db.read_all_images()}
     if lost := sorted({image.name for image in images} - there):
         raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, which RootSIFT needs")
+
+
+def _set_cameras(path: Path, images: list[ImageFile], known: Mapping[str, Intrinsics]) -> None:
+    """Replace the guessed cameras of a database by known ones."""
+    sizes = {image.name: image.size for image in images}
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        for image in db.read_all_images():
+            camera = known[image.name].camera(sizes[image.name])
+            camera.camera_id = image.camera_id
+            db.update_camera(camera)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxsfm.core.backbones import BACKBONES
-from jaxsfm.core.grid import COARSE_STRIDE, FINE_STRIDE, cell_rows_cols, cell_to_px
+from jaxsfm.core.grid import FINE_STRIDE, cell_rows_cols, cell_to_px
+from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS, Layers
 from jaxsfm.core.numerics import squared_norm, unit
 from jaxsfm.core.octaves import halve, octave_capacity
 from jaxsfm.core.relocalize import relocalize
@@ -21,6 +22,20 @@ LEAST_DIFFERENCE = 1e-3
 """Smallest distance between a unit descriptor and the mean of its image for it to count."""
 
 
+class Walk(NamedTuple):
+    """How keypoints are relocalized."""
+
+    levels: int | None = None
+    """The number of levels that a keypoint walks down; `None` stands for all, to a pixel. With
+    fewer it lies at the centre of the cell where it ends: with 0, of its fine cell."""
+    children: int = 2
+    """Children per axis among which it chooses at each level (K in the paper)."""
+
+
+TO_PIXELS = Walk()
+"""The rule of the paper."""
+
+
 class Extraction(NamedTuple):
     """The static, hashable settings of `extract`."""
 
@@ -29,7 +44,8 @@ class Extraction(NamedTuple):
     """Capacity for coarse cells of the first octave; that for fine cells is four times as large."""
     backbone: str = "vgg16"
     """One of `jaxsfm.core.backbones.BACKBONES`."""
-    relocalized: bool = True
+    layers: Layers = PAPER_LAYERS
+    walk: Walk = TO_PIXELS
     octaves: int = 1
     centred: bool = False
     bfloat16: bool = False
@@ -60,7 +76,8 @@ def dense_features(
     *,
     num_coarse: int,
     num_fine: int,
-    relocalized: bool,
+    fine_stride: int = FINE_STRIDE,
+    walk: Walk = TO_PIXELS,
     centred: bool = False,
 ) -> DenseFeatures:
     """The features of an image from its maps.
@@ -70,18 +87,19 @@ def dense_features(
         of 1.
       size: valid (rows, columns) of the image.
       num_coarse, num_fine: capacities of the first octave, at least the number of valid cells.
-      relocalized: keypoints are relocalized; otherwise they are the centres of the cells.
+      fine_stride: stride of the fine maps, pixels.
+      walk: how keypoints are relocalized.
       centred: the mean descriptor of an octave is subtracted from its descriptors, which are then
         scaled to unit length again.
     """
-    fine_grid, coarse_grid = size // FINE_STRIDE, size // COARSE_STRIDE
+    fine_grid, coarse_grid = size // fine_stride, size // (2 * fine_stride)
     row, col = cell_rows_cols(num_fine, fine_grid[1])
-    if relocalized:
-        scores = [score[0] for score in reversed(octaves[0].scores)]
-        keypoints = relocalize(scores, row, col)
+    scores = [score[0] for score in reversed(octaves[0].scores)][: walk.levels]
+    if scores:
+        cells = relocalize(scores, row, col, children=walk.children)
     else:
         cells = jnp.stack([col, row], axis=-1).astype(jnp.float32)
-        keypoints = cell_to_px(cells, stride=FINE_STRIDE)
+    keypoints = cell_to_px(cells, stride=fine_stride >> len(scores))
 
     def descriptors(maps: Sequence[Array], grid: Array, capacity: int) -> tuple[Array, ...]:
         return tuple(
@@ -132,11 +150,14 @@ def extract(
     """
     x = preprocess(image, settings.preprocessing)
     network = BACKBONES[settings.backbone].module(bfloat16=settings.bfloat16)
+    maps_of = functools.partial(network.apply, method="levels")
+    if settings.layers != PAPER_LAYERS:  # only VGG has others
+        maps_of = functools.partial(maps_of, layers=settings.layers)
     levels: list[Levels] = []
     for k in range(settings.octaves):
         # Keypoints come from the first octave.
         heads = heads_of(scores if k == 0 else None)
-        maps = network.apply(params, x[None], (size >> k)[None], heads, method="levels")
+        maps = maps_of(params, x[None], (size >> k)[None], heads)
         assert isinstance(maps, Levels)
         levels.append(maps)
         if k + 1 < settings.octaves:
@@ -146,6 +167,7 @@ def extract(
         size,
         num_coarse=settings.num_coarse,
         num_fine=4 * settings.num_coarse,
-        relocalized=settings.relocalized,
+        fine_stride=FINE_STRIDES[settings.layers],
+        walk=settings.walk,
         centred=settings.centred,
     )

@@ -28,11 +28,12 @@ class Pyramid(NamedTuple):
 class Levels(NamedTuple):
     """The maps of a backbone that features are made of."""
 
-    scores: tuple[Float[Array, "b h w"], Float[Array, "b h2 w2"], Float[Array, "b h4 w4"]]
-    """The scores that keypoints are relocalized by: squared norms of the cells of conv1_2, pool1
-    and pool2, or learned scores."""
+    scores: tuple[Float[Array, "b _h _w"], ...]
+    """The scores that keypoints are relocalized by, of stride 1, 2, 4 and so on below the fine map:
+    squared norms of the cells of conv1_2, pool1 and pool2, or learned scores."""
     pool3: Float[Array, "b h8 w8 d"]
-    """Fine descriptors, not normalised. Other backbones than VGG give their map of this stride."""
+    """Fine descriptors, not normalised. Other backbones than VGG give their map of this stride,
+    other pairs of layers (`jaxsfm.core.layers`) their fine map."""
     pool4: Float[Array, "b h16 w16 c"]
     """Coarse descriptors, not normalised."""
 

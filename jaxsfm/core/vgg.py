@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxsfm.core.blocks import Layer, clear_padding, convolve, pool, scores_and_pool
+from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS, Layers
 from jaxsfm.core.scores import Head, score
 from jaxsfm.core.types import Levels, Pyramid
 
@@ -124,30 +125,37 @@ class VGG(nn.Module):
         images: Float[Array, "b h w 3"],
         size: Int[Array, "b 2"],
         heads: Sequence[Head | None] = (None, None, None),
+        *,
+        layers: Layers = PAPER_LAYERS,
     ) -> Levels:
-        """The maps that features are made of, up to pool4. Arguments are those of `__call__`.
+        """The maps that features are made of. Arguments are those of `__call__`.
 
         Args:
           heads: learned heads for the scores of conv1_2, pool1 and pool2; `None` gives norms.
+          layers: the coarse and the fine layer. Maps of convolutions are those before the
+            rectifier; in VGG-19 they are the last ones of their blocks.
         """
+        coarse, fine = layers.split("/")
         x = clear_padding(images, size)
         finest: list[Array] = []
-        pooled: list[Array] = []
-        for block in range(1, 5):
-            scored, x = scores_and_pool(
-                x,
-                size,
-                self._layers(block),
-                large=block <= LARGE_BLOCKS,
-                head=heads[0] if block == 1 else None,
-                bfloat16=self.bfloat16,
-            )
-            finest.append(scored)
-            pooled.append(x)
+        maps: dict[str, Array] = {}
+        for block in range(1, int(coarse[4]) + 1):
+            convs = self._layers(block)
+            if block <= LARGE_BLOCKS:
+                head = heads[0] if block == 1 else None
+                scored, x = scores_and_pool(
+                    x, size, convs, large=True, head=head, bfloat16=self.bfloat16
+                )
+                finest.append(scored)
+            else:
+                maps[f"conv{block}_3"] = convolve(x, size, convs, bfloat16=self.bfloat16)
+                x = pool(maps[f"conv{block}_3"], size)
+            maps[f"pool{block}"] = x
             size = size // 2
-        pool1, pool2, pool3, pool4 = pooled
-        scores = (finest[0], score(pool1, heads[1]), score(pool2, heads[2]))
-        return Levels(scores, pool3, pool4)
+        walked = [finest[0]]
+        for k in range(1, FINE_STRIDES[layers].bit_length() - 1):
+            walked.append(score(maps[f"pool{k}"], heads[k] if k < len(heads) else None))
+        return Levels(tuple(walked), maps[fine], maps[coarse])
 
     def conv5(
         self, images: Float[Array, "b h w 3"], size: Int[Array, "b 2"]

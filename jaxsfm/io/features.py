@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsfm.config import Config
+from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
@@ -74,18 +75,20 @@ def padded_size(size: tuple[int, int]) -> tuple[int, int]:
     return -(-height // SIDE_BUCKET) * SIDE_BUCKET, -(-width // SIDE_BUCKET) * SIDE_BUCKET
 
 
-def feature_capacity(size: tuple[int, int]) -> FeatureCapacity:
+def feature_capacity(size: tuple[int, int], *, fine_stride: int = FINE_STRIDE) -> FeatureCapacity:
     """The capacity for the features of a working image of (width, height)."""
-    width, height = size
-    # Four cells of pool3 belong to each cell of pool4; an odd last row and column come on top.
-    odd = height // 8 * (width // 8) - 4 * (height // 16) * (width // 16)
-    cells = height // 16 * (width // 16) + -(-odd // 4)
-    return FeatureCapacity(padded_cells(cells), width // 16)
+    coarse_columns, coarse_rows = (side // (2 * fine_stride) for side in size)
+    columns, rows = (side // fine_stride for side in size)
+    # Four fine cells belong to each coarse cell; an odd last row and column come on top.
+    odd = rows * columns - 4 * coarse_rows * coarse_columns
+    cells = coarse_rows * coarse_columns + -(-odd // 4)
+    return FeatureCapacity(padded_cells(cells), coarse_columns)
 
 
 def image_capacity(image: ImageFile, *, config: Config) -> FeatureCapacity:
     """The capacity for the features of an image; it is known before the image is decoded."""
-    return feature_capacity(working_size(image.size, config.max_size, config.enlarge))
+    size = working_size(image.size, config.max_size, config.enlarge)
+    return feature_capacity(size, fine_stride=config.fine_stride)
 
 
 def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:

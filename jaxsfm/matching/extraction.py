@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsfm.config import Config
-from jaxsfm.core.features import Extraction
+from jaxsfm.core.features import Extraction, Walk
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.io.features import ImageFeatures, check_memory, feature_capacity, padded_size
@@ -39,7 +39,7 @@ def _start(
 
     The features are on the devices, with leading axes for the devices and their batches.
     """
-    padded, num_coarse = _shapes(working[0].rgb.shape[1::-1])
+    padded, num_coarse = _shapes(working[0].rgb.shape[1::-1], config)
     count = batch_size * mesh.size
     images = np.zeros((count, *padded, 3), np.uint8)
     sizes = np.zeros((count, 2), np.int32)
@@ -67,16 +67,17 @@ def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Ex
         preprocessing=weights.preprocessing,
         num_coarse=num_coarse,
         backbone=config.backbone,
-        relocalized=config.keypoints != "grid",
+        layers=config.layers,
+        walk=Walk(0 if config.keypoints == "grid" else config.walked_levels, config.children),
         octaves=config.octaves,
         centred=config.centred,
         bfloat16=config.convolutions == "bfloat16",
     )
 
 
-def _shapes(size: tuple[int, int]) -> tuple[tuple[int, int], int]:
+def _shapes(size: tuple[int, int], config: Config) -> tuple[tuple[int, int], int]:
     """Padded size (width, height) and coarse capacity of a working image, which fix the program."""
-    return padded_size(size), feature_capacity(size).num_coarse
+    return padded_size(size), feature_capacity(size, fine_stride=config.fine_stride).num_coarse
 
 
 def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
@@ -108,7 +109,7 @@ def extract_images(
     weights = dataclasses.replace(weights, params=params)
 
     def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
-        return _shapes(working_size(image.size, config.max_size, config.enlarge))
+        return _shapes(working_size(image.size, config.max_size, config.enlarge), config)
 
     def batches() -> Iterator[_Batch]:
         for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):

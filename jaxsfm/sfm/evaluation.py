@@ -35,6 +35,14 @@ class PoseError:
     rotation_deg: float
 
 
+def pose_error(pose: CameraPose, truth: CameraPose) -> PoseError:
+    """How far a pose is from its reference, in the same frame."""
+    return PoseError(
+        position=float(np.linalg.norm(pose.centre - truth.centre)),
+        rotation_deg=float(rotation_angle_deg(pose.rotation, truth.rotation)),
+    )
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """Errors of the registered images that have a reference pose."""
@@ -126,6 +134,11 @@ class Similarity(NamedTuple):
     translation: np.ndarray
     """float64 (3,)."""
 
+    def moved(self, pose: CameraPose) -> CameraPose:
+        """The pose after the map was applied to the world."""
+        centre = self.scale * self.rotation @ pose.centre + self.translation
+        return CameraPose(pose.rotation @ self.rotation.T, centre)
+
 
 def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
     """The similarity that takes `source` to `target` with the least squared error.
@@ -214,14 +227,6 @@ def evaluate(
     names, chosen, sim = common_alignment(model, reference, align_on=align_on)
     errors = {}
     for name, other in sorted(names.items()):
-        ours, truth = model[name], reference[other]
-        moved = CameraPose(
-            ours.rotation @ sim.rotation.T,
-            sim.scale * sim.rotation @ ours.centre + sim.translation,
-        )
-        errors[name] = PoseError(
-            position=float(np.linalg.norm(moved.centre - truth.centre)),
-            rotation_deg=float(rotation_angle_deg(moved.rotation, truth.rotation)),
-        )
+        errors[name] = pose_error(sim.moved(model[name]), reference[other])
     missing = sorted(set(reference) - set(names.values()))
     return Evaluation(images=errors, missing=missing, aligned_on=len(chosen))

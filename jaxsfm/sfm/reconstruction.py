@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.database import drop_pairs, read_images, write_database
-from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
+from jaxsfm.colmap.intrinsics import KnownCameras, check_fits
 from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
 from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.config import Config, Refinement
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
@@ -63,7 +64,7 @@ def reconstruct(
     database: Path,
     *,
     config: Config,
-    intrinsics: Intrinsics | None = None,
+    intrinsics: KnownCameras | None = None,
     options: MapOptions | None = None,
     kept: StageCache | None = None,
     on_image: Callable[[], None] = lambda: None,
@@ -79,7 +80,7 @@ def reconstruct(
       database: where to write the COLMAP database; a file there is replaced.
       config: the one that the matches were made with. Its `view_graph` and `refinement` switch
         those stages on.
-      intrinsics: one known camera for all images. None takes one camera per photo.
+      intrinsics: the known cameras. None takes one camera per photo.
       options: of the mapper. By default it is incremental, and refines the intrinsics unless they
         are given.
       kept: stages of earlier runs, which are used again where they hold. New ones are kept there.
@@ -117,7 +118,7 @@ def reconstruct(
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         stages, key = kept or (WorkFolder(Path(scratch), {}), "")
         by_image = [[image.name, image.sha256, image.size] for image in images]
-        camera = intrinsics and dataclasses.asdict(intrinsics)
+        camera = _plain(intrinsics)
         verifying = [options.seed, options.threads, options.scale, config.view_graph]
         key = digest(key, by_image, camera, verifying, package_versions())
         checked = stages.stage("verified", key, verify_matches)
@@ -138,6 +139,13 @@ def reconstruct(
             attempts=stage_files.read_attempts(mapped),
             refinement=refinement,
         )
+
+
+def _plain(intrinsics: KnownCameras | None) -> Json:
+    """The known cameras as part of a key."""
+    if isinstance(intrinsics, Mapping):
+        return {name: dataclasses.asdict(each) for name, each in intrinsics.items()}
+    return intrinsics and dataclasses.asdict(intrinsics)
 
 
 def _verified(database: Path, options: MapOptions, view_graph: bool) -> VerificationFigures:

@@ -13,3 +13,23 @@ def strecha(scene, tmp_path_factory):
     shutil.copy(scene / "K.txt", folder / "room" / "images" / "K.txt")
     shutil.copytree(scene / "reference", folder / "room" / "gt_dense_cameras")
     return folder
+
+
+@pytest.fixture(scope="session")
+def simple(tmp_path_factory):
+    """Four day views and a night view of the room, rendered."""
+    from jaxsfm.bench.synthetic import camera_matrix, write_scene
+
+    source = tmp_path_factory.mktemp("rendered")
+    write_scene(source, num_views=5, size=(320, 240))
+    folder = tmp_path_factory.mktemp("simple") / "room"
+    for part in ("day", "night"):
+        (folder / part).mkdir(parents=True)
+    for path in (source / "images").iterdir():
+        shutil.copy(path, folder / ("night" if "night" in path.name else "day") / path.name)
+    shutil.copytree(source / "reference", folder / "reference")
+    k = camera_matrix((320, 240))
+    (folder / "intrinsics.txt").write_text(
+        f"PINHOLE:{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}\n"
+    )
+    return folder.parent

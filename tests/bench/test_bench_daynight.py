@@ -7,37 +7,18 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxsfm.bench import scenes
 from jaxsfm.bench.curves import cumulative
-from jaxsfm.bench.daynight import LIMITS, PUBLISHED, judge, summary, table_lines
+from jaxsfm.bench.daynight import PUBLISHED, table_lines
 from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
+from jaxsfm.bench.night_protocol import LIMITS, judge, summary
 from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Subset
 from jaxsfm.bench.subset_models import SubsetModel, dense_models, rootsift_models
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose, read_poses
-from jaxsfm.errors import UserError
-
-
-@pytest.fixture(scope="module")
-def simple(tmp_path_factory):
-    """Four day views and a night view of the room, rendered."""
-    from jaxsfm.bench.synthetic import camera_matrix, write_scene
-
-    source = tmp_path_factory.mktemp("rendered")
-    write_scene(source, num_views=5, size=(320, 240))
-    folder = tmp_path_factory.mktemp("simple") / "room"
-    for part in ("day", "night"):
-        (folder / part).mkdir(parents=True)
-    for path in (source / "images").iterdir():
-        shutil.copy(path, folder / ("night" if "night" in path.name else "day") / path.name)
-    shutil.copytree(source / "reference", folder / "reference")
-    k = camera_matrix((320, 240))
-    (folder / "intrinsics.txt").write_text(
-        f"PINHOLE:{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}\n"
-    )
-    return folder.parent
 
 
 def test_every_image_of_a_strecha_set_is_the_night_once(strecha, tmp_path):
@@ -133,40 +114,6 @@ def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monke
             assert matches is None or 0.5 * matches.number < matches.correct <= matches.number
 
 
-def test_aachens_layout(simple, tmp_path):
-    """Each night photo with the day photos of its lines; other lines do not count."""
-    day = sorted(path.name for path in (simple / "room" / "day").iterdir())
-    night = next((simple / "room" / "night").iterdir()).name
-    photos = tmp_path / "images_upright"
-    shutil.copytree(simple / "room" / "day", photos / "db")
-    (photos / "query" / "night").mkdir(parents=True)
-    shutil.copy(simple / "room" / "night" / night, photos / "query" / "night" / night)
-    lines = [f"db/{day[0]} query/night/{night}", f"query/night/{night} db/{day[2]}"]
-    (tmp_path / scenes.AACHEN_PAIRS).write_text("\n".join([*lines, f"db/{day[0]} db/{day[1]}"]))
-    with pytest.raises(UserError, match="3D-models"):
-        scenes.aachen_scene(tmp_path)
-    import pycolmap
-
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            model="PINHOLE", width=320, height=240, params=[320, 320, 160, 120], camera_id=1
-        )
-    )
-    poses = read_poses(simple / "room" / "reference")
-    for k, name in enumerate(day, 1):
-        pose = poses[name]
-        image = pycolmap.Image(name=f"db/{name}", camera_id=1, image_id=k)
-        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), -pose.rotation @ pose.centre)
-        model.add_image_with_trivial_frame(image, rigid)
-    (tmp_path / "3D-models" / "aachen").mkdir(parents=True)
-    model.write_binary(str(tmp_path / "3D-models" / "aachen"))
-    made = scenes.aachen_scene(tmp_path)
-    assert made.subsets == [Subset([f"db/{day[0]}", f"db/{day[2]}"], f"query/night/{night}")]
-    assert set(made.truth) == {f"db/{day[0]}", f"db/{day[2]}"}
-    assert list(scenes.find_scenes(tmp_path, None)) == [tmp_path.name]
-
-
 def poses_on_arc(names):
     return {
         name: CameraPose(np.eye(3), np.asarray([k, 0.3 * k * k, 0.1 * k]))
@@ -177,12 +124,18 @@ def poses_on_arc(names):
 def test_the_night_camera_is_judged_after_a_similarity_from_the_day():
     names = ["a", "b", "c", "d", "n"]
     truth = poses_on_arc(names)
+    turned = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
+    truth["n"] = CameraPose(turned, truth["n"].centre)
     moved = {name: CameraPose(pose.rotation, 3 * pose.centre + 5) for name, pose in truth.items()}
     moved["n"] = CameraPose(moved["n"].rotation, moved["n"].centre + [0.6, 0, 0])
     subset = Subset(names[:4], "n")
     row = judge(SubsetModel(moved, None), subset, truth)
     assert row["registered"] and row["day_registered"] == 4
     assert row["position"] == pytest.approx(0.2) and row["rotation_deg"] < 1e-6
+    w, x, y, z, *t = row["pose"]  # from the world of the reference to the camera
+    rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+    np.testing.assert_allclose(rotation, truth["n"].rotation, atol=1e-9)
+    np.testing.assert_allclose(-rotation.T @ t, truth["n"].centre + [0.2, 0, 0], atol=1e-9)
     del moved["n"]
     assert "position" not in judge(SubsetModel(moved, None), subset, truth)
     lonely = {name: truth[name] for name in ("a", "n")}
@@ -298,6 +251,8 @@ def test_all_methods_run_on_a_scene(simple, tmp_path, capsys):
         (["--root", "{root}", "--sets", ","], "--sets"),
         (["--root", "{root}", "--sets", "hall"], "no set 'hall'"),
         (["--root", "{root}", "--severity", "-1"], "--severity"),
+        (["--root", "{root}", "--subsets", "list.txt"], "Aachen"),
+        (["--root", "{root}", "--poses", "/nowhere"], "--poses"),
         (["--root", "{root}", "--curves", "curves.svg"], "--curves"),
         (["--root", "{root}", "--methods", "orb"], "no method 'orb'"),
     ],

@@ -102,7 +102,7 @@ def test_the_table_ends_with_the_means_of_the_sets_and_the_published_ones():
         "paper-grid": {"sets": 1, "position": 2.0, "rotation_deg": 4.0},
     }
     lines = table_lines({"rows": [], "summary": {"means": got, "ratios": {}}})
-    assert lines[1].split() == ["mean", "of", "2", "sets", "paper", "2.0000", "4.0000"]
+    assert lines[1].split() == ["mean,", "sets:", "2", "paper", "2.0000", "4.0000"]
     for (name, (position, rotation)), line in zip(PUBLISHED.items(), lines[-2:], strict=True):
         assert line.startswith("published") and name in line
         assert [float(value) for value in line.split()[-2:]] == [position, rotation]

@@ -8,7 +8,7 @@ import pytest
 import tolerances
 from strategies import rng_of
 
-from jaxsfm.core.features import dense_features, stored
+from jaxsfm.core.features import Walk, dense_features, stored
 from jaxsfm.core.types import Levels
 
 SIZE = (35, 50)
@@ -28,7 +28,6 @@ def levels(rng, size=(48, 64)) -> Levels:
 
 def features(octaves, **options):
     size = jnp.asarray(SIZE, jnp.int32)
-    options = {"relocalized": True, **options}
     return dense_features(octaves, size, num_coarse=NUM_COARSE, num_fine=NUM_FINE, **options)
 
 
@@ -81,7 +80,7 @@ def test_what_differs_from_the_mean_by_a_thousandth_shows_nothing():
 def test_keypoints_walk_or_stay_at_the_centres_and_padding_has_none():
     maps = levels(rng_of(2))
     walked = np.asarray(features([maps]).keypoints)
-    centres = np.asarray(features([maps], relocalized=False).keypoints)
+    centres = np.asarray(features([maps], walk=Walk(levels=0)).keypoints)
     scores = [np.sqrt(np.asarray(s[0]))[..., None] for s in reversed(maps.scores)]
     for cell in range(24):
         row, col = divmod(cell, 6)
@@ -90,13 +89,37 @@ def test_keypoints_walk_or_stay_at_the_centres_and_padding_has_none():
     assert not walked[24:].any() and not centres[24:].any()
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+@pytest.mark.parametrize("children", [2, 4])
+def test_a_shorter_walk_ends_at_the_centre_of_a_cell(count, children):
+    maps = levels(rng_of(5))
+    found = np.asarray(features([maps], walk=Walk(count, children)).keypoints)
+    scores = [np.sqrt(np.asarray(s[0]))[..., None] for s in reversed(maps.scores)][:count]
+    stride = 8 >> count
+    for cell in range(24):
+        end = oracles.relocalize(scores, *divmod(cell, 6), children)
+        np.testing.assert_array_equal(found[cell], [(at + 0.5) * stride - 0.5 for at in end])
+
+
+def test_finer_cells_have_finer_grids():
+    maps = levels(rng_of(6))
+    wide = maps._replace(pool4=maps.pool3, pool3=jnp.ones((1, 12, 16, 4)), scores=maps.scores[:2])
+    found = dense_features(
+        [wide], jnp.asarray(SIZE, jnp.int32), num_coarse=24, num_fine=96, fine_stride=4
+    )
+    np.testing.assert_array_equal(found.fine_grid, [35 // 4, 50 // 4])
+    np.testing.assert_array_equal(found.coarse_grid, [35 // 8, 50 // 8])
+    cell = np.arange(8 * 12)
+    own = np.stack([cell % 12, cell // 12], axis=1)
+    np.testing.assert_array_equal(np.asarray(found.keypoints)[: len(own)] // 4, own)
+
+
 def test_an_image_without_a_coarse_cell_has_no_descriptors():
     found = dense_features(
         [levels(rng_of(3))],
         jnp.asarray([9, 7], jnp.int32),
         num_coarse=NUM_COARSE,
         num_fine=NUM_FINE,
-        relocalized=True,
     )
     assert not np.asarray(found.fine[0]).any() and not np.asarray(found.coarse[0]).any()
 

@@ -12,7 +12,10 @@ from jaxsfm.core.types import Status
 PAPER = {
     # What the paper and the authors' code say: section numbers are the paper's.
     "max_size": 1600,  # longer side, pixels; section 4
+    "layers": "pool4/pool3",  # conv4 and conv3 in the paper
     "keypoints": "relocalized",  # section 3.2
+    "children": 2,  # K
+    "walked_levels": None,  # all: pool2, pool1 and conv1_2
     "backbone": "vgg16",
     "threshold_px": 10.0,  # section 3.3
     "min_inliers": 26,  # the code stops at 25 and fewer
@@ -132,6 +135,9 @@ def test_a_pair_shape_needs_room_for_correspondences():
         ("min_inliers", 4, 3),
         ("confidence", 0.001, 0.0),
         ("confidence", 0.9999, 1.0),
+        ("children", 2, 0),
+        ("children", 4, 3),
+        ("walked_levels", 0, -1),
     ],
 )
 def test_a_config_refuses_what_lies_outside_its_range(field, allowed, refused):
@@ -156,6 +162,20 @@ def test_a_refinement_refuses_what_lies_outside_its_range(field, allowed, refuse
     Refinement(**{field: allowed})
     with pytest.raises(ValueError, match=f"Refinement.{field} must .*got {refused}"):
         Refinement(**{field: refused})
+
+
+def test_other_layers_are_known_ones_of_a_vgg_without_learned_keypoints():
+    assert {Config(layers=name).fine_stride for name in ("conv4_3/conv3_3", "pool5/conv5_3")} == {
+        4,
+        16,
+    }
+    for name, other in (
+        ("pool3/pool2", {}),
+        ("conv4_3/conv3_3", {"backbone": "alexnet"}),
+        ("conv4_3/conv3_3", {"keypoints": "learned"}),
+    ):
+        with pytest.raises(ValueError, match=f"layers .*got '{name}'"):
+            Config(layers=name, **other)
 
 
 def test_the_numbers_of_a_status_are_those_in_stored_files():

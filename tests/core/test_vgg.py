@@ -10,6 +10,7 @@ import pytest
 import tolerances
 
 from jaxsfm.core import blocks
+from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS
 from jaxsfm.core.types import Pyramid
 from jaxsfm.core.vgg import LAYERS, VGG16, Preprocessing, init_shapes, preprocess
 from jaxsfm.core.winograd import conv3x3
@@ -150,6 +151,26 @@ def test_both_convolutions_give_the_same_maps(weights, photo, monkeypatch):
         assert_maps_equal(ours, np.asarray(expected))
     assert len(used) == len(LAYERS)
     jax.clear_caches()
+
+
+@pytest.mark.parametrize("layers", [name for name in FINE_STRIDES if name != PAPER_LAYERS])
+def test_other_pairs_of_layers_are_maps_of_the_same_network(weights, photo, layers):
+    """A convolution's map, pooled, is the pyramid's; scores are norms of what lies below."""
+    size, stride = (57, 71), FINE_STRIDES[layers]
+    images, sizes = jnp.asarray(photo[None]), jnp.asarray([size], jnp.int32)
+    pyramid = apply(weights.params, images, sizes)
+    method = functools.partial(VGG16().apply, method="levels", layers=layers)
+    found = jax.jit(method)(weights.params, images, sizes)
+    for name, ours in zip(layers.split("/"), (found.pool4, found.pool3), strict=True):
+        pooled = getattr(pyramid, f"pool{name[4]}")
+        if name.startswith("conv"):
+            assert np.any(np.asarray(ours) < 0)
+            ours = blocks.pool(ours, sizes // 2 ** (int(name[4]) - 1))
+        assert_maps_equal(ours, np.asarray(pooled))
+    assert found.pool3.shape[1] == photo.shape[0] // stride
+    assert len(found.scores) == stride.bit_length() - 1
+    for score, below in zip(found.scores, pyramid, strict=False):
+        assert_maps_equal(score, np.square(np.asarray(below)).sum(axis=-1))
 
 
 def test_the_last_convolution_is_what_pool5_pools(weights, photo):

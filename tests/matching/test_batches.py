@@ -16,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsfm
-from jaxsfm.config import preset
+from jaxsfm.config import Config, preset
 from jaxsfm.core.features import stored
+from jaxsfm.core.layers import FINE_STRIDES
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.sharded import device_mesh
 from jaxsfm.errors import UserError
-from jaxsfm.io.features import feature_capacity
+from jaxsfm.io.features import feature_capacity, image_capacity
 from jaxsfm.io.images import ImageError, read_image
 from jaxsfm.matching import execution
 from jaxsfm.matching.device_cache import ImageCache, tile_order
@@ -148,6 +149,34 @@ def test_features_are_the_programs_rounded_once(weights, images):
         np.testing.assert_array_equal(one, other)
     assert found.dense.coarse[0].dtype == np.float16
     assert found.capacity == feature_capacity(image.size)
+
+
+@given(
+    st.tuples(st.integers(48, 5000), st.integers(48, 5000)),
+    st.sampled_from(sorted(FINE_STRIDES.values())),
+)
+def test_a_capacity_holds_the_cells_of_its_image(size, stride):
+    capacity = feature_capacity(size, fine_stride=stride)
+    fine = [side // stride for side in size]
+    coarse = [side // (2 * stride) for side in size]
+    assert capacity.num_coarse >= coarse[0] * coarse[1] and capacity.columns == coarse[0]
+    assert 4 * capacity.num_coarse >= fine[0] * fine[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layers", ["conv4_3/conv3_3", "pool5/conv5_3"])
+def test_other_layers_match_with_cells_of_their_own_size(weights, images, layers):
+    config = Config(layers=layers)
+    found = [image_features(weights, image, config=config) for image in images[:2]]
+    for features in found:
+        assert features.capacity == image_capacity(features.image, config=config)
+        width, height = (side // config.fine_stride for side in features.image.size)
+        xy = features.dense.keypoints[: width * height].reshape(height, width, 2)
+        own = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
+        np.testing.assert_array_equal(xy // config.fine_stride, own)
+    result = match_features(*found, config=config)
+    least = {"conv4_3/conv3_3": 300, "pool5/conv5_3": 26}
+    assert result.num_inliers >= least[layers]
 
 
 @pytest.mark.slow
