@@ -25,6 +25,7 @@ from jaxsfm.core import (
     lanes,
     losses,
     matching,
+    naive,
     night,
     numerics,
     octaves,
@@ -165,6 +166,11 @@ def _walk_maps() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     return [_floats(k, ROWS * 2**k, COLS * 2**k) ** 2 for k in (1, 2, 3)], row, col
 
 
+def _pyramid(seed: int) -> list[np.ndarray]:
+    """Three maps below the fine cells."""
+    return [_floats(seed + k, 2 * ROWS << k, 2 * COLS << k, 4) for k in (1, 2, 3)]
+
+
 def _walks(seed: int) -> relocalize.WalkProbabilities:
     p = np.abs(_floats(seed, 5, 4, 4))
     start = rng_of(seed).integers(0, 900, (5, 2)).astype(np.int32)
@@ -303,6 +309,7 @@ def calls() -> dict[str, Call]:
         rng_of(0).integers(-1, 4 * ROWS * COLS, (ROWS * COLS, c2f.SIDE**2)), np.int32
     )
     cells = rng_of(1).integers(0, 40, (60, 2)).astype(np.int32)
+    fine_cells = rng_of(3).integers(0, 2 * ROWS, (60, 4)).astype(np.int32)
     squared = _floats(2, 5, 16, 16) ** 2
     problem = ransac._Problem(few.xy0 / 100, few.xy1 / 100, n(100), reach, reach)
     image, image_size, at, patch = _aligned(0)
@@ -352,7 +359,7 @@ def calls() -> dict[str, Call]:
         ),
         "features.dense_features": Call(
             lambda levels, size: dense.dense_features(
-                [levels], size, num_coarse=64, num_fine=256, relocalized=True, centred=True
+                [levels], size, num_coarse=64, num_fine=256, centred=True
             ),
             (_levels(), SIZE),
             (2,),
@@ -360,7 +367,7 @@ def calls() -> dict[str, Call]:
         ),
         "features.dense_features[grid]": Call(
             lambda levels, size: dense.dense_features(
-                [levels], size, num_coarse=64, num_fine=256, relocalized=False
+                [levels], size, num_coarse=64, num_fine=256, walk=dense.Walk(levels=0)
             ),
             (_levels(), SIZE),
             (2,),
@@ -444,6 +451,15 @@ def calls() -> dict[str, Call]:
         "octaves.join_octaves": Call(octaves.join_octaves, (_dense(),), (2,)),
         "pair.pair_key": Call(
             lambda a, b: jax.random.key_data(pair.pair_key(KEY, a, b)), (np.uint32(5), np.uint32(3))
+        ),
+        "naive.descend": Call(
+            naive.descend, (_pyramid(0), _pyramid(5), fine_cells[:, :2], fine_cells[:, 2:])
+        ),
+        "naive.match_naively": Call(
+            _bind(naive.match_naively, shape=_pair_shape("paper")),
+            (KEY, (f0, f1), (_pyramid(0), _pyramid(5)), THRESHOLDS),
+            (2,),
+            slow=True,
         ),
         "pair.match_pair[default]": Call(
             _bind(pair.match_pair, shape=_pair_shape("default")),

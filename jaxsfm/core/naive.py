@@ -80,11 +80,13 @@ def match_naively(
         ),
     )
     xy0, xy1 = (end[:, ::-1].astype(jnp.float32) for end in ends)
-    planes = peel_planes(key, xy0, xy1, jnp.arange(len(fine)) < found, thresholds, shape=shape)
+    valid = jnp.arange(len(fine), dtype=jnp.int32) < found
+    planes = peel_planes(key, xy0, xy1, valid, thresholds, shape=shape)
     equal = jnp.zeros((len(fine),), jnp.float32)
     kept = c2f.one_to_one(fine, planes.plane >= 0, equal, num_cells=num_fine)
     pixels = [end[:, 0] * own[-1].shape[1] + end[:, 1] for end, own in zip(ends, maps, strict=True)]
-    few = jnp.where(found < thresholds.min_inliers, Status.TOO_FEW_MATCHES, Status.NO_PLANE)
+    floor = jnp.asarray(thresholds.min_inliers, jnp.int32)
+    few = jnp.where(found < floor, Status.TOO_FEW_MATCHES, Status.NO_PLANE)
     return PairMatches(
         cells=jnp.stack(pixels, axis=1),
         plane=jnp.where(kept, planes.plane, -1),

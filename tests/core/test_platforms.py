@@ -116,7 +116,7 @@ def planes():
 PROGRAMS = {
     "extract default": lambda: extraction(settings_of("default")),
     "extract paper": lambda: extraction(settings_of("paper")),
-    "extract paper-grid": lambda: extraction(settings_of("paper", relocalized=False)),
+    "extract paper-grid": lambda: extraction(settings_of("paper", walk=features.Walk(levels=0))),
     "extract paper-learned": lambda: extraction(settings_of("paper"), learned=True),
     "extract bfloat16": lambda: extraction(settings_of("paper", bfloat16=True)),
     "extract vgg19": lambda: extraction(settings_of("paper", backbone="vgg19")),

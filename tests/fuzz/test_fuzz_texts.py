@@ -4,6 +4,8 @@ import numpy as np
 from fuzz_children import run_cases
 from mutations import damaged_text, outcome
 
+from jaxsfm.bench.aachen import PAIRS as AACHEN_PAIRS
+from jaxsfm.bench.aachen import read_cameras, read_nvm, read_subsets
 from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import read_poses
@@ -20,6 +22,16 @@ MODELS = (
 )
 SIZE = (640, 480)
 K = "\n".join(" ".join(f"{v}" for v in row) for row in camera_matrix(SIZE))
+CAMERAS = (
+    "db/1.jpg SIMPLE_RADIAL 1600 1200 1469.2 800 600 -0.03\n"
+    "query/night/n.jpg PINHOLE 640 480 600 610.5 320 240\n"
+)
+NIGHTS = "db/1.jpg query/night/n.jpg\ndb/2.jpg query/night/n.jpg\ndb/1.jpg db/2.jpg\n"
+SUBSETS = "# subsets\nquery/night/n.jpg db/1.jpg db/2.jpg\n"
+NVM = (
+    "NVM_V3\n\n2\ndb/1.jpg 600 0.8 0.6 0 0 1.5 -2 0.25 0 0\n"
+    "db/2.jpg 600 1 0 0 0 2.5 -2 0.25 -0.1 0\n\n0\n"
+)
 TURN = "0.8 0.6 0\n-0.6 0.8 0\n0 0 1"
 CAMERA = f"{K}\n0 0 0\n{TURN}\n1.5 -2 0.25\n640 480\n"
 
@@ -70,9 +82,33 @@ def camera_file(rng, folder) -> str:
     return how
 
 
+def aachen_file(rng, folder) -> str:
+    """A list of cameras, of pairs or of subsets, or a model in NVM format."""
+    kind = rng.integers(4)
+    name = ("a_intrinsics.txt", AACHEN_PAIRS, "subsets.txt", "a.nvm")[kind]
+    path = folder / name
+    path.write_bytes(damaged_text((CAMERAS, NIGHTS, SUBSETS, NVM)[kind], rng))
+    read = (
+        lambda: read_cameras(folder),
+        lambda: read_subsets(folder, None),
+        lambda: read_subsets(folder, path),
+        lambda: read_nvm(path),
+    )[kind]
+    how, found = outcome(read, path)
+    path.unlink()  # it must not be in the next case
+    if how == "read" and kind == 3:
+        for pose in found.values():
+            assert np.isfinite(pose.centre).all()
+            np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-6)
+    elif how == "read" and kind:
+        assert found and all(subset.day for subset in found)
+    return how
+
+
 def text(rng, folder) -> str:
-    """One of the four kinds."""
-    return [pairs, intrinsics_file, intrinsics_option, camera_file][rng.integers(4)](rng, folder)
+    """One of the five kinds."""
+    kinds = [pairs, intrinsics_file, intrinsics_option, camera_file, aachen_file]
+    return kinds[rng.integers(len(kinds))](rng, folder)
 
 
 def test_a_damaged_text_is_read_or_refused_by_name(tmp_path, share, least):
