@@ -12,14 +12,13 @@ computes the lanes in turn (`in_turn_on_cpus`).
 
 import functools
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -35,7 +34,7 @@ def _any_lane(lanes: int, batched: list[bool], wanted: Array) -> tuple[Array, bo
     return anywhere(jnp.any(wanted, axis=0)), False
 
 
-def in_turn_on_cpus(function: Callable[P, T]) -> Callable[P, T]:
+def in_turn_on_cpus(function: Callable[..., T]) -> Callable[..., T]:
     """`function`, whose vmapped lanes follow each other on CPUs and run together elsewhere.
 
     Without `vmap` it is `function`. On CPUs a lane of a batch is computed by the program of a
