@@ -129,8 +129,8 @@ def match_pairs(
     Args:
       batch_size: number of pairs that are computed together (vmapped); batches follow each other.
         With 1 the results equal those of `match_pair` bit for bit. With more, products are vmapped
-        and may round differently in the last place. On a CPU 1 is best, because a vmapped
-        `while_loop` runs every pair as long as the slowest one.
+        and may round differently in the last place. On a CPU 1 is best, because one pair fills it,
+        and vmapped loops over windows run every pair as long as the slowest one.
     """
 
     def one(item):

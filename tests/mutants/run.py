@@ -56,7 +56,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/night": ("tests/core/test_night_model.py", "tests/core/test_views.py"),
     "core/numerics": (NUMERICS,),
     "core/octaves": ("tests/core/test_octaves.py",),
-    "core/pair_shape": ("tests/core/test_presets.py",),
+    "core/pair_shape": ("tests/core/test_presets.py", "tests/core/test_platforms.py"),
     "core/ransac": ("tests/core/test_ransac.py", "tests/core/test_planes.py"),
     "core/sharded": (BATCHES,),
     "core/types": ("tests/core/test_presets.py", PAIR),

@@ -14,7 +14,7 @@ os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP prints every step other
 import tyro
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.speed import extraction, homographies, machine, matching, scaling
+from jaxsfm.bench.speed import batches, extraction, homographies, machine, matching, scaling
 from jaxsfm.bench.speed.timing import Metric
 
 DATA = Path(os.environ.get("JAXSFM_DATA", "../shared/data"))
@@ -29,6 +29,7 @@ def groups(data: Path) -> dict[str, Callable[[], Iterator[Metric]]]:
         "mutual": matching.measure_mutual,
         "pairs": lambda: matching.measure_pairs(data),
         "homographies": homographies.measure,
+        "batches": batches.measure,
         "scaling": lambda: scaling.measure_pairs(data),
         "pixels": lambda: scaling.measure_pixels(data),
         "stage": lambda: scaling.measure_stage(data),
@@ -60,8 +61,8 @@ def main(
     """Measure speed, and accuracy with it.
 
     Args:
-      only: groups: machine, extraction, mutual, pairs, homographies, scaling, pixels, stage; all by
-        default.
+      only: groups: machine, extraction, mutual, pairs, homographies, batches, scaling, pixels,
+        stage; all by default.
       gate: exit with 1 if a ratio is worse than the baseline by more than its tolerance.
       update: write a new baseline.
       data: folder of the data sets; groups that need a missing set are skipped.
