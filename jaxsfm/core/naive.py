@@ -43,8 +43,8 @@ def descend(
             for level, children in ((level0, children0), (level1, children1))
         )
         similarity = jnp.einsum("kic,kjc->kij", a, b, precision=HIGHEST)
-        best = jnp.argmax(similarity.reshape(len(similarity), -1), axis=1)
-        pick = jnp.arange(len(best))
+        best = jnp.argmax(similarity.reshape(len(similarity), -1), axis=1).astype(jnp.int32)
+        pick = jnp.arange(len(best), dtype=jnp.int32)
         cells0, cells1 = children0[pick, best // 4], children1[pick, best % 4]
     return cells0, cells1
 
@@ -80,7 +80,8 @@ def match_naively(
         ),
     )
     xy0, xy1 = (end[:, ::-1].astype(jnp.float32) for end in ends)
-    planes = peel_planes(key, xy0, xy1, jnp.arange(len(fine)) < found, thresholds, shape=shape)
+    live = jnp.arange(len(fine), dtype=jnp.int32) < found
+    planes = peel_planes(key, xy0, xy1, live, thresholds, shape=shape)
     equal = jnp.zeros((len(fine),), jnp.float32)
     kept = c2f.one_to_one(fine, planes.plane >= 0, equal, num_cells=num_fine)
     pixels = [end[:, 0] * own[-1].shape[1] + end[:, 1] for end, own in zip(ends, maps, strict=True)]
