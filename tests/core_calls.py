@@ -437,13 +437,6 @@ def calls() -> dict[str, Call]:
         "matching.mutual": Call(matching.mutual, (cells[:40, 0], _floats(0, 40), cells[:40, 1])),
         "matching.scan_mutual": Call(_score_of_rows, (_rows(0), _rows(1))),
         "matching.mutual_nn": Call(_bind(matching.mutual_nn, tile=16), (_rows(0), _rows(1))),
-        "naive.descend": Call(naive.descend, (maps3, maps3, cells[:, :2] % 6, cells[:, :2] % 5)),
-        "naive.match_naively": Call(
-            _bind(naive.match_naively, shape=_pair_shape("paper")),
-            (KEY, (f0, f1), (maps_of_photo, maps_of_photo), THRESHOLDS),
-            (2,),
-            traced=True,
-        ),
         "night.blur": Call(night.blur, (photo, one)),
         "night.night": Call(night.night, (KEY, photo, np.float32(1.5)), slow=True),
         "numerics.at_least_float32": Call(numerics.at_least_float32, (xy0,)),
