@@ -320,8 +320,6 @@ def calls() -> dict[str, Call]:
     photo = _photo(64, 64).astype(np.float32)
     one = np.float32(1)
     soft = {"temperature": 0.7}
-    maps3 = [_floats(k, 12 << k, 16 << k, 4) for k in range(3)]
-    maps_of_photo = [_floats(k, 24 << k, 32 << k, 4) for k in range(3)]
     rgb, rgb_size = _photo(64, 64), np.asarray([60, 50], np.int32)
     table = {
         "align.square_patch": Call(lambda: align.square_patch(2), (), (0,)),
