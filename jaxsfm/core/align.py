@@ -43,6 +43,9 @@ class Templates(NamedTuple):
     """Derivative of `values` with respect to the shift of the patch, per reference pixel. What a
     change of gain or offset would explain has been taken out."""
     hessian: Float[Array, "n 2 2"]
+    rest: Float[Array, "n 2"]
+    """From the pixel that the patch was sampled around to the keypoint, pixels of the reference
+    view."""
     contrast: Float[Array, " n"]
     """Weighted standard deviation before normalisation, units of the map."""
     inside: Bool[Array, " n"]
@@ -151,11 +154,17 @@ def make_templates(
     xy: Float[Array, "n 2"],
     patch: Patch,
 ) -> Templates:
-    """Templates around keypoints of a reference view."""
+    """Templates around keypoints of a reference view.
+
+    A patch is sampled around the pixel nearest to its keypoint, and `align` adds the rest of the
+    way. Between pixels, the noise of an interpolated value is correlated with that of its gradient.
+    With noise of an eighth of the contrast this moved keypoints by as much as the noise itself.
+    """
     dx, dy = 0.5 * jnp.eye(2, dtype=xy.dtype)
 
     def one(centre):
-        at = centre + patch.offsets
+        nearest = jnp.round(centre)
+        at = nearest + patch.offsets
         values, inside = sample(image, size, at)
         gx = sample(image, size, at + dx)[0] - sample(image, size, at - dx)[0]
         gy = sample(image, size, at + dy)[0] - sample(image, size, at - dy)[0]
@@ -167,7 +176,7 @@ def make_templates(
         along = jnp.einsum("q,qc,qck->k", patch.weights, values, g, precision=HIGHEST)
         g = g - values[..., None] * along
         hessian = jnp.einsum("q,qck,qcl->kl", patch.weights, g, g, precision=HIGHEST)
-        return Templates(values, g, hessian, contrast, inside.all())
+        return Templates(values, g, hessian, centre - nearest, contrast, inside.all())
 
     return jax.vmap(one)(xy)
 
@@ -218,7 +227,8 @@ def align(
             d = d * jnp.minimum(1.0, MAX_STEP / length)
             return at + jnp.matmul(a, d, precision=HIGHEST), length
 
-        at, lengths = lax.scan(step, start, None, length=iterations)
+        rest = jnp.matmul(a, t.rest, precision=HIGHEST)
+        at, lengths = lax.scan(step, start - rest, None, length=iterations)
         _, inside, contrast, values = residual(at)
         score = jnp.einsum("q,qc,qc->", patch.weights, values, t.values, precision=HIGHEST)
         # The mean square difference of two patches of variance 1 is 2 (1 - score). Divided by the
@@ -233,6 +243,6 @@ def align(
         )
         stretch = jnp.sqrt(0.5 * jnp.sum(a * a))
         ok = inside & t.inside & (lengths[-1] < TOLERANCE) & (contrast > 0) & (t.contrast > 0)
-        return Aligned(at, score, sigma * stretch, ok)
+        return Aligned(at + rest, score, sigma * stretch, ok)
 
     return jax.vmap(one)(templates, xy, affine)
