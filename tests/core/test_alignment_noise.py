@@ -8,6 +8,7 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from strategies import rng_of
 
 from jaxsfm.core.align import align, make_templates, square_patch
@@ -77,3 +78,14 @@ def test_noise_draws_keypoints_between_pixels_to_neither_side():
     bias = np.linalg.norm(errors.mean(axis=2), axis=-1)
     spread = np.linalg.norm(errors.std(axis=2), axis=-1)
     assert (np.median(bias / spread, axis=0) < 0.35).all()
+
+
+@pytest.mark.parametrize("name", AFFINE)
+def test_the_stated_deviation_is_the_real_one_at_any_fraction_of_a_pixel(name):
+    """Along the worst direction of each texture, which is the same at all places."""
+    errors, sigma = outcome(name)
+    every = errors.reshape(TEXTURES, -1, 2)
+    worst = np.linalg.eigh(np.einsum("tni,tnj->tij", every, every))[1][:, :, 1]
+    real = (np.einsum("tpsk,tk->tps", errors, worst) ** 2).mean(axis=2)
+    ratio = np.sqrt((real / (sigma**2).mean(axis=2)).mean(axis=0))
+    assert (ratio > 1 / 1.2).all() and (ratio < 1.2).all(), ratio
