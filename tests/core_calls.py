@@ -22,6 +22,7 @@ from jaxsfm.core import (
     blocks,
     consensus,
     grid,
+    interpolate,
     lanes,
     losses,
     matching,
@@ -323,7 +324,7 @@ def calls() -> dict[str, Call]:
     rgb, rgb_size = _photo(64, 64), np.asarray([60, 50], np.int32)
     table = {
         "align.square_patch": Call(lambda: align.square_patch(2), (), (0,)),
-        "align.sample": Call(align.sample, (image, image_size, at)),
+        "interpolate.sample": Call(interpolate.sample, (image, image_size, at)),
         "align.make_templates": Call(align.make_templates, (image, image_size, at, patch)),
         "align.align": Call(
             align.align, (image, image_size, _templates(), at, affine, patch), (0, 2), (0,)
@@ -406,6 +407,9 @@ def calls() -> dict[str, Call]:
         "homography.transfer_inliers": Call(hg.transfer_inliers, (hs, xy0, xy1, reach)),
         "homography.transfer_error": Call(hg.transfer_error, (hs, xy0, xy1)),
         "homography.inliers": Call(_bind(hg.inliers, two_way=True), (hs, xy0, xy1, reach, reach)),
+        "interpolate.cubic": Call(interpolate.cubic, (reach,)),
+        "interpolate.noise_kept": Call(interpolate.noise_kept, (xy0, np.abs(xy0[:, 0]))),
+        "interpolate.noise_summed": Call(interpolate.noise_summed, (reach, one)),
         "lanes.anywhere": Call(jax.vmap(lanes.anywhere), (few.valid,)),
         "lanes.in_turn_on_cpus": Call(
             lambda x: jax.vmap(lanes.in_turn_on_cpus(numerics.unit))(x), (x,)

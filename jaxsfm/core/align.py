@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsfm.core.interpolate import noise_kept, noise_summed, sample
 from jaxsfm.core.numerics import HIGHEST
 
 
@@ -32,6 +33,8 @@ class Patch(NamedTuple):
     """(x, y), pixels of the reference view."""
     weights: Float[Array, " q"]
     """Sum 1."""
+    area: Float[Array, ""]
+    """Area that a sample stands for, square pixels of the reference view."""
 
 
 class Templates(NamedTuple):
@@ -43,6 +46,12 @@ class Templates(NamedTuple):
     """Derivative of `values` with respect to the shift of the patch, per reference pixel. What a
     change of gain or offset would explain has been taken out."""
     hessian: Float[Array, "n 2 2"]
+    """Mean product of the derivatives."""
+    covariance: Float[Array, "n 2 2"]
+    """Covariance of the shift, if the values of the patch have independent noise of variance 1."""
+    rest: Float[Array, "n 2"]
+    """From the pixel that the patch was sampled around to the keypoint, pixels of the reference
+    view."""
     contrast: Float[Array, " n"]
     """Weighted standard deviation before normalisation, units of the map."""
     inside: Bool[Array, " n"]
@@ -56,7 +65,8 @@ class Aligned(NamedTuple):
     score: Float[Array, " n"]
     """Zero-mean normalised cross-correlation at the end, -1 .. 1."""
     sigma: Float[Array, " n"]
-    """Standard deviation of the position along its worst direction, pixels of the other view."""
+    """Standard deviation of the position along its worst direction, pixels of the other view, if
+    the patches differ by independent noise of their pixels, of which both have the same share."""
     converged: Bool[Array, " n"]
     """The last step was short, and the patch lies inside the image and is not flat."""
 
@@ -67,6 +77,8 @@ MAX_STEP = 1.0
 """Longest step of one iteration, reference pixels."""
 TOLERANCE = 0.02
 """An alignment has converged if its last step is shorter, reference pixels."""
+LEAST_HESSIAN = 1e-9
+"""Added to the diagonal of a hessian, so that the deviation of a flat patch is large but finite."""
 
 
 def square_patch(radius: int, *, spacing: float = 1.0, sigma: float | None = None) -> Patch:
@@ -77,54 +89,7 @@ def square_patch(radius: int, *, spacing: float = 1.0, sigma: float | None = Non
     y, x = jnp.meshgrid(steps, steps, indexing="ij")
     offsets = jnp.stack([x.ravel(), y.ravel()], axis=-1)
     weights = jnp.exp(-0.5 * jnp.sum(offsets**2, -1) / (sigma or 0.5 * radius) ** 2)
-    return Patch(offsets * spacing, weights / weights.sum())
-
-
-def _cubic(f: Float[Array, "*n"]) -> list[Float[Array, "*n"]]:
-    """Weights of the pixels -1, 0, 1, 2 for a position f in [0, 1] between 0 and 1."""
-    return [
-        ((-0.5 * f + 1.0) * f - 0.5) * f,
-        (1.5 * f - 2.5) * f * f + 1.0,
-        ((-1.5 * f + 2.0) * f + 0.5) * f,
-        (0.5 * f - 0.5) * f * f,
-    ]
-
-
-def sample(
-    image: Float[Array, "h w c"], size: Int[Array, " 2"], xy: Float[Array, "*n 2"]
-) -> tuple[Float[Array, "*n c"], Bool[Array, "*n"]]:
-    """Values at (x, y) by cubic convolution, and which of the points lie inside the image.
-
-    A map may have fewer bits than the points (bfloat16). Its values are then converted to the type
-    of the points before they are interpolated, because places are computed from them.
-
-    A point outside the image gets the value of the nearest edge. Bilinear interpolation would blur
-    most half-way between pixels and draw alignments towards there: they were 0.05 px off on smooth
-    textures instead of 0.01 (tests/core/test_align.py).
-
-    Args:
-      size: valid (rows, columns) of the map.
-
-    Source: Keys, IEEE ASSP 1981, equation 15 with a = -1/2.
-    """
-    h, w, c = image.shape
-    right, bottom = size[1] - 1, size[0] - 1
-    x = jnp.clip(xy[..., 0], 0, right.astype(xy.dtype))
-    y = jnp.clip(xy[..., 1], 0, bottom.astype(xy.dtype))
-    inside = (x == xy[..., 0]) & (y == xy[..., 1])
-    x0, y0 = jnp.floor(x), jnp.floor(y)
-    columns = [jnp.clip(x0.astype(jnp.int32) + k, 0, right) for k in (-1, 0, 1, 2)]
-    rows = [jnp.clip(y0.astype(jnp.int32) + k, 0, bottom) * w for k in (-1, 0, 1, 2)]
-    flat = image.reshape(h * w, c)
-    across, down = _cubic(x - x0), _cubic(y - y0)
-    total = jnp.zeros((*xy.shape[:-1], c), xy.dtype)
-    for row, v in zip(rows, down, strict=True):
-        line = sum(
-            flat[row + col].astype(xy.dtype) * u[..., None]
-            for col, u in zip(columns, across, strict=True)
-        )
-        total = total + line * v[..., None]
-    return total, inside
+    return Patch(offsets * spacing, weights / weights.sum(), jnp.float32(spacing**2))
 
 
 def _normalise(
@@ -151,11 +116,17 @@ def make_templates(
     xy: Float[Array, "n 2"],
     patch: Patch,
 ) -> Templates:
-    """Templates around keypoints of a reference view."""
+    """Templates around keypoints of a reference view.
+
+    A patch is sampled around the pixel nearest to its keypoint, and `align` adds the rest of the
+    way. Between pixels, the noise of an interpolated value is correlated with that of its gradient.
+    With noise of an eighth of the contrast this moved keypoints by as much as the noise itself.
+    """
     dx, dy = 0.5 * jnp.eye(2, dtype=xy.dtype)
 
     def one(centre):
-        at = centre + patch.offsets
+        nearest = jnp.round(centre)
+        at = nearest + patch.offsets
         values, inside = sample(image, size, at)
         gx = sample(image, size, at + dx)[0] - sample(image, size, at - dx)[0]
         gy = sample(image, size, at + dy)[0] - sample(image, size, at - dy)[0]
@@ -167,7 +138,10 @@ def make_templates(
         along = jnp.einsum("q,qc,qck->k", patch.weights, values, g, precision=HIGHEST)
         g = g - values[..., None] * along
         hessian = jnp.einsum("q,qck,qcl->kl", patch.weights, g, g, precision=HIGHEST)
-        return Templates(values, g, hessian, contrast, inside.all())
+        noisy = jnp.einsum("q,qck,qcl->kl", patch.weights**2, g, g, precision=HIGHEST)
+        covariance = _shift_covariance(hessian, noisy, jnp.sum(patch.weights**2))
+        rest = centre - nearest
+        return Templates(values, g, hessian, covariance, rest, contrast, inside.all())
 
     return jax.vmap(one)(xy)
 
@@ -177,6 +151,31 @@ def _solve2(a: Float[Array, "2 2"], b: Float[Array, " 2"]) -> Float[Array, " 2"]
     ok = det > 1e-12
     inv = jnp.where(ok, 1.0 / jnp.where(ok, det, 1.0), 0.0)
     return inv * jnp.stack([a[1, 1] * b[0] - a[0, 1] * b[1], a[0, 0] * b[1] - a[1, 0] * b[0]])
+
+
+def _shift_covariance(
+    hessian: Float[Array, "2 2"], noisy: Float[Array, "2 2"], squares: Float[Array, ""]
+) -> Float[Array, "2 2"]:
+    """H^-1 N H^-1, the covariance of a weighted least-squares shift.
+
+    Args:
+      hessian: H = sum w g g^T, with weights w and derivatives g.
+      noisy: N = sum w^2 g g^T.
+      squares: sum w^2.
+    """
+    least = LEAST_HESSIAN * jnp.eye(2, dtype=hessian.dtype)
+    h, noisy = hessian + least, noisy + squares * least
+    # The determinant of a straight edge is smaller than its rounding.
+    smallest = LEAST_HESSIAN * (h[0, 0] + h[1, 1])
+    det = jnp.maximum(h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0], smallest)
+    inverse = jnp.stack([h[1, 1], -h[0, 1], -h[1, 0], h[0, 0]]).reshape(2, 2) / det
+    return jnp.einsum("ij,jk,kl->il", inverse, noisy, inverse, precision=HIGHEST)
+
+
+def _largest_eigenvalue(s: Float[Array, "2 2"]) -> Float[Array, ""]:
+    """Of a symmetric matrix."""
+    mean, diff = 0.5 * (s[0, 0] + s[1, 1]), 0.5 * (s[0, 0] - s[1, 1])
+    return mean + jnp.sqrt(diff**2 + s[0, 1] ** 2 + 1e-30)
 
 
 @functools.partial(jax.jit, static_argnames=("iterations",))
@@ -218,21 +217,21 @@ def align(
             d = d * jnp.minimum(1.0, MAX_STEP / length)
             return at + jnp.matmul(a, d, precision=HIGHEST), length
 
-        at, lengths = lax.scan(step, start, None, length=iterations)
+        rest = jnp.matmul(a, t.rest, precision=HIGHEST)
+        at, lengths = lax.scan(step, start - rest, None, length=iterations)
         _, inside, contrast, values = residual(at)
         score = jnp.einsum("q,qc,qc->", patch.weights, values, t.values, precision=HIGHEST)
-        # The mean square difference of two patches of variance 1 is 2 (1 - score). Divided by the
-        # effective number of samples it is the noise of a least-squares shift, whose covariance is
-        # noise / hessian.
-        h = t.hessian
-        mean, diff = 0.5 * (h[0, 0] + h[1, 1]), 0.5 * (h[0, 0] - h[1, 1])
-        smallest = mean - jnp.sqrt(diff**2 + h[0, 1] ** 2 + 1e-30)
-        effective = 1.0 / jnp.sum(patch.weights**2)
-        sigma = jnp.sqrt(
-            2 * jnp.maximum(1 - score, 1e-6) / (jnp.maximum(smallest, 1e-9) * effective)
-        )
-        stretch = jnp.sqrt(0.5 * jnp.sum(a * a))
+        # The mean square difference of two patches of variance 1 is 2 (1 - score). Interpolation
+        # has reduced the noise in it, and divided by the share that is kept it is the noise of a
+        # pixel. A keypoint is moved by the part of the noise that is as smooth as the derivatives.
+        # Interpolation does not reduce this part, and samples that share pixels have it in common.
+        kept = noise_kept(patch.offsets, patch.weights), noise_kept(at + offsets, patch.weights)
+        areas = patch.area, patch.area * jnp.abs(a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
+        pixel = 2 * jnp.maximum(1 - score, 1e-6) / (values.shape[-1] * (kept[0] + kept[1]))
+        summed = noise_summed(areas[0], kept[0]) + noise_summed(areas[1], kept[1])
+        covariance = jnp.einsum("ij,jk,lk->il", a, t.covariance, a, precision=HIGHEST)
+        sigma = jnp.sqrt(pixel * summed * _largest_eigenvalue(covariance))
         ok = inside & t.inside & (lengths[-1] < TOLERANCE) & (contrast > 0) & (t.contrast > 0)
-        return Aligned(at, score, sigma * stretch, ok)
+        return Aligned(at + rest, score, sigma, ok)
 
     return jax.vmap(one)(templates, xy, affine)

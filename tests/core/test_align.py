@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from strategies import rng_of, seeds
 from tolerances import ALIGNED_PX
 
-from jaxsfm.core.align import Templates, align, make_templates, sample, square_patch
+from jaxsfm.core.align import Templates, align, make_templates, square_patch
+from jaxsfm.core.interpolate import sample
 
 SIZE = (64, 80)
 PATCH = square_patch(7)

@@ -45,14 +45,17 @@ ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "mutants"
 EQUIVALENT = Path(__file__).parent / "equivalent.json"
 FILES = ("jaxsfm/core", "jaxsfm/sfm/refine", "jaxsfm/sfm/register", "jaxsfm/sfm/view_graph.py")
+ALIGN = ("tests/core/test_align.py", "tests/core/test_alignment_noise.py")
 NUMERICS, BACKBONES = "tests/core/test_numerics_and_grid.py", "tests/core/test_backbones.py"
 PAIR, BATCHES = "tests/core/test_pair.py", "tests/matching/test_batches.py"
 REFINE, WEAK = "tests/sfm/test_refine.py", "tests/sfm/test_weak_views.py"
 TESTS: dict[str, tuple[str, ...]] = {
     "core/alexnet": (BACKBONES,),
+    "core/align": ALIGN,
     "core/blocks": ("tests/core/test_blocks.py", "tests/core/test_vgg.py"),
     "core/features": ("tests/core/test_features.py", BACKBONES),
     "core/grid": (NUMERICS,),
+    "core/interpolate": ALIGN,
     "core/night": ("tests/core/test_night_model.py", "tests/core/test_views.py"),
     "core/numerics": (NUMERICS,),
     "core/octaves": ("tests/core/test_octaves.py",),

@@ -80,6 +80,8 @@ def _templates(
         np.zeros((n, q, 1), np.float32),
         np.zeros((n, q, 1, 2), np.float32),
         np.zeros((n, 2, 2), np.float32),
+        np.zeros((n, 2, 2), np.float32),
+        np.zeros((n, 2), np.float32),
         np.zeros(n, np.float32),
         np.zeros(n, bool),
     ]
