@@ -95,10 +95,10 @@ def image_work(width: int, height: int, config: Config) -> list[Stage]:
 
 def pair_work(width: int, height: int, config: Config, found: Found) -> list[Stage]:
     """The stages of `jaxsfm.core.pair.match_pair` for two images of this size."""
-    n = feature_capacity((width, height)).num_coarse
-    tile = min(config.pair.coarse_tile, n)
-    radius = config.pair.consensus
-    margin = 2 * radius * (config.pair.coarse_columns + 1) if radius else 0
+    n, shape = feature_capacity((width, height)).num_coarse, config.pair.for_accelerators()
+    tile = min(shape.coarse_tile, n)
+    radius = shape.consensus
+    margin = 2 * radius * (shape.coarse_columns + 1) if radius else 0
     rows, columns = -(-n // tile) * (tile + margin), n + margin  # with the neighbours of each tile
     table, entries = 4.0 * rows * columns, float(rows * columns)
     smaller = [octave_capacity(n, k) for k in range(1, config.octaves)]
@@ -118,26 +118,27 @@ def pair_work(width: int, height: int, config: Config, found: Found) -> list[Sta
     cells, channels = SIDE * SIDE, FINE * config.octaves
     gathered = 2 * cells * channels * 4.0 * found.coarse
     windows = 2.0 * cells * cells * channels * found.coarse
-    chunks = found.coarse / config.pair.fine_chunk
+    chunks = found.coarse / shape.fine_chunk
     # Rows are read, written next to each other, and read by the product.
     stages.append(Stage("windows", windows, 4.0 * cells**2 * found.coarse, 3 * gathered, chunks))
     # Nine slots per cell: built, sorted, compared, compacted.
     stages.append(Stage("correspondences", 0, 9.0 * 4 * n * 30, 9 * 4.0 * 4 * n * 12))
-    if config.pair.one_to_one == "similarity":
+    if shape.one_to_one == "similarity":
         rows = 2 * channels * 4.0 * found.tentative
         products = 2.0 * channels * found.tentative
         steps = found.tentative / 512
         stages.append(Stage("similarities", 0, products, 3 * rows, steps))
     # Every hypothesis is scored on all correspondences: later planes have fewer.
     hypotheses, k = found.hypotheses, found.tentative
-    steps = hypotheses / config.pair.hypotheses_per_step
-    chunks = steps * max(k / config.pair.score_chunk, 1)
+    # The stopping rule looks at every step; samples are drawn and scored several steps at once.
+    looks = hypotheses / shape.hypotheses_per_step
+    batches = looks / shape.steps_at_once
+    chunks = batches * max(k / shape.score_chunk, 1)
     operations = (SOLVE + SCORE * k) * hypotheses
-    stages.append(Stage("hypotheses", 0, operations, 16.0 * k * steps, steps + chunks))
+    steps = looks + batches + chunks
+    stages.append(Stage("hypotheses", 0, operations, 16.0 * k * batches, steps))
     # A plane has about three new best hypotheses, and each is refitted until nothing is gained.
-    fits = config.pair.max_planes * (
-        3 * min(config.pair.local_refits, 2) + config.pair.plane_rounds
-    )
+    fits = shape.max_planes * (3 * min(shape.local_refits, 2) + shape.plane_rounds)
     stages.append(Stage("refits", 0, REFIT * k * fits, 40.0 * k * fits, fits))
     return stages
 
