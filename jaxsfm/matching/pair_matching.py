@@ -121,11 +121,17 @@ class _Program(NamedTuple):
     shape: PairShape
 
 
-def _program(capacity0: FeatureCapacity, capacity1: FeatureCapacity, config: Config) -> _Program:
-    shape, widest = config.pair, max(capacity0.columns, capacity1.columns)
+def pair_shape(config: Config, *capacities: FeatureCapacity) -> PairShape:
+    """The settings of the pair program for images of these capacities."""
+    shape, widest = config.pair, max(capacity.columns for capacity in capacities)
     if shape.consensus and widest > shape.coarse_columns:
         shape = dataclasses.replace(shape, coarse_columns=-(-widest // 64) * 64)
-    return _Program(max(capacity0.num_coarse, capacity1.num_coarse), shape)
+    return shape
+
+
+def _program(capacity0: FeatureCapacity, capacity1: FeatureCapacity, config: Config) -> _Program:
+    num_coarse = max(capacity0.num_coarse, capacity1.num_coarse)
+    return _Program(num_coarse, pair_shape(config, capacity0, capacity1))
 
 
 class _Started(NamedTuple):

@@ -1,0 +1,79 @@
+"""Exported programs run where jaxsfm is not, and give what it gives."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from jaxsfm.config import preset
+from jaxsfm.core.features import extract
+from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.pair import match_pair
+from jaxsfm.errors import UserError
+from jaxsfm.io.features import feature_capacity, padded_size
+from jaxsfm.matching import exported
+from jaxsfm.matching.exported import PLATFORMS, export_programs
+from jaxsfm.matching.extraction import extraction_settings
+from jaxsfm.matching.pair_matching import pair_shape, thresholds
+
+SIZE = (150, 110)
+SCRIPT = """
+import sys
+from pathlib import Path
+import numpy as np
+from jax import export
+folder = Path(sys.argv[1])
+extract, match = (
+    export.deserialize((folder / name).read_bytes()) for name in ("extract", "match")
+)
+photos, size = np.load(folder / "photos.npy"), np.load(folder / "size.npy")
+features = [extract.call(photo, size) for photo in photos]
+found = match.call(np.uint32(3), *features)
+assert not [name for name in sys.modules if name.startswith("jaxsfm")]
+np.savez(folder / "found.npz", **found, keypoints=features[0]["keypoints"])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "default"])
+def test_programs_run_without_jaxsfm_and_give_what_it_gives(weights, photos, tmp_path, name):
+    pytest.importorskip("flatbuffers")
+    config = dataclasses.replace(preset(name), max_size=max(SIZE))
+    programs = export_programs(weights, SIZE, config=config)
+    for part, data in programs._asdict().items():
+        (tmp_path / part).write_bytes(data)
+        assert jax.export.deserialize(bytearray(data)).platforms == PLATFORMS
+    padded = np.zeros((2, *padded_size(SIZE), 3), np.uint8)
+    padded[0, : SIZE[1], : SIZE[0]] = photos[0][100 : 100 + SIZE[1], 100 : 100 + SIZE[0]]
+    padded[1, : SIZE[1], : SIZE[0]] = photos[0][108 : 108 + SIZE[1], 116 : 116 + SIZE[0]]
+    size = np.asarray(SIZE[::-1], np.int32)
+    np.save(tmp_path / "photos.npy", padded)
+    np.save(tmp_path / "size.npy", size)
+    subprocess.run([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True, cwd=tmp_path)
+
+    capacity = feature_capacity(SIZE)
+    settings = extraction_settings(weights, config, capacity.num_coarse)
+    features = [
+        join_octaves(extract(weights.params, photo, size, settings=settings)) for photo in padded
+    ]
+    shape = pair_shape(config, capacity)
+    expected = match_pair(jax.random.key(3), *features, thresholds(config), shape=shape)
+    with np.load(tmp_path / "found.npz") as found:
+        np.testing.assert_array_equal(found["keypoints"], features[0].keypoints)
+        matched, wanted = (
+            {tuple(cell) for cell in np.asarray(each["cells"])[np.asarray(each["plane"]) >= 0]}
+            for each in (found, expected._asdict())
+        )
+    assert len(wanted) > 30 and len(matched ^ wanted) <= 0.02 * len(wanted)
+
+
+def test_without_flatbuffers_the_extra_is_named(weights, monkeypatch):
+    def missing(*_):
+        raise ImportError("No module named 'flatbuffers'")
+
+    monkeypatch.setattr(exported, "_exported", missing)
+    with pytest.raises(UserError, match=r"pip install 'jaxsfm\[export\]'"):
+        export_programs(weights, SIZE, config=preset("paper"))
