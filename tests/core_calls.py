@@ -463,7 +463,7 @@ def calls() -> dict[str, Call]:
             _bind(naive.match_naively, shape=_pair_shape("paper")),
             (KEY, (f0, f1), (_pyramid(0), _pyramid(5)), THRESHOLDS),
             (2,),
-            slow=True,
+            traced=True,
         ),
         "pair.match_pair[default]": Call(
             _bind(pair.match_pair, shape=_pair_shape("default")),

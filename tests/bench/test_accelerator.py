@@ -108,14 +108,14 @@ def test_no_stage_is_faster_with_more_to_do_and_halves_are_never_slower():
 @pytest.mark.slow
 def test_a_small_run_measures_every_preset_and_writes_its_figures(tmp_path, capsys):
     file = tmp_path / "figures.json"
-    assert accelerator.main(size=(192, 128), presets=("default",), json=file) == 0
+    assert accelerator.main(size=(128, 128), presets=("paper",), json=file) == 0
     printed = capsys.readouterr().out
     figures = json.loads(file.read_text())
     assert [row["what"] for row in figures["rows"]] == ["images", "pairs"]
     for row in figures["rows"]:
         assert row["per_second"] > 0 and 0 < row["products"] < 2 and row["megabytes"] > 0
         assert f"| {row['preset']} | {row['what']} |" in printed
-    assert figures["found"]["default"]["tentative"] > 0
+    assert figures["found"]["paper"]["tentative"] > 0
     assert all(device.name in printed for device in DEVICES)
 
 
