@@ -6,7 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, assert_never
 
 import tyro
 
@@ -133,7 +133,11 @@ def _tables(run: Path) -> "Tables | None":
     return read_database(path, where=str(path)) if path.is_file() else None
 
 
-def _write_model(fresh: Path, model: "pycolmap.Reconstruction", to: Format) -> None:
+def _write_model(
+    fresh: Path,
+    model: "pycolmap.Reconstruction",
+    to: Literal["nvm", "ply", "bundler", "colmap", "colmap-text"],
+) -> None:
     from jaxsfm.colmap.formats.bundler import write_bundler
     from jaxsfm.colmap.formats.lens import check_no_blanks
     from jaxsfm.colmap.formats.nvm import nvm_text
@@ -146,9 +150,11 @@ def _write_model(fresh: Path, model: "pycolmap.Reconstruction", to: Format) -> N
         write_bundler(fresh, model)
     elif to == "colmap":
         model.write_binary(fresh)
-    else:
+    elif to == "colmap-text":
         check_no_blanks([image.name for image in model.images.values()], to)
         model.write_text(fresh)
+    else:
+        assert_never(to)
 
 
 def _write_hloc(folder: Path, run: Path, matches: Literal["all", "verified"]) -> None:
