@@ -156,8 +156,9 @@ class _Runs(_Sets, _Network):
         = 4 instead of 2. paper-conv4, paper-pool5: the layers conv4_3/conv3_3 or pool5/conv5_3
         instead of pool4/pool3. grid, reloc, learned:
         the preset default without refinement; keypoints are at the centres of cells (grid), at the
-        largest norms (reloc) or at the largest learned scores (learned). PRESET-IDEA: as in bench
-        wxbs, and also PRESET-no-placing.
+        largest norms (reloc) or at the largest learned scores (learned). PRESET-no-IDEA,
+        PRESET-norm and so on: as in bench wxbs. PRESET-no-placing: default or robust without the
+        separate placing of weak views.
       seed: Seed of all random choices.
       threads: Number of COLMAP's threads; -1 uses all cores.
     """
@@ -204,8 +205,8 @@ class DayNightOptions(_Runs):
 
     Attributes:
       root: Folder of the data. It has scenes (SCENE/day, SCENE/night and SCENE/reference), or
-        Strecha sets, or Aachen Day-Night. In Strecha sets, one photo after the other is turned to a
-        synthetic night.
+        Strecha sets, or Aachen Day-Night. In Strecha sets, each photo in turn is replaced by a
+        synthetic night photo.
       subsets: Aachen only: a file with the subsets, such as the 98 of the paper. Each line names a
         night photo and then its day photos, as paths below images_upright. Without it, the subsets
         are those of image_pairs_to_match.txt.
