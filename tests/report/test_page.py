@@ -264,7 +264,7 @@ def test_a_run_in_parts_says_what_parts_them_and_what_may_help(plain, tmp_path):
     change_report(out, part)
     assert main(["report", str(out)]) == 0
     body = without_scripts((out / "report.html").read_text())
-    assert "Groups of photos that trusted pairs join" in body
+    assert "Groups of photos that are joined by trusted pairs" in body
     assert "7 matches, 26 are needed" in body and HOSTILE not in body
     assert "<li><code>--some &lt;option&gt;</code>: small</li><li>far</li>" in body
     change_report(out, lambda report: report.update(models=[], no_model="nothing <fits>"))
