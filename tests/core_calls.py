@@ -54,6 +54,7 @@ from jaxsfm.core.types import (
     JoinedFeatures,
     Levels,
     OctavePart,
+    Planes,
     Thresholds,
 )
 
@@ -455,6 +456,20 @@ def calls() -> dict[str, Call]:
         "octaves.join_octaves": Call(octaves.join_octaves, (_dense(),), (2,)),
         "pair.pair_key": Call(
             lambda a, b: jax.random.key_data(pair.pair_key(KEY, a, b)), (np.uint32(5), np.uint32(3))
+        ),
+        "pair.tentative_matches": Call(
+            _bind(pair.tentative_matches, shape=_pair_shape("paper")),
+            (f0, f1, np.arange(len(f0.coarse), dtype=np.int32)),
+        ),
+        "pair.pair_matches": Call(
+            pair.pair_matches,
+            (
+                cells[:, 0],
+                cells,
+                n(50),
+                Planes(hs, n([20, 12]), n([64, 64]), cells[:, 0] % 3 - 1),
+                THRESHOLDS,
+            ),
         ),
         "naive.descend": Call(
             naive.descend, (_pyramid(0), _pyramid(5), fine_cells[:, :2], fine_cells[:, 2:])

@@ -101,13 +101,15 @@ class Programs(NamedTuple):
     """The programs of one preset on one device, ready to be called."""
 
     extract: Callable[[], object]
-    match: Callable[[], PairMatches]
+    match: Callable[[], object]
     images: int
     pairs: int
     bytes_per_image: float
     bytes_per_pair: float
     keypoints: np.ndarray
     """Of both photos, (2, cells, 2)."""
+    matches: PairMatches
+    """Of the first pair, on the host."""
     found: Found
 
 
@@ -122,9 +124,9 @@ def _programs(weights: Weights, config: Config, photos: Photos, mesh: Mesh) -> P
     images = images_at_once(execution, mesh, pixels, ENOUGH)
     pairs = pairs_at_once(execution, mesh, photos.num_coarse, ENOUGH, config=config)
     settings = extraction_settings(weights, config, photos.num_coarse)
-    some = np.arange(images) % 2
+    inputs = photos.images[np.arange(images) % 2], np.tile(photos.size, (images, 1))
     put = jax.device_put(
-        (weights.params, weights.scores(config), photos.images[some], photos.size[None][0 * some]),
+        (weights.params, weights.scores(config), *inputs),
         jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec()),
     )
     extraction = extract_batch.lower(*put, mesh=mesh, settings=settings).compile()
@@ -148,6 +150,7 @@ def _programs(weights: Weights, config: Config, photos: Photos, mesh: Mesh) -> P
         _program_bytes(extraction) / images,
         _program_bytes(matching) / pairs,
         keypoints,
+        once,
         found,
     )
 
@@ -198,12 +201,11 @@ def agreement(ours: Programs, cpu: Programs) -> tuple[float, float]:
     """Shares of the CPU's keypoints and matches that the device gives as well."""
     keypoints = float((ours.keypoints == cpu.keypoints).all(axis=2).mean())
 
-    def matches(programs: Programs) -> set[tuple[int, int]]:
-        found = jax.tree.map(lambda x: np.asarray(x[0, 0]), programs.match())
-        return {(int(a), int(b)) for a, b in found.cells[found.plane >= 0]}
-
-    expected = matches(cpu)
-    return keypoints, len(expected & matches(ours)) / max(len(expected), 1)
+    same, expected = (
+        {(int(a), int(b)) for a, b in found.cells[found.plane >= 0]}
+        for found in (ours.matches, cpu.matches)
+    )
+    return keypoints, len(expected & same) / max(len(expected), 1)
 
 
 def table_lines(rows: list[Measured], found: dict[str, Found], size: tuple[int, int]) -> list[str]:

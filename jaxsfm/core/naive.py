@@ -16,9 +16,10 @@ from jaxtyping import Array, Float, Int
 from jaxsfm.core import coarse_to_fine as c2f
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.numerics import HIGHEST, unit
+from jaxsfm.core.pair import pair_matches, tentative_matches
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.ransac import peel_planes
-from jaxsfm.core.types import JoinedFeatures, PairMatches, PRNGKey, Status, Thresholds
+from jaxsfm.core.types import JoinedFeatures, PairMatches, PRNGKey, Thresholds
 
 Maps = Sequence[Float[Array, "_h _w _c"]]
 """Feature maps of one image, coarse to fine, each twice the size of the last."""
@@ -43,8 +44,8 @@ def descend(
             for level, children in ((level0, children0), (level1, children1))
         )
         similarity = jnp.einsum("kic,kjc->kij", a, b, precision=HIGHEST)
-        best = jnp.argmax(similarity.reshape(len(similarity), -1), axis=1)
-        pick = jnp.arange(len(best))
+        best = jnp.argmax(similarity.reshape(len(similarity), -1), axis=1).astype(jnp.int32)
+        pick = jnp.arange(len(best), dtype=jnp.int32)
         cells0, cells1 = children0[pick, best // 4], children1[pick, best % 4]
     return cells0, cells1
 
@@ -67,11 +68,8 @@ def match_naively(
       pixels in the finest maps.
     """
     f0, f1 = features
-    num_fine = max(f0.fine.shape[0], f1.fine.shape[0])
     coarse = mutual_nn(f0.coarse, f1.coarse, tile=shape.coarse_tile)
-    windows = c2f.match_windows(f0, f1, coarse, chunk=shape.fine_chunk)
-    capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
-    fine, found = c2f.correspondences(c2f.candidates(windows, f0), capacity=capacity)
+    fine, found = tentative_matches(f0, f1, coarse, shape=shape)
     ends = descend(
         *maps,
         *(
@@ -83,17 +81,8 @@ def match_naively(
     valid = jnp.arange(len(fine), dtype=jnp.int32) < found
     planes = peel_planes(key, xy0, xy1, valid, thresholds, shape=shape)
     equal = jnp.zeros((len(fine),), jnp.float32)
+    num_fine = max(f0.fine.shape[0], f1.fine.shape[0])
     kept = c2f.one_to_one(fine, planes.plane >= 0, equal, num_cells=num_fine)
+    planes = planes._replace(plane=jnp.where(kept, planes.plane, -1))
     pixels = [end[:, 0] * own[-1].shape[1] + end[:, 1] for end, own in zip(ends, maps, strict=True)]
-    floor = jnp.asarray(thresholds.min_inliers, jnp.int32)
-    few = jnp.where(found < floor, Status.TOO_FEW_MATCHES, Status.NO_PLANE)
-    return PairMatches(
-        cells=jnp.stack(pixels, axis=1),
-        plane=jnp.where(kept, planes.plane, -1),
-        homographies=planes.homographies,
-        num_inliers=planes.num_inliers,
-        num_coarse=jnp.sum(coarse >= 0, dtype=jnp.int32),
-        num_tentative=found,
-        num_dropped=jnp.maximum(found - len(fine), 0),
-        status=jnp.where(planes.num_inliers[0] > 0, Status.VERIFIED, few).astype(jnp.int32),
-    )
+    return pair_matches(coarse, jnp.stack(pixels, axis=1), found, planes, thresholds)

@@ -9,7 +9,7 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from jaxsfm.core import coarse_to_fine as c2f
 from jaxsfm.core.consensus import consensus_nn
@@ -21,6 +21,7 @@ from jaxsfm.core.types import (
     DescriptorGrid,
     JoinedFeatures,
     PairMatches,
+    Planes,
     PRNGKey,
     Status,
     Thresholds,
@@ -74,8 +75,6 @@ def _match_pair(
     *,
     shape: PairShape,
 ) -> PairMatches:
-    num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
-    capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
     if shape.consensus:
         coarse = consensus_nn(
             DescriptorGrid(features0.coarse, features0.coarse_grid, features0.coarse_parts),
@@ -86,8 +85,7 @@ def _match_pair(
         )
     else:
         coarse = mutual_nn(features0.coarse, features1.coarse, tile=shape.coarse_tile)
-    windows = c2f.match_windows(features0, features1, coarse, chunk=shape.fine_chunk)
-    cells, found = c2f.correspondences(c2f.candidates(windows, features0), capacity=capacity)
+    cells, found = tentative_matches(features0, features1, coarse, shape=shape)
     valid = jnp.arange(cells.shape[0], dtype=jnp.int32) < found
     xy0, xy1 = features0.keypoints[cells[:, 0]], features1.keypoints[cells[:, 1]]
     planes = peel_planes(key, xy0, xy1, valid, thresholds, shape=shape)
@@ -95,7 +93,46 @@ def _match_pair(
         score = c2f.similarities(features0, features1, cells, found)
     else:
         score = jnp.zeros((cells.shape[0],), jnp.float32)
+    num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
     kept = c2f.one_to_one(cells, planes.plane >= 0, score, num_cells=num_fine)
+    planes = planes._replace(plane=jnp.where(kept, planes.plane, -1))
+    return pair_matches(coarse, cells, found, planes, thresholds)
+
+
+def tentative_matches(
+    features0: JoinedFeatures,
+    features1: JoinedFeatures,
+    coarse: Int[Array, " n"],
+    *,
+    shape: PairShape,
+) -> tuple[Int[Array, "k 2"], Int[Array, ""]]:
+    """Fine cells of both images that correspond inside the windows of coarse matches, in index
+    order, and how many were found, also beyond the capacity k.
+
+    Args:
+      coarse: for every coarse cell of image 0 its match in image 1, or -1.
+    """
+    num_fine = max(features0.fine.shape[0], features1.fine.shape[0])
+    capacity = max(int(shape.correspondences_per_cell * num_fine), 1)
+    windows = c2f.match_windows(features0, features1, coarse, chunk=shape.fine_chunk)
+    return c2f.correspondences(c2f.candidates(windows, features0), capacity=capacity)
+
+
+def pair_matches(
+    coarse: Int[Array, " n"],
+    cells: Int[Array, "k 2"],
+    found: Int[Array, ""],
+    planes: Planes,
+    thresholds: Thresholds,
+) -> PairMatches:
+    """What a pair ends with, and its status.
+
+    Args:
+      coarse: for every coarse cell of image 0 its match, or -1.
+      cells: the tentative matches.
+      found: how many were found, also beyond the capacity k.
+      planes: the planes, with -1 for matches that do not count.
+    """
     floor = jnp.asarray(thresholds.min_inliers, jnp.int32)
     status = jnp.where(
         planes.num_inliers[0] > 0,
@@ -104,7 +141,7 @@ def _match_pair(
     )
     return PairMatches(
         cells=cells,
-        plane=jnp.where(kept, planes.plane, -1),
+        plane=planes.plane,
         homographies=planes.homographies,
         num_inliers=planes.num_inliers,
         num_coarse=jnp.sum(coarse >= 0, dtype=jnp.int32),

@@ -66,7 +66,9 @@ def export_programs(
 
     def matches(seed, features0, features1):
         pair = [
-            JoinedFeatures(**each | {"coarse_parts": tuple(map(_part, each["coarse_parts"]))})
+            JoinedFeatures(**each)._replace(
+                coarse_parts=tuple(OctavePart(**part) for part in each["coarse_parts"])
+            )
             for each in (features0, features1)
         ]
         return match_pair(jax.random.key(seed), *pair, limits, shape=shape)._asdict()
@@ -84,10 +86,6 @@ def export_programs(
         raise UserError(
             "exporting programs needs flatbuffers: pip install 'jaxsfm[export]'"
         ) from error
-
-
-def _part(fields: dict[str, jax.Array]) -> OctavePart:
-    return OctavePart(**fields)
 
 
 def _exported(function, platforms: Sequence[str]):

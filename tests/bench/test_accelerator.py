@@ -121,11 +121,10 @@ def test_a_small_run_measures_every_preset_and_writes_its_figures(tmp_path, caps
 
 def test_agreement_counts_what_both_devices_give():
     def programs(keypoints, cells, plane):
-        matches = accelerator.PairMatches(
-            *(np.asarray(x)[None, None] for x in (cells, plane, [[0]], [1], 1, 1, 0, 0))
-        )
+        rest = (np.asarray(x) for x in (cells, plane, [0], [1], 1, 1, 0, 0))
+        matches, found = accelerator.PairMatches(*rest), Found(1, 1, 1)
         return accelerator.Programs(
-            lambda: None, lambda: matches, 1, 1, 0.0, 0.0, np.asarray(keypoints), Found(1, 1, 1)
+            lambda: None, lambda: None, 1, 1, 0.0, 0.0, np.asarray(keypoints), matches, found
         )
 
     cpu = programs([[[1.0, 2.0], [3.0, 4.0]]], [[0, 0], [1, 1], [2, 2]], [0, 0, -1])
