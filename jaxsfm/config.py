@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS, Layers
 from jaxsfm.core.pair_shape import PairShape as PairShape
+from jaxsfm.core.pair_shape import Products
 
 Keypoints = Literal["relocalized", "learned", "grid"]
 Convolutions = Literal["float32", "bfloat16"]
@@ -99,6 +100,10 @@ class Config:
     """Type of the operands of the network's convolutions. Sums are float32 and are then rounded to
     this type. bfloat16 is meant for accelerators, where no gain has been measured yet; on CPUs it
     only rounds."""
+    products: Products = "float32"
+    """Type of the descriptors whose products decide which cells match. Sums are float32. The types
+    of 16 bits are meant for accelerators, where they halve the memory of a photo; on CPUs they only
+    round."""
     keypoints: Keypoints = "relocalized"
     """Where the keypoint of a fine cell lies: at the pixel that it walks to by the largest norms
     (the rule of the paper) or by learned scores (`jaxsfm.io.relocalizer`), or at the centre of the
@@ -158,6 +163,7 @@ class Config:
         for name, words in (
             ("backbone", get_args(BackboneName)),
             ("convolutions", get_args(Convolutions)),
+            ("products", get_args(Products)),
             ("keypoints", get_args(Keypoints)),
             ("layers", get_args(Layers)),
         ):

@@ -443,6 +443,12 @@ def calls() -> dict[str, Call]:
         "night.blur": Call(night.blur, (photo, one)),
         "night.night": Call(night.night, (KEY, photo, np.float32(1.5)), slow=True),
         "numerics.at_least_float32": Call(numerics.at_least_float32, (xy0,)),
+        "numerics.descriptor_products": Call(
+            functools.partial(numerics.descriptor_products, "nc,mc->nm"),
+            (_rows(0), _rows(1)),
+            (0,),
+            (0, 1),
+        ),
         "numerics.squared_norm": Call(numerics.squared_norm, (xy0,)),
         "numerics.inverse_norm": Call(numerics.inverse_norm, (xy0,)),
         "numerics.unit": Call(numerics.unit, (xy0,)),

@@ -21,6 +21,8 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
     "learned": lambda c: dataclasses.replace(c, keypoints="learned"),
     "alexnet": lambda c: dataclasses.replace(c, backbone="alexnet"),
     "bfloat16": lambda c: dataclasses.replace(c, convolutions="bfloat16"),
+    "products-float16": lambda c: dataclasses.replace(c, products="float16"),
+    "products-bfloat16": lambda c: dataclasses.replace(c, products="bfloat16"),
     "no-placing": lambda c: dataclasses.replace(
         c, refinement=c.refinement and dataclasses.replace(c.refinement, weak_octaves=0)
     ),

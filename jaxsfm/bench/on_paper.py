@@ -7,12 +7,15 @@ step; the pairs of a batch take their steps together. Everything else (decoding,
 arrays) counts nothing, so the figures are bounds and not forecasts.
 """
 
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Mapping
+from typing import NamedTuple, get_args
 
-from jaxsfm.config import Config
+from jaxsfm.config import Config, Convolutions, preset
 from jaxsfm.core.coarse_to_fine import SIDE
 from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.io.features import feature_capacity
+from jaxsfm.matching.execution import fitting_pairs
 
 LAYERS = (
     *((3, 64, 1), (64, 64, 1)),
@@ -40,6 +43,8 @@ class Stage(NamedTuple):
     """Bytes that are read from or written to the device's memory."""
     steps: float = 0.0
     """Steps of loops that wait for each other."""
+    half: bool = False
+    """Whether the products take numbers of 16 bits; they sum in float32."""
 
 
 class Device(NamedTuple):
@@ -49,22 +54,24 @@ class Device(NamedTuple):
     float32: float
     """Operations a second in float32 products at full precision, and outside of products."""
     half: float
-    """Operations a second in products of bfloat16 with float32 sums, without sparsity."""
+    """Operations a second in products of 16-bit numbers with float32 sums, without sparsity."""
     bandwidth: float
     """Bytes a second."""
+    memory: float
+    """Bytes that JAX uses: three quarters of a GPU's memory, unless it is told otherwise."""
     step_s: float = 30e-6
     """Seconds of one step of a loop: a handful of kernels, and the condition read by the host. An
     assumption, not a maker's figure."""
 
 
 DEVICES = (
-    Device("H200", 67e12, 989e12, 4.8e12),
-    Device("A100 80 GB", 19.5e12, 312e12, 2.0e12),
-    Device("RTX 4090", 82.6e12, 165e12, 1.0e12),
+    Device("H200", 67e12, 989e12, 4.8e12, 0.75 * 141e9),
+    Device("A100 80 GB", 19.5e12, 312e12, 2.0e12, 0.75 * 80e9),
+    Device("RTX 4090", 82.6e12, 165e12, 1.0e12, 0.75 * 24e9),
     # A float32 product at full precision takes six passes of bfloat16.
-    Device("TPU v5e", 197e12 / 6, 197e12, 0.82e12),
+    Device("TPU v5e", 197e12 / 6, 197e12, 0.82e12, 16e9),
 )
-"""Dense rates from the makers' data sheets."""
+"""Dense rates and memory from the makers' data sheets."""
 
 
 class Found(NamedTuple):
@@ -83,19 +90,22 @@ def image_work(width: int, height: int, config: Config) -> list[Stage]:
 
     Keypoints and descriptors are left out: they read the network's maps once, which counts here.
     """
-    size = 2 if config.convolutions == "bfloat16" else 4
+    half = config.convolutions == "bfloat16"
+    size = 2 if half else 4
     pixels = sum(width * height / 4**k for k in range(config.octaves))
     products = sum(18 * a * b * pixels / cells for a, b, cells in LAYERS)
     maps = sum(size * (a + b) * pixels / cells for a, b, cells in LAYERS)
     # The last map of each block is read by its pooling, and that of three blocks by the norms.
     read = sum(size * b * pixels / cells for _, b, cells in (LAYERS[k] for k in (1, 3, 6, 9)))
     elementwise = sum(3 * b * pixels / cells for _, b, cells in LAYERS)
-    return [Stage("network", products, elementwise, maps + 2 * read)]
+    return [Stage("network", products, elementwise, maps + 2 * read, half=half)]
 
 
 def pair_work(width: int, height: int, config: Config, found: Found) -> list[Stage]:
     """The stages of `jaxsfm.core.pair.match_pair` for two images of this size."""
     n, shape = feature_capacity((width, height)).num_coarse, config.pair.for_accelerators()
+    half = config.products != "float32"
+    size = 2.0 if half else 4.0  # bytes of a channel
     tile = min(shape.coarse_tile, n)
     radius = shape.consensus
     margin = 2 * radius * (shape.coarse_columns + 1) if radius else 0
@@ -106,7 +116,8 @@ def pair_work(width: int, height: int, config: Config, found: Found) -> list[Sta
         products = 2.0 * COARSE * (entries + sum(smaller) * columns)
     else:
         products = 2.0 * COARSE * config.octaves * entries
-    stages = [Stage("coarse products", products, 0, 8.0 * n * COARSE * config.octaves + table)]
+    read = 2 * size * n * COARSE * config.octaves
+    stages = [Stage("coarse products", products, 0, read + table, half=half)]
     if radius and smaller:
         # Four rows of a small table are read for every row; a tile of the sum stays in the cache.
         parts = 4.0 * sum(smaller) * columns
@@ -116,15 +127,16 @@ def pair_work(width: int, height: int, config: Config, found: Found) -> list[Sta
         stages.append(Stage("consensus", 0, 3.0 * entries * votes, 2 * table))
     stages.append(Stage("mutual neighbours", 0, 4.0 * entries, 2 * table))
     cells, channels = SIDE * SIDE, FINE * config.octaves
-    gathered = 2 * cells * channels * 4.0 * found.coarse
+    gathered = 2 * cells * channels * size * found.coarse
     windows = 2.0 * cells * cells * channels * found.coarse
     chunks = found.coarse / shape.fine_chunk
     # Rows are read, written next to each other, and read by the product.
-    stages.append(Stage("windows", windows, 4.0 * cells**2 * found.coarse, 3 * gathered, chunks))
+    others = 4.0 * cells**2 * found.coarse
+    stages.append(Stage("windows", windows, others, 3 * gathered, chunks, half))
     # Nine slots per cell: built, sorted, compared, compacted.
     stages.append(Stage("correspondences", 0, 9.0 * 4 * n * 30, 9 * 4.0 * 4 * n * 12))
     if shape.one_to_one == "similarity":
-        rows = 2 * channels * 4.0 * found.tentative
+        rows = 2 * channels * size * found.tentative
         products = 2.0 * channels * found.tentative
         steps = found.tentative / 512
         stages.append(Stage("similarities", 0, products, 3 * rows, steps))
@@ -143,16 +155,53 @@ def pair_work(width: int, height: int, config: Config, found: Found) -> list[Sta
     return stages
 
 
-def seconds(stages: list[Stage], device: Device, *, batch: int = 1, half: bool = False) -> float:
+def seconds(stages: list[Stage], device: Device, *, batch: int = 1) -> float:
     """The least time of one image or pair on a device.
 
     Args:
       batch: number of pairs that take the steps of their loops together.
-      half: products take bfloat16 and sum in float32.
     """
-    rate = device.half if half else device.float32
-    return sum(
-        max(stage.products / rate + stage.others / device.float32, stage.bytes / device.bandwidth)
-        + stage.steps * device.step_s / batch
-        for stage in stages
-    )
+
+    def least(stage: Stage) -> float:
+        products = stage.products / (device.half if stage.half else device.float32)
+        return max(products + stage.others / device.float32, stage.bytes / device.bandwidth)
+
+    return sum(least(stage) + stage.steps * device.step_s / batch for stage in stages)
+
+
+def in_numbers(config: Config, numbers: Convolutions) -> Config:
+    """The config with convolutions and products of descriptors of this type."""
+    return dataclasses.replace(config, convolutions=numbers, products=numbers)
+
+
+def paper_lines(found: Mapping[str, Found], size: tuple[int, int]) -> list[str]:
+    """What the devices could do at most, as a table in Markdown.
+
+    Args:
+      found: for each preset what the work of a pair depends on.
+      size: (width, height) of the photos.
+    """
+    num_coarse = feature_capacity(size).num_coarse
+    lines = ["| on paper, a second | " + " | ".join(d.name for d in DEVICES) + " |"]
+    lines.append("|" + "---|" * (len(DEVICES) + 1))
+    for name, counts in found.items():
+        for numbers in get_args(Convolutions):
+            config = in_numbers(preset(name), numbers)
+            images, pairs = image_work(*size, config), pair_work(*size, config, counts)
+            together = [fitting_pairs(d.memory, num_coarse, config=config) for d in DEVICES]
+            for what, rates in (
+                ("images", [1 / seconds(images, d) for d in DEVICES]),
+                ("pairs, one at a time", [1 / seconds(pairs, d) for d in DEVICES]),
+                ("pairs, as many at once as fit", [
+                    1 / seconds(pairs, d, batch=n) for d, n in zip(DEVICES, together, strict=True)
+                ]),
+            ):  # fmt: skip
+                lines.append(f"| {name}, {numbers}, {what} | {' | '.join(map(rate_text, rates))} |")
+            cells = " | ".join(map(str, together))
+            lines.append(f"| {name}, {numbers}, pairs that fit | {cells} |")
+    return lines
+
+
+def rate_text(x: float) -> str:
+    """Three digits, or all of a larger number."""
+    return f"{x:.0f}" if x >= 100 else f"{x:.3g}"

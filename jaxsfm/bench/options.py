@@ -105,7 +105,8 @@ class PairOptions(_Sets, _Network, _Seeds):
         learned scores (learned). PRESET-no-IDEA: default or robust without one idea, which is
         octaves, centring, consensus, competition or alignment; for robust also enlarging.
         PRESET-norm, PRESET-learned, PRESET-alexnet, PRESET-bfloat16: default or robust with this
-        keypoint rule, network or number format.
+        keypoint rule, network or number format of the network. PRESET-products-float16,
+        PRESET-products-bfloat16: with descriptors of this type.
       max_size: Limit for the longer side of a photo, in pixels. Without it, that of the preset.
     """
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 from jaxsfm.cli.subcommands import named_options
 from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
+from jaxsfm.core.pair_shape import Products
 
 Preset = Literal["paper", "default", "robust"]
 
@@ -26,6 +27,8 @@ class MatchingChoice:
       backbone: The network: vgg16, which the paper uses; alexnet; or vgg19, which needs --weights.
       convolutions: Number format in which the network multiplies. bfloat16 is meant for
         accelerators.
+      products: Number format of the descriptors whose products find the matches. float16 and
+        bfloat16 are meant for accelerators.
     """
 
     preset: Preset = "default"
@@ -33,6 +36,7 @@ class MatchingChoice:
     keypoints: Keypoints | Literal["preset"] = "preset"
     backbone: BackboneName = "vgg16"
     convolutions: Convolutions = "float32"
+    products: Products = "float32"
 
     def config(self, relocalizer: Path | None = None) -> Config:
         """The preset with the settings that differ from it.
@@ -51,6 +55,7 @@ class MatchingChoice:
             preset(self.preset),
             max_size=self.max_size,
             convolutions=self.convolutions,
+            products=self.products,
             backbone=self.backbone,
         )
         keypoints = self.keypoints

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.matching import mutual
-from jaxsfm.core.numerics import HIGHEST, argmax_first, compact
+from jaxsfm.core.numerics import argmax_first, at_least_float32, compact, descriptor_products
 from jaxsfm.core.types import JoinedFeatures
 
 RADIUS = 1
@@ -61,7 +61,7 @@ def _match_windows(
     index1, inside1 = window_cells(cell1, f1.coarse_grid, f1.fine_grid)
     a, b = (rows_of(f.fine, index) for f, index in ((f0, index0), (f1, index1)))
     a_set, b_set = inside0 & shown[0][index0], inside1 & shown[1][index1]
-    s = jnp.einsum("bwd,bvd->bwv", a, b, precision=HIGHEST)
+    s = descriptor_products("bwd,bvd->bwv", a, b)
     s = jnp.where(a_set[:, :, None] & b_set[:, None, :], s, -jnp.inf)
     row_score, row_best = argmax_first(s, axis=2)
     _, col_best = argmax_first(s, axis=1)
@@ -153,10 +153,10 @@ def similarities(
         start = jnp.minimum(i * chunk, k - chunk)
         some = lax.dynamic_slice_in_dim(cells, start, chunk)
         a, b = rows_of(f0.fine, some[:, 0]), rows_of(f1.fine, some[:, 1])
-        products = jnp.einsum("kd,kd->k", a, b, precision=HIGHEST)
+        products = descriptor_products("kd,kd->k", a, b)
         return i + 1, lax.dynamic_update_slice(scores, products, (start,))
 
-    start = (jnp.int32(0), jnp.zeros((k,), f0.fine.dtype))
+    start = (jnp.int32(0), at_least_float32(jnp.zeros((k,), f0.fine.dtype)))
     return lax.while_loop(lambda s: s[0] * chunk < found, body, start)[1]
 
 

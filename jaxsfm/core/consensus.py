@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.matching import scan_mutual
-from jaxsfm.core.numerics import HIGHEST
+from jaxsfm.core.numerics import descriptor_products
 from jaxsfm.core.octaves import blend
 from jaxsfm.core.types import DescriptorGrid, OctavePart
 
@@ -41,7 +41,7 @@ def _products(
 
     def first_octave(start, count):
         block = lax.dynamic_slice_in_dim(rows, start, count)
-        return jnp.einsum("nc,mc->nm", block, others[:, :own], precision=HIGHEST)
+        return descriptor_products("nc,mc->nm", block, others[:, :own])
 
     if not parts:
         return first_octave
@@ -49,7 +49,7 @@ def _products(
     for part in parts:
         k, c = part.flat.shape
         mine = others[:, channel : channel + c]
-        tables.append(jnp.einsum("kc,mc->km", part.flat, mine, precision=HIGHEST))
+        tables.append(descriptor_products("kc,mc->km", part.flat, mine))
         cells.append(jnp.pad(part.cells + cell, padding))
         shares.append(jnp.pad(part.weights, padding))
         channel, cell = channel + c, cell + k
@@ -112,9 +112,9 @@ def consensus_nn(
     def scores(start):
         block = product(start, tile + 2 * margin)
         at = lax.dynamic_slice_in_dim(column0, start, tile)
-        total = jnp.zeros((tile, m), a.dtype)
+        total = jnp.zeros((tile, m), block.dtype)
         for right, w in kernel:
-            line = jnp.zeros((tile, m), a.dtype)
+            line = jnp.zeros((tile, m), block.dtype)
             for down, v in kernel:
                 corner = (margin + down * grid0[1] + right, margin + down * grid1[1] + right)
                 line += v * lax.dynamic_slice(block, corner, (tile, m))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsfm.core.numerics import HIGHEST, argmax_first
+from jaxsfm.core.numerics import argmax_first, descriptor_products
 
 
 def similarity(a: Float[Array, "n c"], b: Float[Array, "m c"]) -> Float[Array, "n m"]:
@@ -15,7 +15,7 @@ def similarity(a: Float[Array, "n c"], b: Float[Array, "m c"]) -> Float[Array, "
 
     For unit vectors |a - b|^2 = 2 - 2 a.b, so the largest product is the nearest neighbour.
     """
-    products = jnp.einsum("nc,mc->nm", a, b, precision=HIGHEST)
+    products = descriptor_products("nc,mc->nm", a, b)
     a_set, b_set = jnp.any(a != 0, axis=-1), jnp.any(b != 0, axis=-1)
     return jnp.where(a_set[:, None] & b_set[None, :], products, -jnp.inf)
 

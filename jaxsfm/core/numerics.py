@@ -1,5 +1,6 @@
 """Small functions that all stages share, written with care for rounding and gradients."""
 
+import functools
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -19,6 +20,31 @@ def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     bfloat16 has 8 binary digits, so that coordinates of a thousand pixels would be multiples of 4.
     """
     return x.astype(jnp.float32) if jnp.finfo(x.dtype).bits < 32 else x
+
+
+def descriptor_products(
+    subscripts: str, a: Float[Array, "*a"], b: Float[Array, "*b"]
+) -> Float[Array, "*ab"]:
+    """`einsum` of two arrays of descriptors, summed in float32, or in float64 if they have 64 bits.
+
+    Descriptors of 16 bits are multiplied as they are on accelerators. CPUs convert them to float32
+    first. Both multiply the same numbers: the product of two numbers of 16 bits has at most 22
+    digits, so float32 holds it exactly. Only the order of the sums differs.
+    """
+    converted = functools.partial(_converted_products, subscripts)
+    if a.dtype != b.dtype or a.dtype.itemsize > 2:
+        return converted(a, b)
+    as_they_are = functools.partial(_products_of_16_bits, subscripts)
+    return lax.platform_dependent(a, b, cpu=converted, default=as_they_are)
+
+
+def _converted_products(subscripts: str, a: Array, b: Array) -> Array:
+    a, b = at_least_float32(a), at_least_float32(b)
+    return jnp.einsum(subscripts, a, b, precision=HIGHEST)
+
+
+def _products_of_16_bits(subscripts: str, a: Array, b: Array) -> Array:
+    return jnp.einsum(subscripts, a, b, precision=HIGHEST, preferred_element_type=jnp.float32)
 
 
 def squared_norm(x: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:

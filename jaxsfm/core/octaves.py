@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsfm.core.grid import cell_rows_cols
-from jaxsfm.core.numerics import inverse_norm
+from jaxsfm.core.numerics import at_least_float32, inverse_norm
+from jaxsfm.core.pair_shape import Products
 from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart
 
 OCTAVE_WEIGHT = 0.5
@@ -57,6 +58,7 @@ def blend(
     rows: Float[Array, "k c"], cells: Int[Array, "n 4"], weights: Float[Array, "n 4"]
 ) -> Float[Array, "n c"]:
     """For each of n cells the weighted sum of four rows."""
+    weights = at_least_float32(weights)
 
     def nth(i):
         return weights[:, i : i + 1] * jnp.take(rows, cells[:, i], axis=0, mode="clip")
@@ -99,15 +101,20 @@ def _join(
     return joined * scale, tuple(p._replace(weights=p.weights * scale) for p in parts)
 
 
-def join_octaves(features: DenseFeatures) -> JoinedFeatures:
+def join_octaves(features: DenseFeatures, *, products: Products = "float32") -> JoinedFeatures:
     """The features of an image with its octaves joined: the product of two joined descriptors is a
-    weighted mean of the products in the octaves."""
+    weighted mean of the products in the octaves.
+
+    Args:
+      products: type of the joined descriptors, of which products are computed. They are joined in
+        float32 and then rounded to it.
+    """
     coarse, parts = _join(features.coarse, features.coarse_grid)
     return JoinedFeatures(
-        coarse=coarse,
-        fine=_join(features.fine, features.fine_grid)[0],
+        coarse=coarse.astype(products),
+        fine=_join(features.fine, features.fine_grid)[0].astype(products),
         keypoints=features.keypoints,
         coarse_grid=features.coarse_grid,
         fine_grid=features.fine_grid,
-        coarse_parts=parts,
+        coarse_parts=tuple(part._replace(flat=part.flat.astype(products)) for part in parts),
     )

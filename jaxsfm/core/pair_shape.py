@@ -4,13 +4,16 @@ import dataclasses
 from typing import Literal
 
 OneToOne = Literal["first", "similarity"]
+Products = Literal["float32", "bfloat16", "float16"]
+"""Types of the descriptors that are multiplied. Their products are summed in float32."""
 
 ACCELERATOR_FACTORS = {"steps_at_once": 8, "score_chunk": 8, "fine_chunk": 8}
 """How many times as much an accelerator computes at once. The sizes in `PairShape` are those of a
 CPU, whose caches they fill. An accelerator has thousands of lanes to fill, and every turn of a loop
 costs it the start of several kernels. The factors follow from that and from the memory that a pair
 may take (`jaxsfm.matching.execution`); they have not been measured. None of them changes a
-result."""
+result. The tile of coarse products stays as it is: a larger one has a smaller share of margins, but
+leaves room for fewer pairs side by side (docs/decisions/accelerators.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from jaxsfm.core.features import Extraction, extract, stored
 from jaxsfm.core.numerics import one_by_one
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pairs, pair_key
-from jaxsfm.core.pair_shape import PairShape
+from jaxsfm.core.pair_shape import PairShape, Products
 from jaxsfm.core.types import DenseFeatures, JoinedFeatures, PairMatches, PRNGKey, Thresholds
 
 P = ParamSpec("P")
@@ -73,12 +73,18 @@ def extract_batch(
     return _sharded(local, mesh, specs, _EACH)(params, scores, images, sizes)
 
 
-@functools.partial(jax.jit, static_argnames=("mesh",))
-def join_everywhere(features: DenseFeatures, *, mesh: Mesh) -> JoinedFeatures:
-    """The joined features of one image, copied to every device along a leading axis of devices."""
+@functools.partial(jax.jit, static_argnames=("mesh", "products"))
+def join_everywhere(
+    features: DenseFeatures, *, mesh: Mesh, products: Products = "float32"
+) -> JoinedFeatures:
+    """The joined features of one image, copied to every device along a leading axis of devices.
+
+    Args:
+      products: as in `jaxsfm.core.octaves.join_octaves`.
+    """
 
     def local(features):
-        return jax.tree.map(lambda x: x[None], join_octaves(features))
+        return jax.tree.map(lambda x: x[None], join_octaves(features, products=products))
 
     return _sharded(local, mesh, (_SAME,), _EACH)(features)
 

@@ -135,7 +135,15 @@ def _remove(path: Path) -> None:
 
 _OPTIONS = {
     name: f"--{name.replace('_', '-')}"
-    for name in ("max_size", "keypoints", "convolutions", "backbone", "seed", "weights")
+    for name in (
+        "max_size",
+        "keypoints",
+        "convolutions",
+        "products",
+        "backbone",
+        "seed",
+        "weights",
+    )
 }
 
 

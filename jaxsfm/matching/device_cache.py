@@ -9,6 +9,7 @@ from jax.sharding import Mesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from jaxsfm.core.pair_shape import Products
 from jaxsfm.core.sharded import join_everywhere
 from jaxsfm.core.types import JoinedFeatures
 from jaxsfm.io.features import ImageFeatures, pad_features
@@ -44,10 +45,12 @@ class DeviceFeatures(NamedTuple):
     joined: JoinedFeatures
 
 
-def put_on_devices(features: ImageFeatures, num_coarse: int, mesh: Mesh) -> DeviceFeatures:
+def put_on_devices(
+    features: ImageFeatures, num_coarse: int, mesh: Mesh, *, products: Products = "float32"
+) -> DeviceFeatures:
     """Join an image's octaves on all devices of a mesh, padded to `num_coarse` coarse cells."""
     bare = features.dense._replace(coarse=(), fine=())
-    joined = join_everywhere(pad_features(features.dense, num_coarse), mesh=mesh)
+    joined = join_everywhere(pad_features(features.dense, num_coarse), mesh=mesh, products=products)
     return DeviceFeatures(features._replace(dense=bare), joined)
 
 

@@ -77,12 +77,13 @@ def _device_memory(mesh: Mesh) -> int | None:
     return stats.get("bytes_limit") if stats else None
 
 
-def joined_bytes(num_coarse: int, *, octaves: int, backbone: str = "vgg16") -> int:
+def joined_bytes(num_coarse: int, *, config: Config) -> int:
     """Bytes of one image's joined features, padded to `num_coarse` cells in the first octave.
 
-    With VGG they are about 98 bytes per working pixel with four octaves, and 24 with one.
+    With VGG and products in float32 they are about 98 bytes per working pixel with four octaves,
+    and 24 with one.
     """
-    network = BACKBONES[backbone]
+    network, octaves = BACKBONES[config.backbone], config.octaves
 
     def blank() -> DenseFeatures:
         def octave(cells: int, channels: int) -> tuple[jax.Array, ...]:
@@ -93,13 +94,15 @@ def joined_bytes(num_coarse: int, *, octaves: int, backbone: str = "vgg16") -> i
         grid = jnp.zeros(2, jnp.int32)
         return DenseFeatures(coarse, fine, jnp.zeros((4 * num_coarse, 2)), grid, grid)
 
-    shapes = jax.tree.leaves(jax.eval_shape(lambda: join_octaves(blank())))
+    shapes = jax.tree.leaves(
+        jax.eval_shape(lambda: join_octaves(blank(), products=config.products))
+    )
     return sum(math.prod(x.shape) * x.dtype.itemsize for x in shapes)
 
 
 def cached_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config: Config) -> int:
     """How many images' joined features stay on each device: at least the two of a pair."""
-    each = joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone)
+    each = joined_bytes(num_coarse, config=config)
     memory = _device_memory(mesh)
     if execution.memory_gb is not None:
         most = execution.memory_gb * 1e9 / each
@@ -118,25 +121,27 @@ not been measured on a GPU yet."""
 
 
 def images_at_once(execution: Execution, mesh: Mesh, pixels: int, count: int) -> int:
-    """How many of `count` images of `pixels` pixels, padded, each device extracts side by side."""
-    each = ACCELERATOR_BYTES_PER_PIXEL * pixels
-    return _side_by_side(execution.images_at_once, mesh, DEVICE_SHARE, each, MAX_IMAGES, count)
+    """How many of `count` images of `pixels` pixels, padded, each device extracts side by side.
 
-
-def _side_by_side(
-    asked: int | None, mesh: Mesh, share: float, each: int, most: int, count: int
-) -> int:
-    """How many items each device computes side by side.
-
-    It is the number that was asked for; else as many as fit into a share of the device's memory,
-    or one on a CPU. It is no more than a device's part of `count`, rounded up to a power of two so
-    that few programs are compiled.
+    It is the number that was asked for; else as many as fit into the device's memory, or one on a
+    CPU. It is no more than a device's part of `count`, rounded up to a power of two so that few
+    programs are compiled.
     """
-    memory = _device_memory(mesh)
+    asked, memory = execution.images_at_once, _device_memory(mesh)
     if asked is None:
-        asked = 1 if memory is None else int(np.clip(share * memory / each, 1, most))
-    own = -(-count // mesh.size)
-    return min(asked, 1 << (own - 1).bit_length())
+        each = ACCELERATOR_BYTES_PER_PIXEL * pixels
+        asked = 1 if memory is None else _fitting(DEVICE_SHARE * memory, each, MAX_IMAGES)
+    return min(asked, _own_part(count, mesh))
+
+
+def _fitting(memory: float, each: float, most: int) -> int:
+    """How many items fit into memory, from 1 to `most`."""
+    return int(np.clip(memory / each, 1, most))
+
+
+def _own_part(count: int, mesh: Mesh) -> int:
+    """A device's part of `count` items, rounded up to a power of two."""
+    return 1 << (-(-count // mesh.size) - 1).bit_length()
 
 
 PAIR_BYTES_PER_CELL = 35_000
@@ -144,15 +149,23 @@ PAIR_BYTES_PER_CELL = 35_000
 own account of the program of the preset `default` at 1600 x 1200; `paper` takes 13 000."""
 
 
+def fitting_pairs(memory: float, num_coarse: int, *, config: Config) -> int:
+    """How many pairs an accelerator with this memory (bytes) matches side by side.
+
+    A batch copies both sides of its pairs, into half of the memory that cached images leave.
+    """
+    each = 2 * joined_bytes(num_coarse, config=config) + PAIR_BYTES_PER_CELL * num_coarse
+    return _fitting((1 - DEVICE_SHARE) / 2 * memory, each, MAX_PAIRS)
+
+
 def pairs_at_once(
     execution: Execution, mesh: Mesh, num_coarse: int, count: int, *, config: Config
 ) -> int:
-    """How many of `count` pairs each device matches side by side."""
-    # A batch copies both sides of its pairs, into half of the memory that cached images leave.
-    share = (1 - DEVICE_SHARE) / 2
-    joined = joined_bytes(num_coarse, octaves=config.octaves, backbone=config.backbone)
-    each = 2 * joined + PAIR_BYTES_PER_CELL * num_coarse
-    return _side_by_side(execution.pairs_at_once, mesh, share, each, MAX_PAIRS, count)
+    """How many of `count` pairs each device matches side by side, as in `images_at_once`."""
+    asked, memory = execution.pairs_at_once, _device_memory(mesh)
+    if asked is None:
+        asked = 1 if memory is None else fitting_pairs(memory, num_coarse, config=config)
+    return min(asked, _own_part(count, mesh))
 
 
 Batch = TypeVar("Batch")

@@ -61,7 +61,7 @@ def export_programs(
 
     def features(rgb, size):
         dense = extract(weights.params, rgb, size, settings=settings, scores=scores)
-        joined = join_octaves(dense)._asdict()
+        joined = join_octaves(dense, products=config.products)._asdict()
         return joined | {"coarse_parts": [part._asdict() for part in joined["coarse_parts"]]}
 
     def matches(seed, features0, features1):

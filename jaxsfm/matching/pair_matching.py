@@ -81,7 +81,7 @@ def match_pairs(
             ordered = tile_order(some, max(1, most // 2))
 
             def on_devices(name: Name, num_coarse: int = num_coarse) -> DeviceFeatures:
-                return put_on_devices(load(name), num_coarse, mesh)
+                return put_on_devices(load(name), num_coarse, mesh, products=config.products)
 
             cache, todo = ImageCache(on_devices, ordered, most), iter(ordered)
             while batch := list(itertools.islice(todo, side_by_side * mesh.size)):

@@ -156,8 +156,10 @@ def test_an_ablation_leaves_out_or_exchanges_one_idea():
     assert changed.pair.consensus == 0 and changed != preset("default")
     assert CONFIGS["paper-naive"] == CONFIGS["paper"]  # they differ in how keypoints are found
     assert len(set(CONFIGS.values())) == len(CONFIGS) - 1
-    assert sum(name.startswith(("default-", "robust-")) for name in CONFIGS) == 19
+    assert sum(name.startswith(("default-", "robust-")) for name in CONFIGS) == 23
     low = method_config("default-bfloat16")
     assert low == dataclasses.replace(preset("default"), convolutions="bfloat16")
+    half = method_config("robust-products-float16")
+    assert half == dataclasses.replace(preset("robust"), products="float16")
     with pytest.raises(ValueError, match="default-no-enlarging"):
         method_config("default-no-enlarging")  # default does not enlarge

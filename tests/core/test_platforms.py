@@ -7,6 +7,7 @@ tests/core/test_ransac.py for planes, and here for the sizes of chunks.
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from jaxsfm.config import PRESETS, PairShape
 from jaxsfm.core import align, features, pair, ransac, relocalize, sharded, soft_matching
 from jaxsfm.core.backbones import BACKBONES
 from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.pair_shape import Products
 from jaxsfm.core.scores import init_scores
 from jaxsfm.core.types import JoinedFeatures, Thresholds
 from jaxsfm.core.vgg import Preprocessing
@@ -59,8 +61,8 @@ def described(preset: str):
     return jax.eval_shape(extract, parameters("vgg16"), IMAGE, SIZE)
 
 
-def joined(preset: str):
-    return jax.eval_shape(join_octaves, described(preset))
+def joined(preset: str, products: Products = "float32"):
+    return jax.eval_shape(functools.partial(join_octaves, products=products), described(preset))
 
 
 def extraction(settings: features.Extraction, *, learned: bool = False):
@@ -70,9 +72,10 @@ def extraction(settings: features.Extraction, *, learned: bool = False):
     return lambda p, s, image, size: extract(p, image, size, scores=s), (params, heads, IMAGE, SIZE)
 
 
-def matching(preset: str):
+def matching(preset: str, products: Products = "float32"):
     match = functools.partial(pair.match_pair, shape=PRESETS[preset].pair)
-    return match, (KEY, joined(preset), joined(preset), LIMITS)
+    both = joined(preset, products)
+    return match, (KEY, both, both, LIMITS)
 
 
 def batch_of_pairs():
@@ -126,6 +129,8 @@ PROGRAMS = {
     "match default": lambda: matching("default"),
     "match paper": lambda: matching("paper"),
     "match robust": lambda: matching("robust"),
+    "match default, float16": lambda: matching("default", "float16"),
+    "match paper, bfloat16": lambda: matching("paper", "bfloat16"),
     "match a batch": batch_of_pairs,
     "ransac": planes,
     "relocalize": lambda: walks("hard"),
@@ -155,6 +160,22 @@ def test_accelerators_score_more_hypotheses_at_once_than_cpus():
     for platform in PLATFORMS:
         text = traced.lower(lowering_platforms=(platform,)).as_text()
         assert (f"tensor<{at_once}x3x3xf32>" in text) == (platform != "cpu")
+
+
+@pytest.mark.parametrize(("products", "short"), [("float16", "f16"), ("bfloat16", "bf16")])
+def test_accelerators_multiply_descriptors_of_16_bits_and_sum_in_float32(products, short):
+    """CPUs multiply in float32, because few of them have such products."""
+    function, given = matching("default", products)
+    traced = jax.jit(function).trace(*given)
+    for platform in PLATFORMS:
+        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        operands = {
+            tuple(re.findall(r"[x<](\w+)>", line.rpartition(" : ")[2]))
+            for line in text.splitlines()
+            if "stablehlo.dot_general" in line
+        }
+        assert ((short, short, "f32") in operands) == (platform != "cpu")
+        assert all(types[2] == "f32" for types in operands)
 
 
 def test_only_what_changes_no_result_differs_between_platforms():

@@ -25,6 +25,7 @@ PAPER = {
     "octaves": 1,
     "centred": False,
     "convolutions": "float32",
+    "products": "float32",
     "aligned_octaves": 0,
     "view_graph": False,
     "refinement": None,

@@ -1,6 +1,7 @@
 """Batches, devices and memory decide when something is computed, never what."""
 
 import dataclasses
+import functools
 import itertools
 import json
 import os
@@ -238,12 +239,13 @@ def test_a_hosts_memory_does_not_grow_with_the_number_of_small_images():
     assert 2 <= large <= 16
 
 
-def test_memory_is_what_the_formula_says(features):
-    config = preset("default")
+@pytest.mark.parametrize("products", ["float32", "float16"])
+def test_memory_is_what_the_formula_says(features, products):
+    config = dataclasses.replace(preset("default"), products=products)
     (one, *_) = features.values()
-    joined = jax.jit(join_octaves)(one.dense)
+    joined = jax.jit(functools.partial(join_octaves, products=products))(one.dense)
     size = sum(x.nbytes for x in jax.tree.leaves(joined))
-    assert execution.joined_bytes(one.capacity.num_coarse, octaves=4) == size
+    assert execution.joined_bytes(one.capacity.num_coarse, config=config) == size
     for budget, most in ((10.5 * size, 10), (size, 2)):
         chosen = Execution(memory_gb=budget / 1e9)
         found = execution.cached_images(chosen, MESH, one.capacity.num_coarse, config=config)
@@ -269,7 +271,7 @@ def test_an_accelerator_takes_what_fits(monkeypatch, memory):
     images = execution.images_at_once(Execution(), MESH, pixels, 999)
     pairs = execution.pairs_at_once(Execution(), MESH, cells, 999, config=config)
     kept = execution.cached_images(Execution(), MESH, cells, config=config)
-    joined = execution.joined_bytes(cells, octaves=4)
+    joined = execution.joined_bytes(cells, config=config)
     assert images == 1 or images * execution.ACCELERATOR_BYTES_PER_PIXEL * pixels <= memory / 2
     batch = pairs * (2 * joined + execution.PAIR_BYTES_PER_CELL * cells)
     assert kept * joined + batch <= memory
