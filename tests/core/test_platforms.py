@@ -170,7 +170,7 @@ def test_accelerators_multiply_descriptors_of_16_bits_and_sum_in_float32(product
     for platform in PLATFORMS:
         text = traced.lower(lowering_platforms=(platform,)).as_text()
         operands = {
-            tuple(re.findall(r"[x<](\w+)>", line.rpartition(" : ")[2]))
+            tuple(re.findall(r"tensor<(?:\d+x)*(\w+)>", line.rpartition(" : ")[2]))
             for line in text.splitlines()
             if "stablehlo.dot_general" in line
         }
