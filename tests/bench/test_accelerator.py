@@ -10,13 +10,23 @@ import pytest
 from jax.extend import core as jex
 
 from jaxsfm.bench import accelerator, accelerator_programs
-from jaxsfm.bench.on_paper import DEVICES, Found, Stage, image_work, pair_work, seconds
+from jaxsfm.bench.on_paper import (
+    DEVICES,
+    Found,
+    Stage,
+    image_work,
+    in_numbers,
+    pair_work,
+    paper_lines,
+    seconds,
+)
 from jaxsfm.config import PRESETS
 from jaxsfm.core.consensus import consensus_nn
 from jaxsfm.core.features import extract
 from jaxsfm.core.matching import mutual_nn
 from jaxsfm.core.types import DescriptorGrid, OctavePart
 from jaxsfm.io.features import feature_capacity, padded_size
+from jaxsfm.matching.execution import fitting_pairs
 from jaxsfm.matching.extraction import extraction_settings
 
 SIDE = 256
@@ -130,3 +140,19 @@ def test_agreement_counts_what_both_devices_give():
     cpu = programs([[[1.0, 2.0], [3.0, 4.0]]], [[0, 0], [1, 1], [2, 2]], [0, 0, -1])
     ours = programs([[[1.0, 2.0], [3.0, 5.0]]], [[0, 0], [1, 2], [2, 2]], [0, 0, 0])
     assert accelerator_programs.agreement(ours, cpu) == (0.5, 0.5)
+
+
+def test_on_paper_an_h200_matches_more_than_300_pairs_a_second_with_products_of_16_bits():
+    """The counts are those of two neighbouring views at 1600 x 1200 (docs/performance.md)."""
+    size, h200 = (1600, 1200), DEVICES[0]
+    found = Found(coarse=4370, tentative=22216, hypotheses=21376)
+    rates = {}
+    for numbers in ("float32", "bfloat16"):
+        config = in_numbers(PRESETS["default"], numbers)
+        together = fitting_pairs(h200.memory, feature_capacity(size).num_coarse, config=config)
+        rates[numbers] = 1 / seconds(pair_work(*size, config, found), h200, batch=together)
+    assert h200.name == "H200" and rates["bfloat16"] > 300 > rates["float32"] > 250
+    cells = next(
+        line for line in paper_lines({"default": found}, size) if "bfloat16, pairs, as many" in line
+    ).split(" | ")
+    assert float(cells[1]) == pytest.approx(rates["bfloat16"], rel=5e-3)
