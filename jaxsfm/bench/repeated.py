@@ -92,7 +92,7 @@ def _prism(rng: np.random.Generator, seed: int, faces: int) -> RepeatedScene:
     face = wall(-width / 2, width, -apothem, texture(rng, width))
     motions = [turn(2 * np.pi * k / faces) for k in range(faces)]
     walls = [moved(face, motion) for motion in motions]
-    poses = _around(rng, max(16, 3 * faces), 2.6 * apothem, 0.0)
+    poses = _around(rng, max(20, 3 * faces), 2.6 * apothem, 0.0)
     facing = look_at(np.asarray([0.3, 0.1, -2.4 * apothem]), np.zeros(3))
     return RepeatedScene(walls, poses, motions[1], faces, posters(seed, motions, face), facing)
 
@@ -120,7 +120,7 @@ def _street(rng: np.random.Generator, seed: int) -> RepeatedScene:
     everywhere = [shift(period * k) for k in range(-hidden, passed + hidden)]
     planes = [moved(each, motion) for motion in everywhere for each in house]
     poses = []
-    stops = np.arange(0, period * (passed - 1) + 0.1, period / 2.6)
+    stops = np.arange(0, period * (passed - 1) + 0.1, period / 2.9)
     for k, x in enumerate(stops):
         # Centres near one line would leave the rotation about this line uncertain.
         centre = np.asarray([x, (-1) ** k * rng.uniform(0.3, 0.9), -rng.uniform(4.0, 6.0)])

@@ -116,7 +116,7 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     assert [row["set"] for row in rows] == 4 * ["room"] + 4 * ["synthetic-box"]
     assert rows[1]["outcome"] == "right"  # the room of the demo does not repeat itself
     for row in rows[4:]:
-        assert row["images"] == 16 and row["outcome"] in OUTCOMES and row["size"] == 240
+        assert row["images"] == 20 and row["outcome"] in OUTCOMES and row["size"] == 240
         # A group is a part of a model, and COLMAP has nothing to say against its models.
         assert all(
             sum(own) <= count for own, count in zip(row["groups"], row["models"], strict=False)
@@ -126,7 +126,7 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     assert "wrong, not noticed" in text
 
     work = tmp_path / "work" / "synthetic-box" / "240" / "seed0"
-    assert len(list((work / "scene" / "images").glob("*.png"))) == 16
+    assert len(list((work / "scene" / "images").glob("*.png"))) == 20
     own, taken = (_files(work / method / "matches") for method in ("default", "colmap"))
     assert own == taken and own
     before = {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}

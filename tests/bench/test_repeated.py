@@ -112,15 +112,16 @@ def test_every_photo_shows_much_of_what_the_next_one_shows(kind):
     for seed in range(3):
         scene = repeated_scene(f"{PREFIX}{kind}", seed)
         rng = np.random.default_rng(0)
-        st = rng.uniform(0, 1, (len(scene.planes), 150, 2))
-        points = np.concatenate(
-            [p.corner + a[:, :1] * p.right + a[:, 1:] * p.down
-             for p, a in zip(scene.planes, st, strict=True)]
-        )  # fmt: skip
-        own = np.repeat(np.arange(len(scene.planes)), 150)
+        points, own = [], []
+        for k, plane in enumerate(scene.planes):
+            area = np.linalg.norm(np.cross(plane.right, plane.down))
+            st = rng.uniform(0, 1, (round(30 * area), 2))
+            points.append(plane.corner + st[:, :1] * plane.right + st[:, 1:] * plane.down)
+            own += [k] * len(st)
+        points, own = np.concatenate(points), np.asarray(own)
         visible = [_visible(points, own, pose, scene.planes) for pose in scene.poses]
         for now, following in zip(visible, visible[1:], strict=False):
-            assert (now & following).sum() > 0.4 * min(now.sum(), following.sum()) > 20
+            assert (now & following).sum() > 0.4 * min(now.sum(), following.sum()) > 40
 
 
 def _visible(points, own, pose, planes):
@@ -134,7 +135,7 @@ def _visible(points, own, pose, planes):
 def test_steps_between_repeats_are_more_than_twice_the_limits_of_a_right_photo():
     """Otherwise photos of two repeats could be one group."""
     for kind in KINDS:
-        for seed in range(4):
+        for seed in range(2):
             scene = repeated_scene(f"{PREFIX}{kind}", seed)
             centres = np.asarray([pose.centre for pose in scene.poses])
             width = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
