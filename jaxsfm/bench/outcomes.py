@@ -7,9 +7,9 @@ itself and turned or moved against the others. Mean errors after a fit to all ph
 this: the fit lies between the groups, and one wrong photo of twenty hardly changes a mean.
 
 The limits separate two sizes of error. Repeats of architecture are 30 to 180 degrees or at least an
-eighth of the cameras' extent apart. Two groups that are further apart than twice the limits cannot
-be one group. Poses of right models are off by less than 1 degree and less than 1 % of the extent,
-also from small photos. The limits lie between.
+eighth of the cameras' extent apart, and two groups that are further apart than twice the limits
+cannot be one group. Right models of the Strecha sets, made from photos of 800 pixels without
+refinement, have mean errors of 0.2 % of the extent and 0.5 degrees or less.
 """
 
 from collections.abc import Sequence

@@ -8,6 +8,7 @@ from jaxsfm.bench.outcomes import POSITION_SHARE, ROTATION_DEG
 from jaxsfm.bench.repeated import KINDS, PREFIX, SCENES, repeated_scene, write_repeated
 from jaxsfm.bench.strecha_sets import read_set
 from jaxsfm.bench.synthetic import TexturedPlane, camera_matrix, render
+from jaxsfm.bench.walls import moved
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 from tests.room_scene import hidden
 
@@ -104,6 +105,19 @@ def test_the_written_cameras_show_points_where_they_were_rendered(kind, tmp_path
 
 def _painted(plane, texture):
     return TexturedPlane(corner=plane.corner, right=plane.right, down=plane.down, texture=texture)
+
+
+def test_one_poster_tells_every_photo_of_a_room():
+    """Each shows an end wall, or the place of the poster on its wall or on the opposite one."""
+    for seed in range(6):
+        scene = repeated_scene("synthetic-room-poster", seed)
+        white, black = (np.full((2, 2, 3), value, np.uint8) for value in (255, 0))
+        poster = scene.planes[-1]
+        planes = [_painted(plane, black) for plane in scene.planes[:2]]
+        planes += [_painted(plane, white) for plane in [*scene.planes[2:4], poster]]
+        planes.append(_painted(moved(poster, scene.step), white))
+        for pose in scene.poses:
+            assert np.mean(picture(planes, pose) > 100) > 0.04
 
 
 @pytest.mark.parametrize("kind", KINDS)
