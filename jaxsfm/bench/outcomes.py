@@ -82,8 +82,8 @@ def groups(model: Poses, truth: Poses) -> list[list[str]]:
     """The groups of a model's photos (see the module), the largest first.
 
     The largest group is looked for among the similarities that two photos determine: the rotation
-    of the first, and the distance of the two centres. It is then fitted to all its photos, and kept
-    if no photo is lost. The next group is found in the same way among the remaining photos. Photos
+    of the first, and the distance of the two centres. It is then fitted to all its photos, as long
+    as this adds photos. The next group is found in the same way among the remaining photos. Photos
     without a reference pose are in no group. The order of photos has no effect, except among
     groups of equal size.
     """
@@ -134,8 +134,9 @@ def _largest(ours: _Arrays, reference: _Arrays, limit: float) -> np.ndarray:
             close = np.linalg.norm(scale * own - true, axis=-1) <= limit
             if (upright & close).sum() > best.sum():
                 best = upright & close
-    fitted = _fitted(ours, reference, best, limit)
-    return fitted if fitted.sum() > best.sum() else best
+    while (fitted := _fitted(ours, reference, best, limit)).sum() > best.sum():
+        best = fitted
+    return best
 
 
 def _fitted(ours: _Arrays, reference: _Arrays, member: np.ndarray, limit: float) -> np.ndarray:

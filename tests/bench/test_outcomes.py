@@ -82,6 +82,23 @@ def test_a_model_is_right_in_any_position_scale_and_direction(seed):
     assert outcome([moved(near, similarity(seed))], truth) == "right"
 
 
+def test_a_model_of_noisy_poses_is_right_if_a_fit_to_all_photos_is_within_the_limits():
+    """The similarity of any two of its photos is not."""
+    truth = ring()
+    limit = POSITION_SHARE * extent(truth)
+    noisy = disturbed(truth, position=0.6 * limit, rotation_deg=0.8 * ROTATION_DEG)
+    assert outcome([moved(noisy, similarity(3))], truth) == "right"
+
+
+def test_photos_that_were_turned_in_place_are_not_in_the_group():
+    truth = ring()
+    turned = dict.fromkeys(sorted(truth)[14:], turn(1.0).rotation)
+    model = truth | {
+        n: CameraPose(truth[n].rotation @ r, truth[n].centre) for n, r in turned.items()
+    }
+    assert groups(model, truth)[0] == sorted(truth)[:14]
+
+
 @pytest.mark.parametrize(
     "too_much",
     [{"position": 4 * POSITION_SHARE * 2 * RADIUS, "rotation_deg": 0.0},
