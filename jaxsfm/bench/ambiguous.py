@@ -24,6 +24,8 @@ from jaxsfm.errors import writing
 
 SAME_MATCHES = ("default", *MAPPERS)
 """Methods that have the same matches, which are computed once."""
+SHOWN = 4
+"""The number of groups that the table shows; the JSON file has all of them."""
 
 
 class Task(NamedTuple):
@@ -153,6 +155,11 @@ def counts(rows: list[AmbiguousRow]) -> Counts:
     return found
 
 
+def _sizes(sizes: list[int]) -> str:
+    """The sizes of groups as text, with no more than `SHOWN` of them."""
+    return "+".join([*map(str, sizes[:SHOWN]), *["..."] * (len(sizes) > SHOWN)])
+
+
 def cells(row: AmbiguousRow) -> Cells:
     """A row of the table: the groups of the largest model, mean errors and the outcome."""
     found = {
@@ -162,7 +169,7 @@ def cells(row: AmbiguousRow) -> Cells:
         "seed": str(row["seed"]),
         "images": f"{max(row['models'], default=0)}/{row['images']}",
         "models": str(len(row["models"])),
-        "groups": "+".join(map(str, row["groups"][0])) if row["groups"] else "",
+        "groups": _sizes(row["groups"][0]) if row["groups"] else "",
     }
     if row["position"] is not None and row["rotation_deg"] is not None:
         found["position"] = f"{row['position']['mean']:.4f}"

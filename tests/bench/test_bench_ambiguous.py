@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxsfm.bench.ambiguous import counts, table_lines
+from jaxsfm.bench.ambiguous import cells, counts, table_lines
 from jaxsfm.bench.methods import AMBIGUOUS_METHODS, RUN_METHODS, method_config
 from jaxsfm.bench.options import AmbiguousOptions
 from jaxsfm.bench.outcomes import OUTCOMES
@@ -67,6 +67,8 @@ def test_the_table_ends_with_the_number_of_each_outcome_of_each_method():
     assert got["colmap"] == dict.fromkeys(OUTCOMES, 0) | {"right": 1, "wrong, not noticed": 1}
     assert got["default"]["no model"] == 1
     lines = table_lines({"rows": rows, "summary": got})
+    many = row("colmap", "right") | {"groups": [[4, 3, 2, 2, 1]]}
+    assert cells(many)["groups"] == "4+3+2+2+..."
     words = "synthetic-box colmap 400 1 8/12 2 6+2 0.5000 1.500 5.00% 2.0 wrong, not noticed"
     assert lines[1].split() == words.split()
     assert "synthetic-box default: no model" in lines
