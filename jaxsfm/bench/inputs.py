@@ -3,18 +3,21 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, inspect_image
 
+T = TypeVar("T")
 
-def choose_sets(found: dict[str, Path], names: Sequence[str] | None, root: Path) -> list[Path]:
+
+def choose_sets(found: dict[str, T], names: Sequence[str] | None, root: Path | str) -> list[T]:
     """The sets called `names`, in that order; all sets, sorted by name, if `names` is None.
 
     Args:
-      found: the path of every set in `root`, by name.
+      found: the path of every set in `root`, or what else stands for it, by name.
 
     Raises:
       UserError: `names` is empty, or one of them is not in `found`.

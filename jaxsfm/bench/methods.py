@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 
 from jaxsfm.config import Config, Keypoints, preset
+from jaxsfm.options import Mapper
 
 
 def _with_pair(config: Config, **changes: int) -> Config:
@@ -89,17 +90,28 @@ RUN_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-
 """The methods of the benchmarks of whole reconstructions."""
 
 
+MAPPERS: dict[str, Mapper] = {"colmap": "incremental", "colmap-global": "global"}
+"""Methods that hand the matches of `default` to COLMAP: every verified pair, to this mapper.
+
+Neither our view graph nor our refinement takes part.
+"""
+_MAPPED = dataclasses.replace(CONFIGS["default"], view_graph=False, refinement=None)
+AMBIGUOUS_METHODS = (*RUN_METHODS, *MAPPERS)
+"""The methods of `bench ambiguous`."""
+
+
 def method_config(method: str, *, max_size: int | None = None) -> Config:
     """The configuration of a method.
 
     Args:
-      method: one of `CONFIGS`.
+      method: one of `CONFIGS` or of `MAPPERS`.
       max_size: the longer side of the working images in pixels; None keeps the method's.
 
     Raises:
       ValueError: there is no such method.
     """
-    if method not in CONFIGS:
-        raise ValueError(f"method must be one of {', '.join(CONFIGS)}; got {method!r}")
-    config = CONFIGS[method]
+    configs = CONFIGS | dict.fromkeys(MAPPERS, _MAPPED)
+    if method not in configs:
+        raise ValueError(f"method must be one of {', '.join(configs)}; got {method!r}")
+    config = configs[method]
     return config if max_size is None else dataclasses.replace(config, max_size=max_size)

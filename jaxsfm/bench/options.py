@@ -19,11 +19,17 @@ def _names(values: Sequence[str]) -> list[str]:
     return [name for value in values for name in value.split(",") if name]
 
 
+def _check_side(size: int, option: str) -> None:
+    """Raise UserError for a working size that is too small."""
+    if size < MIN_SIDE:
+        raise UserError(f"{option} must be at least {MIN_SIDE} pixels; got {size}")
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchOptions:
     """Options of every benchmark. All options raise UserError for values that cannot be used."""
 
-    root: Path
+    root: Path | None
     """Folder of the data."""
     methods: tuple[str, ...]
     """Methods to compare, separated by commas or blanks."""
@@ -115,8 +121,8 @@ class PairOptions(_Sets, _Network, _Seeds):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.max_size is not None and self.max_size < MIN_SIDE:
-            raise UserError(f"--max-size must be at least {MIN_SIDE} pixels; got {self.max_size}")
+        if self.max_size is not None:
+            _check_side(self.max_size, "--max-size")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -160,23 +166,32 @@ class _Runs(_Sets, _Network):
         largest norms (reloc) or at the largest learned scores (learned). PRESET-no-IDEA,
         PRESET-norm and so on: as in bench wxbs. PRESET-no-placing: default or robust without the
         separate placing of weak views.
-      seed: Seed of all random choices.
       threads: Number of COLMAP's threads; -1 uses all cores.
     """
 
     methods: tuple[str, ...]
-    seed: int = 0
     threads: int = -1
 
     def __post_init__(self) -> None:
-        from jaxsfm.runs.run_options import check_seed, check_threads
+        from jaxsfm.runs.run_options import check_threads
 
-        check_seed(self.seed)
         check_threads(self.threads)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StrechaOptions(_Runs):
+class _OneSeed(_Runs):
+    seed: int = 0
+    """Seed of all random choices."""
+
+    def __post_init__(self) -> None:
+        from jaxsfm.runs.run_options import check_seed
+
+        super().__post_init__()
+        check_seed(self.seed)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StrechaOptions(_OneSeed):
     """Options of `bench strecha`.
 
     Attributes:
@@ -201,7 +216,7 @@ class StrechaOptions(_Runs):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DayNightOptions(_Runs):
+class DayNightOptions(_OneSeed):
     """Options of `bench daynight`.
 
     Attributes:
@@ -234,3 +249,52 @@ class DayNightOptions(_Runs):
         super().__post_init__()
         if not (math.isfinite(self.severity) and self.severity >= 0):
             raise UserError(f"--severity must be at least 0; got {self.severity}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AmbiguousOptions(_Runs, _Seeds):
+    """Options of `bench ambiguous`.
+
+    Attributes:
+      root: Folder of sets in the layout of bench strecha: SET/images/K.txt,
+        SET/gt_dense_cameras/*.camera. Without it, only synthetic scenes are used.
+      sets: Names of sets in --root and of synthetic scenes, separated by commas or blanks. Without
+        it, all sets of --root and all synthetic scenes. The scenes are synthetic-KIND,
+        synthetic-KIND-poster (one poster) and synthetic-KIND-posters (a poster on every repeat but
+        one). KIND is room, tower, box or street; a room has no more than one poster.
+      methods: Methods to compare, separated by commas or blanks. colmap: every verified pair of
+        default, given to COLMAP's incremental mapper. colmap-global: the same for COLMAP's global
+        mapper. The others are those of bench strecha.
+      sizes: Limits for the longer side of a photo in pixels, separated by commas or blanks.
+        Synthetic scenes are rendered at this size.
+      seeds: How often each method is run, with seeds 0, 1, ... Synthetic scenes are drawn from the
+        same seeds.
+      out: Folder for scenes, databases and models. A later run continues from what is there.
+    """
+
+    root: Path | None = None
+    sets: tuple[str, ...] | None = None
+    methods: tuple[str, ...] = ("rootsift,colmap,colmap-global,default,robust",)
+    sizes: tuple[str, ...] = ("800",)
+    seeds: int = 1
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        _Runs.__post_init__(self)
+        _Seeds.__post_init__(self)
+        self.chosen_sizes()
+
+    def chosen_sizes(self) -> list[int]:
+        """The numbers in `sizes`.
+
+        Raises:
+          UserError: there is no number, or one that is too small.
+        """
+        texts = _names(self.sizes)
+        if not texts:
+            raise UserError("--sizes: none given")
+        for text in texts:
+            if not text.isascii() or not text.isdigit():
+                raise UserError(f"--sizes: {text!r} is not a number of pixels")
+            _check_side(int(text), "--sizes")
+        return [int(text) for text in texts]

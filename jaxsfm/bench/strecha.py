@@ -10,9 +10,9 @@ import numpy as np
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.methods import RUN_METHODS
 from jaxsfm.bench.options import StrechaOptions
-from jaxsfm.bench.strecha_models import set_model
+from jaxsfm.bench.strecha_models import MethodRun, SetModels, set_models
 from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
-from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.errors import UserError
 from jaxsfm.sfm.evaluation import evaluate
 
@@ -37,7 +37,17 @@ class ModelFigures(TypedDict):
     """The largest error of a focal length."""
 
 
-class StrechaRow(TypedDict):
+class CameraErrors(TypedDict):
+    """How far the cameras of a model are from the reference, after the best similarity."""
+
+    position: dict[str, float] | None
+    """Mean, median and largest position error, units of the reference."""
+    rotation_deg: dict[str, float] | None
+    not_evaluated: str
+    """Why there are no errors; empty if there are."""
+
+
+class StrechaRow(CameraErrors):
     """The figures of one set and one method."""
 
     set: str
@@ -48,11 +58,6 @@ class StrechaRow(TypedDict):
     stages: dict[str, float]
     """Seconds of each stage."""
     model: ModelFigures | None
-    position: dict[str, float] | None
-    """Mean, median and largest position error, units of the reference."""
-    rotation_deg: dict[str, float] | None
-    not_evaluated: str
-    """Why there are no errors; empty if there are."""
 
 
 Ratios = dict[str, dict[str, dict[str, float]]]
@@ -76,45 +81,43 @@ class StrechaSummary(TypedDict):
     ratios: Ratios
 
 
-def _row(
-    each: StrechaSet,
-    method: str,
-    model: "pycolmap.Reconstruction | None",
-    stages: dict[str, float],
-) -> StrechaRow:
-    """The figures of the largest model; None stands for no model."""
-    row: StrechaRow = {
+def camera_errors(model: Poses | None, truth: Poses) -> CameraErrors:
+    """The errors of a model's cameras; None stands for no model."""
+    failed: CameraErrors = {"position": None, "rotation_deg": None, "not_evaluated": "no model"}
+    if model is None:
+        return failed
+    try:
+        errors = evaluate(model, truth)
+    except UserError as error:
+        return {**failed, "not_evaluated": str(error)}
+    return {"position": errors.position, "rotation_deg": errors.rotation_deg, "not_evaluated": ""}
+
+
+def _row(each: StrechaSet, method: str, made: SetModels) -> StrechaRow:
+    """The figures of the largest model."""
+    model = made.models[0] if made.models else None
+    return {
         "set": each.folder.name,
         "method": method,
         "images": len(each.truth),
-        "registered": 0,
-        "stages": stages,
-        "model": None,
-        "position": None,
-        "rotation_deg": None,
-        "not_evaluated": "no model",
+        "registered": model.num_reg_images() if model else 0,
+        "stages": made.seconds,
+        "model": _model_figures(model, each.focal) if model else None,
+        **camera_errors(model_poses(model) if model else None, each.truth),
     }
-    if model is None:
-        return row
+
+
+def _model_figures(model: "pycolmap.Reconstruction", focal: float) -> ModelFigures:
     focals = [
         model.cameras[model.image(i).camera_id].mean_focal_length() for i in model.reg_image_ids()
     ]
-    row["registered"] = model.num_reg_images()
-    row["model"] = {
+    return {
         "points": model.num_points3D(),
         "observations": model.compute_num_observations(),
         "track_length": model.compute_mean_track_length(),
         "reprojection_error_px": model.compute_mean_reprojection_error(),
-        "focal_error_percent": 100 * max(abs(focal / each.focal - 1) for focal in focals),
+        "focal_error_percent": 100 * max(abs(own / focal - 1) for own in focals),
     }
-    try:
-        errors = evaluate(model_poses(model), each.truth)
-    except UserError as error:
-        row["not_evaluated"] = str(error)
-        return row
-    row["position"], row["rotation_deg"] = errors.position, errors.rotation_deg
-    row["not_evaluated"] = ""
-    return row
 
 
 def bench_strecha(options: StrechaOptions) -> BenchFigures[StrechaRow, StrechaSummary]:
@@ -128,7 +131,15 @@ def bench_strecha(options: StrechaOptions) -> BenchFigures[StrechaRow, StrechaSu
             for each in sets:
                 for method in methods:
                     work = (options.out or Path(scratch)) / each.folder.name / method
-                    yield _row(each, method, *set_model(each, method, work, options))
+                    run = MethodRun(
+                        method=method,
+                        known=options.intrinsics == "known",
+                        network=options.network,
+                        seed=options.seed,
+                        threads=options.threads,
+                        best_pairs=options.best_pairs,
+                    )
+                    yield _row(each, method, set_models(each, work, run))
 
     def summary(measured: list[StrechaRow]) -> StrechaSummary:
         return {"means": means(measured), "ratios": ratios(measured)}

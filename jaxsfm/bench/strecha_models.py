@@ -1,14 +1,15 @@
 """Reconstruct a Strecha set by a method, in a work folder."""
 
+import dataclasses
 import json
+import shutil
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.methods import NAIVE, method_config
+from jaxsfm.bench.methods import MAPPERS, NAIVE, method_config
 from jaxsfm.bench.naive import match_pairs_naively
-from jaxsfm.bench.options import StrechaOptions
 from jaxsfm.bench.strecha_sets import StrechaSet
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
@@ -16,9 +17,13 @@ from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
+from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.io.pairs import best_pairs, exhaustive_pairs
 from jaxsfm.io.weights import chosen_weights
+from jaxsfm.io.work_folder import RECORD
 from jaxsfm.matching.pipeline import open_images
+from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
+from jaxsfm.report.run_report import RunReport
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.reconstruction import reconstruct
@@ -26,73 +31,117 @@ from jaxsfm.sfm.reconstruction import reconstruct
 if TYPE_CHECKING:
     import pycolmap
 
-Made: TypeAlias = "tuple[pycolmap.Reconstruction | None, dict[str, float]]"
-"""The largest model, and the seconds of each stage."""
+SECONDS = "bench_seconds.json"
+"""The file in a work folder that holds the longest times of extraction and matching."""
 
 
-def set_model(each: StrechaSet, method: str, work: Path, options: StrechaOptions) -> Made:
-    """The largest model of a set, also written to `work`/sparse; and the seconds of each stage."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MethodRun:
+    """How a method is run on a set."""
+
+    method: str
+    known: bool = True
+    """Whether the cameras are those of the set and stay fixed; otherwise they are guessed."""
+    network: WeightsChoice = USUAL_WEIGHTS
+    seed: int = 0
+    threads: int = -1
+    best_pairs: int | None = None
+    """Map only so many pairs of each image; RootSIFT maps all."""
+    max_size: int | None = None
+    """The longer side of the working images, pixels; None keeps the method's own."""
+
+    @property
+    def mapping(self) -> MapOptions:
+        """The options of the mapper."""
+        return MapOptions(refine_intrinsics=not self.known, seed=self.seed, threads=self.threads)
+
+
+class SetModels(NamedTuple):
+    """A method's reconstruction of a set."""
+
+    models: "list[pycolmap.Reconstruction]"
+    """The one with most images first; empty if there is none."""
+    seconds: dict[str, float]
+    """Of each stage."""
+    report: RunReport | None
+    """What the run says of its models; None for methods that are not runs of ours."""
+
+
+def set_models(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
+    """Reconstruct a set. The models are also in `work`/sparse."""
     work.mkdir(parents=True, exist_ok=True)
-    if method == "rootsift":
-        return _run_rootsift(each, work, options)
-    if method == NAIVE:
-        return _run_naive(each, work, options)
-    return _run_method(each, method, work, options)
+    if run.method == "rootsift":
+        return _run_rootsift(each, work, run)
+    if run.method == NAIVE:
+        return _run_naive(each, work, run)
+    return _run_method(each, work, run)
 
 
-def _run_rootsift(each: StrechaSet, work: Path, options: StrechaOptions) -> Made:
-    """The model of a set by COLMAP's own features."""
+def take_matches(work: Path, other: Path) -> None:
+    """Begin a work folder with the matches of another one that has the same photos.
+
+    A folder that is there already stays as it is. A run in the new folder uses those matches that
+    its own settings would give, and computes the rest.
+    """
+    if work.exists() or not (other / RECORD).is_file():
+        return
+    with atomic_folder(work) as fresh:
+        shutil.copytree(other / "matches", fresh / "matches")
+        for name in (RECORD, SECONDS):
+            if (other / name).is_file():
+                shutil.copyfile(other / name, fresh / name)
+
+
+def _run_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
+    """The models of a set by COLMAP's own features."""
     photos, database = each.folder / "images", work / "database.db"
     images, _ = open_images(photos)
     start = time.monotonic()
-    known = options.intrinsics == "known"
-    camera = parse_intrinsics(each.camera) if known else None
-    seed, threads = options.seed, options.threads
-    verification = VerificationOptions(seed=seed, threads=threads)
-    write_rootsift_database(database, photos, images, camera, verification)
-    mapping = MapOptions(refine_intrinsics=not known, seed=seed, threads=threads)
-    models, _ = build_models(database, read_two_views(database), mapping)
+    camera = parse_intrinsics(each.camera) if run.known else None
+    verification = VerificationOptions(seed=run.seed, threads=run.threads)
+    write_rootsift_database(database, photos, images, camera, verification, max_size=run.max_size)
+    models, _ = build_models(database, read_two_views(database), run.mapping)
     write_models(models, work / "sparse")
-    return models[0] if models else None, {"all": time.monotonic() - start}
+    return SetModels(models, {"all": time.monotonic() - start}, None)
 
 
-def _run_method(each: StrechaSet, method: str, work: Path, options: StrechaOptions) -> Made:
-    """The model of a set by one of our methods, for which `work` is its work folder."""
-    run = RunOptions(
-        intrinsics=each.camera if options.intrinsics == "known" else None,
-        network=options.network,
-        seed=options.seed,
-        threads=options.threads,
-        best_pairs=options.best_pairs,
+def _run_method(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
+    """The models of a set by one of our methods, for which `work` is its work folder."""
+    options = RunOptions(
+        intrinsics=each.camera if run.known else None,
+        network=run.network,
+        seed=run.seed,
+        threads=run.threads,
+        best_pairs=run.best_pairs,
+        mapper=MAPPERS.get(run.method, "incremental"),
         progress=True,
     )
-    photos, config = each.folder / "images", method_config(method)
-    report = reconstruct_folder(photos, work, config=config, options=run)
-    model = read_model(work / "sparse" / "0") if report.models else None
-    return model, report.seconds | _matching_seconds(work, report.seconds)
+    photos, config = each.folder / "images", method_config(run.method, max_size=run.max_size)
+    report = reconstruct_folder(photos, work, config=config, options=options)
+    models = [read_model(work / "sparse" / str(k)) for k in range(len(report.models))]
+    return SetModels(models, report.seconds | _matching_seconds(work, report.seconds), report)
 
 
-def _run_naive(each: StrechaSet, work: Path, options: StrechaOptions) -> Made:
-    """The model of a set from matches of pixels."""
-    config, start = method_config(NAIVE), time.monotonic()
-    weights = chosen_weights(options.network, config.backbone)
+def _run_naive(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
+    """The models of a set from matches of pixels."""
+    config, start = method_config(NAIVE, max_size=run.max_size), time.monotonic()
+    weights = chosen_weights(run.network, config.backbone)
     images = {image.name: image for image in open_images(each.folder / "images")[0]}
-    pairs, seed = exhaustive_pairs(images), options.seed
-    matched = match_pairs_naively(weights, images, pairs, config=config, seed=seed)
+    pairs = exhaustive_pairs(images)
+    matched = match_pairs_naively(weights, images, pairs, config=config, seed=run.seed)
     results = {result.pair: result for result in matched}
     counts = {pair: result.num_inliers for pair, result in results.items()}
-    kept = sorted(best_pairs(counts, options.best_pairs or len(images)))
-    known = options.intrinsics == "known"
+    kept = sorted(best_pairs(counts, run.best_pairs or len(images)))
     made = reconstruct(
         list(images.values()),
         {pair: results[pair] for pair in kept},
         work / "database.db",
         config=config,
-        intrinsics=parse_intrinsics(each.camera) if known else None,
-        options=MapOptions(refine_intrinsics=not known, seed=seed, threads=options.threads),
+        intrinsics=parse_intrinsics(each.camera) if run.known else None,
+        options=run.mapping,
     )
     write_models(made.models, work / "sparse")
-    return made.models[0] if made.models else None, {"all": time.monotonic() - start}
+    return SetModels(made.models, {"all": time.monotonic() - start}, None)
 
 
 def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
@@ -101,7 +150,7 @@ def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
     A stage that is reused took its time once. The longest time measured so far is what counts, and
     it is stored in the work folder.
     """
-    path = work / "bench_seconds.json"
+    path = work / SECONDS
     try:
         before = json.loads(path.read_text())
     except (OSError, ValueError):

@@ -60,7 +60,9 @@ def read_sets(root: Path, names: Sequence[str] | None) -> list[StrechaSet]:
     Raises:
       UserError: a set is missing, or its camera or poses cannot be read.
     """
-    return [
-        StrechaSet(folder, *strecha_intrinsics(folder), read_poses(folder, option="--root"))
-        for folder in find_sets(root, names)
-    ]
+    return [read_set(folder) for folder in find_sets(root, names)]
+
+
+def read_set(folder: Path) -> StrechaSet:
+    """Read the camera and the poses of a set; UserError if they cannot be read."""
+    return StrechaSet(folder, *strecha_intrinsics(folder), read_poses(folder, option="--root"))

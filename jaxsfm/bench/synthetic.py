@@ -102,6 +102,22 @@ def camera_matrix(size: tuple[int, int]) -> np.ndarray:
     return np.asarray([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
 
 
+def _in_view(plane: TexturedPlane, pose: CameraPose, k: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether a plane may be in the picture.
+
+    It is not if its corners all lie outside one side of the pyramid of the camera's rays.
+    """
+    p = plane
+    corners = np.stack(
+        [p.corner, p.corner + p.right, p.corner + p.down, p.corner + p.right + p.down]
+    )
+    x, y, depth = k @ pose.rotation @ (corners - pose.centre).T
+    # The photo's area ends half a pixel beyond the centres of its outer pixels.
+    right, bottom = size[0] - 0.5, size[1] - 0.5
+    inside = [depth, x + 0.5 * depth, right * depth - x, y + 0.5 * depth, bottom * depth - y]
+    return all((side > 0).any() for side in inside)
+
+
 def render(planes: list[TexturedPlane], pose: CameraPose, size: tuple[int, int]) -> np.ndarray:
     """An exact perspective image, uint8 RGB, averaged from an image of twice the resolution."""
     width, height = size
@@ -114,6 +130,8 @@ def render(planes: list[TexturedPlane], pose: CameraPose, size: tuple[int, int])
     image = np.zeros((height * s, width * s, 3), np.uint8)
     nearest = np.full((height * s, width * s), np.inf)
     for plane in planes:
+        if not _in_view(plane, pose, k, size):
+            continue
         # centre + depth * ray = corner + a * right + b * down
         normal = np.cross(plane.right, plane.down)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,6 +164,13 @@ def night(image: np.ndarray, *, seed: int) -> np.ndarray:
     return np.round(255 * encoded).astype(np.uint8)
 
 
+def camera_text(k: np.ndarray, pose: CameraPose, size: tuple[int, int]) -> str:
+    """The content of a Strecha `.camera` file: K (3, 3), the pose, the width and the height."""
+    rows = [*k, np.zeros(3), *pose.rotation.T, pose.centre]
+    lines = [" ".join(f"{v:.9g}" for v in row) for row in rows]
+    return "\n".join([*lines, f"{size[0]} {size[1]}"]) + "\n"
+
+
 def write_scene(
     folder: Path, *, num_views: int = 7, size: tuple[int, int] = (640, 480), seed: int = 0
 ) -> Poses:
@@ -166,10 +191,7 @@ def write_scene(
         if dark:
             rgb = night(rgb, seed=seed)
         cv2.imwrite(str(images / name), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        rows = [*k, np.zeros(3), *pose.rotation.T, pose.centre]
-        lines = [" ".join(f"{v:.9g}" for v in row) for row in rows]
-        text = "\n".join([*lines, f"{size[0]} {size[1]}"])
-        (reference / f"{name}.camera").write_text(text + "\n")
+        (reference / f"{name}.camera").write_text(camera_text(k, pose, size))
         poses[name] = pose
     np.savetxt(folder / "K.txt", k, fmt="%.9g")
     return poses

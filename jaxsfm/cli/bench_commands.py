@@ -6,6 +6,7 @@ from typing import Annotated, TypeVar
 import tyro
 
 from jaxsfm.bench.options import (
+    AmbiguousOptions,
     BenchOptions,
     DayNightOptions,
     HomographyOptions,
@@ -42,6 +43,20 @@ def strecha(bench: Unnamed[StrechaOptions]) -> int:
     from jaxsfm.bench.strecha import bench_strecha, table_lines
 
     return _run(bench_strecha, table_lines, bench)
+
+
+def ambiguous(bench: Unnamed[AmbiguousOptions]) -> int:
+    """Reconstruct scenes that repeat themselves: right, wrong and noticed, or wrong and not?
+
+    Synthetic scenes are rendered; sets with ground truth can be added with --root.
+
+    For example
+        $ jaxsfm bench ambiguous --sets synthetic-room,synthetic-room-poster --sizes 480
+        $ jaxsfm bench ambiguous --root SETS --sets castle-P19 --sizes 600,800,1000 --seeds 3
+    """
+    from jaxsfm.bench.ambiguous import bench_ambiguous, table_lines
+
+    return _run(bench_ambiguous, table_lines, bench)
 
 
 def wxbs(bench: Unnamed[WxbsOptions]) -> int:

@@ -7,7 +7,7 @@ import threading
 
 import tyro
 
-from jaxsfm.cli.bench_commands import daynight, homography, planes, strecha, warps, wxbs
+from jaxsfm.cli.bench_commands import ambiguous, daynight, homography, planes, strecha, warps, wxbs
 from jaxsfm.cli.data_commands import data
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.localize_commands import extend, localize
@@ -25,6 +25,7 @@ from jaxsfm.io.versions import package_versions
 BENCHMARKS = {
     "strecha": strecha,
     "daynight": daynight,
+    "ambiguous": ambiguous,
     "wxbs": wxbs,
     "homography": homography,
     "planes": planes,

@@ -22,6 +22,7 @@ def write_rootsift_database(
     verification: VerificationOptions,
     *,
     pairs: Iterable[Pair] | None = None,
+    max_size: int | None = None,
 ) -> None:
     """Write a new database with COLMAP's DoG + RootSIFT features, matched and verified.
 
@@ -32,6 +33,8 @@ def write_rootsift_database(
       verification: its threads are those of extraction and matching too. Pairs with fewer matches
         or inliers than its `min_inliers` are emptied.
       pairs: those to match; None: all.
+      max_size: larger photos are reduced to this longer side, in pixels, before features are found;
+        None: COLMAP's own limit.
 
     Raises:
       UserError: COLMAP leaves an image out, because it does not read the format or, with given
@@ -47,6 +50,8 @@ def write_rootsift_database(
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = verification.threads
     extraction.use_gpu = False
+    if max_size is not None:
+        extraction.max_image_size = max_size
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads = verification.threads
     matching.use_gpu = False
