@@ -104,8 +104,8 @@ def localize_photos(
         )
         if lost := job.extract_missing(files.values()):
             raise UserError(lost[min(lost)])
-        photos = Photos([*files.values(), *(q.image for q in queries)], model.config)
-        images = DeviceImages(photos.gray)
+        readable = Photos([*files.values(), *(q.image for q in queries)], model.config)
+        images = DeviceImages(readable.gray)
         bar = tqdm(total=len(queries), desc="localizing", unit="photo", disable=not job.progress)
         with bar:
             for query, matches in match_queries(job, queries, files):

@@ -27,7 +27,7 @@ def padded(image: np.ndarray) -> PaddedImage:
     """Pad an image float32 (h, w), and put it on the device."""
     h, w = image.shape
     wide = np.pad(image, ((0, -h % PAD), (0, -w % PAD)))
-    return jax.device_put(PaddedImage(wide[..., None], np.asarray([h, w], np.int32)))
+    return PaddedImage(*jax.device_put((wide[..., None], np.asarray([h, w], np.int32))))
 
 
 def largest_chunk() -> int:
