@@ -14,6 +14,7 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.passes import refine_model
 
 SIZE = (480, 360)
@@ -135,6 +136,10 @@ def arrays(model: pycolmap.Reconstruction, scene: Room) -> Model:
 
 def read_of(scene: Room, change=lambda image: image):
     return lambda name: (change(scene.images[name]), (1.0, 1.0))
+
+
+def images_of(scene: Room, change=lambda image: image) -> DeviceImages:
+    return DeviceImages(read_of(scene, change))
 
 
 def errors(model, scene: Room) -> tuple[float, float]:

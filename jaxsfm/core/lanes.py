@@ -29,8 +29,10 @@ def anywhere(wanted: Bool[Array, ""]) -> Bool[Array, ""]:
 
 
 @anywhere.def_vmap
-def _any_lane(lanes: int, batched: list[bool], wanted: Array) -> tuple[Array, bool]:
-    del lanes, batched  # without a batched argument this rule is not used
+def _any_lane(lanes: object, batched: list[bool], wanted: Array) -> tuple[Array, bool]:
+    # In an exported program the number of lanes may be a symbol. Without a batched argument this
+    # rule is not used.
+    del lanes, batched
     return anywhere(jnp.any(wanted, axis=0)), False
 
 

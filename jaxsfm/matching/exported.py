@@ -4,6 +4,7 @@ Needs the package flatbuffers (`pip install 'jaxsfm[export]'`).
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ from jax import export
 
 from jaxsfm.config import Config
 from jaxsfm.core.features import extract
+from jaxsfm.core.lanes import in_turn_on_cpus
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pair
 from jaxsfm.core.types import JoinedFeatures, OctavePart
@@ -31,7 +33,8 @@ class Programs(NamedTuple):
     """(rgb, size) -> features. rgb: uint8 (rows, columns, 3), the photo padded at the bottom and on
     the right to `jaxsfm.io.features.padded_size`; size: int32 (2,), its rows and columns. The
     features are a dict of the fields of `jaxsfm.core.types.JoinedFeatures`, where `coarse_parts` is
-    a list of dicts. The weights are in the program."""
+    a list of dicts. The weights are in the program. If it is for batches, all arrays have a leading
+    axis of photos."""
     match: bytes
     """(seed, features, features) -> matches. seed: uint32, the same for both orders of a pair; the
     matches are a dict of the fields of `jaxsfm.core.types.PairMatches`, in pixels of the working
@@ -44,12 +47,15 @@ def export_programs(
     *,
     config: Config,
     platforms: Sequence[str] = PLATFORMS,
+    batch: bool = False,
 ) -> Programs:
     """Export extraction and matching for photos of one working size.
 
     Args:
       size: (width, height) of the photos, at most `config.max_size`; they are not reduced.
       platforms: the platforms that the programs can run on.
+      batch: the extraction is for any number of photos. CPUs compute them in turn, and accelerators
+        all together, with about 3000 bytes of memory for each pixel.
 
     Raises:
       UserError: flatbuffers is not installed.
@@ -57,10 +63,11 @@ def export_programs(
     capacity = feature_capacity(size)
     settings = extraction_settings(weights, config, capacity.num_coarse)
     shape, limits = pair_shape(config, capacity), thresholds(config)
-    scores = weights.scores(config)
+    parameters = weights.params, weights.scores(config)
 
-    def features(rgb, size):
-        dense = extract(weights.params, rgb, size, settings=settings, scores=scores)
+    def features(parameters, rgb, size):
+        params, scores = parameters
+        dense = extract(params, rgb, size, settings=settings, scores=scores)
         joined = join_octaves(dense, products=config.products)._asdict()
         return joined | {"coarse_parts": [part._asdict() for part in joined["coarse_parts"]]}
 
@@ -75,11 +82,16 @@ def export_programs(
 
     photo = jax.ShapeDtypeStruct((*padded_size(size), 3), jnp.uint8)
     rows_and_columns = jax.ShapeDtypeStruct((2,), jnp.int32)
-    found = jax.eval_shape(features, photo, rows_and_columns)
+    found = jax.eval_shape(features, parameters, photo, rows_and_columns)
+    given = photo, rows_and_columns
+    if batch:
+        features = jax.vmap(in_turn_on_cpus(features), in_axes=(None, 0, 0))
+        any_number = export.symbolic_shape("photos")
+        given = tuple(jax.ShapeDtypeStruct((*any_number, *x.shape), x.dtype) for x in given)
     number = jax.ShapeDtypeStruct((), jnp.uint32)
     try:
         return Programs(
-            bytes(_exported(features, platforms)(photo, rows_and_columns).serialize()),
+            bytes(_exported(partial(features, parameters), platforms)(*given).serialize()),
             bytes(_exported(matches, platforms)(number, found, found).serialize()),
         )
     except ImportError as error:

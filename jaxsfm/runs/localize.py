@@ -17,7 +17,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.io.photos import Photos, Reader
+from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import Store
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.report.finished_run import FinishedRun, read_run
@@ -41,6 +41,7 @@ from jaxsfm.runs.working_model import (
     view_without_pose,
     weights_of_run,
 )
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.register.locate_view import Localization, locate
 
 
@@ -103,11 +104,12 @@ def localize_photos(
         )
         if lost := job.extract_missing(files.values()):
             raise UserError(lost[min(lost)])
-        read = Photos([*files.values(), *(q.image for q in queries)], model.config).gray
+        readable = Photos([*files.values(), *(q.image for q in queries)], model.config)
+        images = DeviceImages(readable.gray)
         bar = tqdm(total=len(queries), desc="localizing", unit="photo", disable=not job.progress)
         with bar:
             for query, matches in match_queries(job, queries, files):
-                rows.append(_localize_query(query, matches, finished, model, read))
+                rows.append(_localize_query(query, matches, finished, model, images))
                 bar.update()
     return LocalizationReport(
         version=importlib.metadata.version("jaxsfm"),
@@ -122,7 +124,7 @@ def locate_photo(
     model: WorkingModel,
     shortlist: Sequence[str],
     matches: Mapping[Pair, PairResult],
-    read: Reader,
+    images: DeviceImages,
 ) -> Localization:
     """Find the pose of a photo from its matches with the shortlisted photos of a model."""
     part, _ = model.model.part(shortlist)
@@ -130,7 +132,7 @@ def locate_photo(
         view_without_pose(image, camera, model.config),
         part,
         matches,
-        read,
+        images,
         refinement=model.config.refinement or Refinement(),
         own_camera=camera.estimated,
         seed=model.seed,
@@ -142,13 +144,13 @@ def _localize_query(
     matches: dict[Pair, PairResult] | str,
     run: FinishedRun,
     model: WorkingModel,
-    read: Reader,
+    images: DeviceImages,
 ) -> LocalizedPhoto | UnusablePhoto:
     """The row of a photo, whose matches may be the reason why it has none."""
     try:
         if isinstance(matches, str):
             raise ImageError(matches)
-        found = locate_photo(query.image, query.camera, model, query.shortlist, matches, read)
+        found = locate_photo(query.image, query.camera, model, query.shortlist, matches, images)
     except ImageError as error:
         return UnusablePhoto(photo=query.path, shortlist=query.shortlist, why=str(error))
     error = None

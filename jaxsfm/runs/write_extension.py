@@ -14,6 +14,7 @@ from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.runs.build_report import NewPhotos, extended_report
 from jaxsfm.runs.working_model import WorkingModel, view_without_pose
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.register.grow import UnregisteredView, grow
 
 
@@ -61,7 +62,7 @@ def write_extension(
             model.model,
             unregistered,
             matches,
-            photos.gray,
+            DeviceImages(photos.gray),
             refinement=model.config.refinement,
             seed=model.seed,
             on_view=on_view,

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 from strategies import rng_of
 
 from jaxsfm.config import PRESETS, PairShape
@@ -140,6 +141,87 @@ PROGRAMS = {
     "templates": templates,
     "align": alignment,
 }
+
+
+def along(axis: tuple, tree):
+    """The shapes of a tree, with a leading axis."""
+    return jax.tree.map(lambda x: shaped(*axis, *x.shape, dtype=x.dtype), tree)
+
+
+def any_photos(preset: str):
+    extract = functools.partial(features.extract, settings=settings_of(preset))
+    given = parameters("vgg16"), *along(export.symbolic_shape("photos"), (IMAGE, SIZE))
+    return jax.vmap(extract, in_axes=(None, 0, 0)), given
+
+
+def any_pairs(preset: str):
+    match, (key, *sides, limits) = matching(preset)
+    given = *along(export.symbolic_shape("pairs"), (key, *sides)), limits
+    return jax.vmap(match, in_axes=(0, 0, 0, None)), given
+
+
+def any_features(function):
+    return function, (along(export.symbolic_shape("photos"), described("default")),)
+
+
+def any_walks():
+    h, w, n = export.symbolic_shape("h, w, cells")
+    cells = shaped(n, dtype=jnp.int32)
+    scores = [shaped(h * s, w * s) for s in (1, 2, 4)]
+    return functools.partial(relocalize.relocalize, variant="hard"), (scores, cells, cells)
+
+
+def any_templates():
+    h, w, n = export.symbolic_shape("h, w, keypoints")
+    _, (*_, patch) = templates()
+    return align.make_templates, (shaped(h, w, 1), SIZE, shaped(n, 2), patch)
+
+
+def any_alignment():
+    make, (image, size, xy, patch) = any_templates()
+    made = jax.eval_shape(make, image, size, xy, patch)
+    affine = shaped(*xy.shape, 2)
+    return align.align, (image, size, made, xy, affine, patch)
+
+
+SYMBOLIC = {
+    "extract paper": (lambda: any_photos("paper"), {"photos"}),
+    "extract default": (lambda: any_photos("default"), {"photos"}),
+    "store": (lambda: any_features(features.stored), {"photos"}),
+    "join octaves": (lambda: any_features(jax.vmap(join_octaves)), {"photos"}),
+    "match paper": (lambda: any_pairs("paper"), {"pairs"}),
+    "relocalize": (any_walks, {"h", "w", "2*h", "2*w", "4*h", "4*w", "cells"}),
+    "templates": (any_templates, {"h", "w", "keypoints"}),
+    "align": (any_alignment, {"h", "w", "keypoints"}),
+}
+"""Programs that are lowered once for all sizes, and the sizes that are not known then. The sizes of
+photos and of lists of cells are not among them (docs/decisions/accelerators.md)."""
+
+
+@pytest.mark.parametrize("name", SYMBOLIC)
+def test_one_program_serves_all_batches_and_lengths(name):
+    make, unknown = SYMBOLIC[name]
+    function, given = make()
+    exported = export.export(jax.jit(function), platforms=PLATFORMS)(*given)
+    sizes = {str(d) for x in exported.in_avals for d in x.shape if not isinstance(d, int)}
+    assert sizes == unknown
+
+
+@pytest.mark.parametrize(("height", "width", "count"), [(64, 80, 1), (48, 48, 9)])
+def test_the_alignment_for_all_sizes_gives_what_that_for_one_size_gives(height, width, count):
+    rng = rng_of(count)
+    patch, size = align.square_patch(7), np.int32([height, width])
+    image = np.float32(rng.normal(size=(height, width, 1)))
+    xy = np.float32(rng.uniform(16, 32, (count, 2)))
+    affine = np.float32(np.eye(2) + rng.uniform(-0.2, 0.2, (count, 2, 2)))
+    for program, given in (
+        ("templates", (image, size, xy, patch)),
+        ("align", (image, size, align.make_templates(image, size, xy, patch), xy, affine, patch)),
+    ):
+        function, shapes = SYMBOLIC[program][0]()
+        any_size = export.export(jax.jit(function), platforms=PLATFORMS)(*shapes)
+        for x, y in zip(any_size.call(*given), function(*given), strict=True):
+            np.testing.assert_array_equal(x, y)
 
 
 @pytest.mark.parametrize("name", PROGRAMS)

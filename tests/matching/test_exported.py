@@ -70,6 +70,31 @@ def test_programs_run_without_jaxsfm_and_give_what_it_gives(weights, photos, tmp
     assert len(wanted) > 30 and len(matched ^ wanted) <= 0.02 * len(wanted)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "default"])
+def test_a_program_for_any_number_of_photos_gives_what_one_photo_gives(weights, photos, name):
+    """Bit for bit on a CPU, where the photos of a batch are computed in turn."""
+    pytest.importorskip("flatbuffers")
+    config = dataclasses.replace(preset(name), max_size=max(SIZE))
+    one, many = (
+        jax.export.deserialize(
+            bytearray(export_programs(weights, SIZE, config=config, batch=batch).extract)
+        )
+        for batch in (False, True)
+    )
+    padded = np.zeros((3, *padded_size(SIZE), 3), np.uint8)
+    sizes = np.int32([[110, 150], [90, 150], [110, 97]])
+    for photo, (rows, columns) in zip(padded, sizes, strict=True):
+        photo[:rows, :columns] = photos[0][100 : 100 + rows, 100 : 100 + columns]
+    for count in (3, 1):
+        found = many.call(padded[:count], sizes[:count])
+        for k in range(count):
+            for x, y in zip(
+                *map(jax.tree.leaves, (found, one.call(padded[k], sizes[k]))), strict=True
+            ):
+                np.testing.assert_array_equal(x[k], y)
+
+
 def test_without_flatbuffers_the_extra_is_named(weights, monkeypatch):
     def missing(*_):
         raise ImportError("No module named 'flatbuffers'")

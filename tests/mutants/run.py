@@ -49,6 +49,7 @@ ALIGN = ("tests/core/test_align.py", "tests/core/test_alignment_noise.py")
 NUMERICS, BACKBONES = "tests/core/test_numerics_and_grid.py", "tests/core/test_backbones.py"
 PAIR, BATCHES = "tests/core/test_pair.py", "tests/matching/test_batches.py"
 REFINE, WEAK = "tests/sfm/test_refine.py", "tests/sfm/test_weak_views.py"
+DEVICE = "tests/sfm/test_device_images.py"
 TESTS: dict[str, tuple[str, ...]] = {
     "core/alexnet": (BACKBONES,),
     "core/align": ALIGN,
@@ -65,14 +66,16 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/types": ("tests/core/test_presets.py", PAIR),
     "core/winograd": ("tests/core/test_winograd.py", "tests/core/test_vgg.py"),
     "refine/candidates": (REFINE, WEAK),
+    "refine/device_images": (DEVICE, "tests/sfm/test_placing.py"),
+    "refine/device_templates": (DEVICE,),
     "refine/evidence": (WEAK,),
     "refine/octave_pose": ("tests/sfm/test_placing.py", WEAK),
-    "refine/padding": ("tests/sfm/test_pair_alignment.py", REFINE),
-    "refine/patch_alignment": (REFINE, WEAK),
+    "refine/padding": (DEVICE, "tests/sfm/test_pair_alignment.py", REFINE),
+    "refine/patch_alignment": (DEVICE, REFINE, WEAK),
     "refine/pose_doubt": ("tests/sfm/test_placing.py",),
     "refine/passes": (REFINE, WEAK),
     "refine/plane_geometry": (REFINE, WEAK),
-    "refine/track_alignment": (REFINE, WEAK),
+    "refine/track_alignment": (DEVICE, REFINE, WEAK),
     "refine/weak_views": (WEAK,),
     "register/grow": ("tests/sfm/test_new_points.py", "tests/runs/test_extend.py"),
     "register/locate_view": ("tests/sfm/test_single_view.py", "tests/sfm/test_new_points.py"),

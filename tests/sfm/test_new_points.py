@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from room_scene import Room, exact_model, exact_tracks, read_of
+from room_scene import Room, exact_model, exact_tracks, images_of
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
@@ -61,7 +61,7 @@ def test_rays_meet_where_the_points_are(rendered):
 def test_what_has_a_point_gets_no_other_and_the_rest_is_found_where_it_is(rendered):
     model = half_known(rendered)
     tracks = model.tracks
-    made = new_points(model, {NEW}, all_matches(rendered), read_of(rendered), refinement=None)
+    made = new_points(model, {NEW}, all_matches(rendered), images_of(rendered), refinement=None)
     assert len(made.points) > 100
     distance = np.linalg.norm(made.points[:, None] - rendered.points[None], axis=2)
     nearest = distance.argmin(1)
@@ -97,7 +97,7 @@ def test_a_keypoint_that_leads_to_two_of_one_view_makes_no_point(rendered):
 def test_alignment_takes_the_noise_of_matches_away(rendered, refinement):
     matches = all_matches(rendered, sigma=1.0)
     model = half_known(rendered)
-    made = new_points(model, {NEW}, matches, read_of(rendered), refinement=refinement)
+    made = new_points(model, {NEW}, matches, images_of(rendered), refinement=refinement)
     planes = np.stack([rendered.points, rendered.normals], axis=1)
     off = np.abs(np.einsum("npk,pk->np", made.points[:, None] - planes[None, :, 0], planes[:, 1]))
     error = np.median(off[np.arange(len(off)), _nearest(made.points, rendered.points)])
@@ -111,7 +111,7 @@ def test_as_few_new_points_as_a_model_needs_are_aligned(rendered, monkeypatch, m
     monkeypatch.setattr(
         triangulate, "align_blocks", lambda *rest: aligned.append(1) or blocks(*rest)
     )
-    arguments = half_known(rendered), {NEW}, all_matches(rendered), read_of(rendered)
+    arguments = half_known(rendered), {NEW}, all_matches(rendered), images_of(rendered)
     count = len(new_points(*arguments, refinement=None).points)
     assert not aligned
     monkeypatch.setattr(triangulate, "MIN_POINTS", count + missing)
@@ -138,7 +138,7 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
         Model(rendered.views[:3], tracks),
         unregistered,
         all_matches(rendered),
-        read_of(rendered),
+        images_of(rendered),
         refinement=Refinement(),
     )
     assert grown.placed == [NEW, "4.png"] and grown.rounds == 2

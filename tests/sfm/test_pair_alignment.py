@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -12,6 +13,7 @@ from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
+from jaxsfm.sfm.refine import padding
 from jaxsfm.sfm.refine.pair_alignment import align, align_matches, local_map
 
 SIDE = 320
@@ -90,6 +92,30 @@ def test_matches_end_where_the_plane_puts_them(scale0, scale1):
     assert found.aligned.mean() > 0.9
     assert np.median(errors) < 2 * ALIGNED_PX  # the warped image was interpolated too
     assert np.mean(errors < 0.5) > 0.97
+
+
+def test_a_size_puts_each_image_on_the_device_once_and_reads_the_host_once(monkeypatch):
+    result, _ = pair(2.0, 1.0, 1.0)
+    image, counts = texture(0), {"images": 0, "reads": 0}
+    put, get = jax.device_put, jax.device_get
+
+    def counted(x):
+        counts["images"] += sum(leaf.shape[2:] == (1,) for leaf in jax.tree.leaves(x))
+        return put(x)
+
+    def read(x):
+        counts["reads"] += 1
+        return get(x)
+
+    monkeypatch.setattr(padding, "CHUNK", 64)
+    monkeypatch.setattr(jax, "device_put", counted)
+    monkeypatch.setattr(jax, "device_get", read)
+    assert result.num_inliers > 2 * 64
+    found = align_matches(
+        result, image, seen_by(H, image), (1.0, 1.0), (1.0, 1.0), octaves=3, max_error_px=10.0
+    )
+    assert found.aligned.mean() > 0.9
+    assert counts == {"images": 3 * 2, "reads": 3}
 
 
 def test_smaller_sizes_bring_home_what_is_further_off():

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from room_scene import SIZE, Room, exact_model, read_of
+from room_scene import SIZE, Room, exact_model, images_of
 
 from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.colmap.view import View
@@ -16,7 +16,6 @@ from jaxsfm.sfm.refine.octave_pose import (
     OctavePose,
     PoseHypothesis,
     follow,
-    octave_reader,
     trusted,
 )
 from jaxsfm.sfm.refine.pose_doubt import pose_doubt, projection_doubt
@@ -144,7 +143,7 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
             poses[name].view, poses[name].best = last, best
 
     monkeypatch.setattr(octave_pose, "_descend", descend)
-    follow(list(poses.values()), exact_model(rendered), read_of(rendered), Refinement())
+    follow(list(poses.values()), exact_model(rendered), images_of(rendered), Refinement())
     first, second = began
     assert [(name, view is start) for name, view in first] == [(name, True) for name in found]
     assert [(name, view is end) for name, view in second] == [("doubtful", True)]
@@ -154,14 +153,14 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
 def test_an_octaves_pixels_are_means_and_lie_where_they_lay(rendered, px):
     model = exact_model(rendered)
     tracks, views, smaller = model.tracks, model.in_octave(px).views, model.in_octave(px).tracks
-    read = octave_reader(read_of(rendered), px)
     at, _ = views[0].project(rendered.points[:50])
     whole, _ = rendered.views[0].project(rendered.points[:50])
     np.testing.assert_allclose((at + 0.5) * px - 0.5, whole)
     np.testing.assert_allclose((smaller.xy + 0.5) * px - 0.5, tracks.xy)
-    image, scale = read("0.png")
-    assert image.shape[::-1] == views[0].size == (SIZE[0] // px, SIZE[1] // px)
-    assert scale == (px, px)
+    image = images_of(rendered).octave(px).take("0.png")
+    assert tuple(image.size.tolist()[::-1]) == views[0].size == (SIZE[0] // px, SIZE[1] // px)
     np.testing.assert_allclose(
-        image[3, 5], rendered.images["0.png"][3 * px : 4 * px, 5 * px : 6 * px].mean(), rtol=1e-5
+        image.map[3, 5, 0],
+        rendered.images["0.png"][3 * px : 4 * px, 5 * px : 6 * px].mean(),
+        rtol=1e-5,
     )

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from room_scene import Room, camera, exact_model, other_scene, read_of
+from room_scene import Room, camera, exact_model, images_of, other_scene
 from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 
 from jaxsfm.colmap.model import Model
@@ -34,7 +34,7 @@ def found(
         image,
         known(scene),
         night_matches(scene, right=right, wrong=wrong).matches,
-        read_of(scene),
+        images_of(scene),
         refinement=Refinement(),
         own_camera=own_camera,
     )
@@ -144,7 +144,7 @@ def test_no_view_is_no_pose(rendered):
         rendered.views[NIGHT],
         part,
         {},
-        read_of(rendered),
+        images_of(rendered),
         refinement=Refinement(),
         own_camera=False,
     )

@@ -13,6 +13,7 @@ from room_scene import (
     camera,
     exact_model,
     exact_tracks,
+    images_of,
     noisy_model,
     other_scene,
     read_of,
@@ -82,7 +83,7 @@ def place(
     after, placed = place_weak_views(
         before,
         weak,
-        read_of(scene),
+        images_of(scene),
         sizes(scene),
         refinement=Refinement(**config),
         refine_intrinsics=refine_intrinsics,
@@ -343,7 +344,7 @@ def test_targets_are_a_part_of_all_views(rendered):
     """Aligning to some views gives what aligning to all gives there, to the last bit."""
     refinement = Refinement()
     limits = AlignmentLimits.of(refinement)
-    arguments = (exact_model(rendered), read_of(rendered), refinement, limits)
+    arguments = (exact_model(rendered), images_of(rendered), refinement, limits)
     (every,) = align_blocks(*arguments)
     (some,) = align_blocks(*arguments, targets=[1, 3])
     mine = np.isin(every.found.view, [1, 3])
@@ -366,7 +367,7 @@ def test_only_points_that_a_target_may_show_are_looked_at(rendered):
     def aligned(view: View, targets):
         some = model.with_views([*views, dataclasses.replace(view, image_id=99)])
         limits = AlignmentLimits.of(refinement)
-        return list(align_blocks(some, read_of(rendered), refinement, limits, targets=targets))
+        return list(align_blocks(some, images_of(rendered), refinement, limits, targets=targets))
 
     (every,) = aligned(turned(35), None)
     (some,) = aligned(turned(35), [len(views)])
@@ -377,7 +378,7 @@ def test_only_points_that_a_target_may_show_are_looked_at(rendered):
     np.testing.assert_array_equal(some.moved, every.moved[mine])
     assert aligned(turned(180), [len(views)]) == []
     behind = PoseHypothesis(view=turned(180), own_camera=False)
-    follow([behind], model, read_of(rendered), refinement)
+    follow([behind], model, images_of(rendered), refinement)
     assert behind.best is None and behind.agreed == 0
 
 

@@ -18,9 +18,8 @@ from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.colmap.tracks import Observations
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.photos import Reader
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.sfm.refine.padding import block_means
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.pose_doubt import projection_doubt
 from jaxsfm.sfm.refine.track_alignment import align_blocks
@@ -116,18 +115,8 @@ def trusted(pose: PoseHypothesis) -> OctavePose | None:
     return best if enough else None
 
 
-def octave_reader(read: Reader, px: int) -> Reader:
-    """A reader of the same images, with pixels that are `px` times as large."""
-
-    def reduced(name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        gray, (sx, sy) = read(name)
-        return block_means(gray, px), (sx * px, sy * px)
-
-    return reduced
-
-
 def _aligned_points(
-    model: Model, read: Reader, targets: Sequence[int], refinement: Refinement
+    model: Model, images: DeviceImages, targets: Sequence[int], refinement: Refinement
 ) -> list[AlignedPoints]:
     """For each of the target views, where it shows the points of the model.
 
@@ -136,7 +125,7 @@ def _aligned_points(
     """
     parts: list[list[AlignedPoints]] = [[] for _ in targets]
     limits = AlignmentLimits(refinement.weak_min_score, MAX_SIGMA_PX, refinement.max_shift_px)
-    for block in align_blocks(model, read, refinement, limits, targets=targets):
+    for block in align_blocks(model, images, refinement, limits, targets=targets):
         found, points = block.found, block.patches.points
         for k, part in zip(targets, parts, strict=True):
             own = found.view == k
@@ -182,14 +171,17 @@ def _step(
 
 
 def follow(
-    poses: Sequence[PoseHypothesis], structure: Model, read: Reader, refinement: Refinement
+    poses: Sequence[PoseHypothesis],
+    structure: Model,
+    images: DeviceImages,
+    refinement: Refinement,
 ) -> None:
     """Follow poses over all octaves, in place. Those that end in doubt are followed once more.
 
     Args:
       poses: of views that are not among those of the structure.
       structure: views, and points with their observations.
-      read: intensities of all these views, by name.
+      images: those of all these views, in working pixels.
     """
     unsure = poses
     for _ in range(MAX_DESCENTS):
@@ -197,12 +189,15 @@ def follow(
             break
         for pose in unsure:
             pose.view = pose.best.view if pose.best else pose.view
-        _descend(unsure, structure, read, refinement)
+        _descend(unsure, structure, images, refinement)
         unsure = [pose for pose in unsure if pose.best and pose.best.doubt_px > SURE_PX]
 
 
 def _descend(
-    poses: Sequence[PoseHypothesis], structure: Model, read: Reader, refinement: Refinement
+    poses: Sequence[PoseHypothesis],
+    structure: Model,
+    images: DeviceImages,
+    refinement: Refinement,
 ) -> None:
     """From the coarsest octave to the finest, in place; at each until the poses stand still."""
     for octave in reversed(range(refinement.weak_octaves)):
@@ -213,7 +208,7 @@ def _descend(
             views = [*structure.views, *(pose.view for pose in moving)]
             model = structure.with_views(views).in_octave(px)
             targets = range(len(structure.views), len(views))
-            seen = _aligned_points(model, octave_reader(read, px), targets, refinement)
+            seen = _aligned_points(model, images.octave(px), targets, refinement)
             far = [
                 _step(pose, model.views[k], each, px, refinement)
                 for k, pose, each in zip(targets, moving, seen, strict=True)

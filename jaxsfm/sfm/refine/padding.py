@@ -1,35 +1,50 @@
 """Images and keypoints in the few shapes that the alignment is compiled for.
 
 Every new shape of an argument of `jaxsfm.core.align` is compiled anew. So images are padded, and
-keypoints are aligned in chunks of one length.
+keypoints are aligned in chunks of a few lengths.
 """
 
 from collections.abc import Iterator
 
+import jax
 import numpy as np
 
 from jaxsfm.io import interrupt
 from jaxsfm.sfm.refine.patch_alignment import PaddedImage
 
 CHUNK = 256
-"""Keypoints aligned by one call of the compiled program. A keypoint takes 35 us in chunks of 128 to
-1024 and 47 us in chunks of 4096, and most views of a large model have a few hundred in a block."""
+"""Keypoints aligned by one call of the compiled program on a CPU. A keypoint takes 35 us in chunks
+of 128 to 1024 and 47 us in chunks of 4096, and most views of a large model have a few hundred in a
+block."""
+ACCELERATOR_FACTOR = 8
+"""An accelerator aligns up to so many times as many keypoints by one call. Its lanes are filled by
+the samples of about 2000 patches. The factor changes no result, and it has not been measured."""
 PAD = 128
 """The sides of maps are padded to multiples of this, so that there are few shapes."""
 
 
 def padded(image: np.ndarray) -> PaddedImage:
-    """Pad an image (h, w)."""
+    """Pad an image float32 (h, w), and put it on the device."""
     h, w = image.shape
     wide = np.pad(image, ((0, -h % PAD), (0, -w % PAD)))
-    return PaddedImage(wide[..., None], np.asarray([h, w], np.int32))
+    return PaddedImage(*jax.device_put((wide[..., None], np.asarray([h, w], np.int32))))
+
+
+def largest_chunk() -> int:
+    """The largest number of keypoints of a call on the platform that JAX uses."""
+    return CHUNK if jax.default_backend() == "cpu" else ACCELERATOR_FACTOR * CHUNK
 
 
 def chunks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-    """Chunks of CHUNK indices (n,), filled up with their first one, and how many of each count."""
-    for start in range(0, len(rows), CHUNK):
-        piece = rows[start : start + CHUNK]
-        filled = np.full(CHUNK, piece[0])
+    """Chunks of indices (n,), filled up with their first one, and how many of each count.
+
+    The last chunk is CHUNK times the power of two that holds it, so that the calls of an
+    accelerator have few lengths, and a short one is not mostly filling.
+    """
+    largest = largest_chunk()
+    for start in range(0, len(rows), largest):
+        piece = rows[start : start + largest]
+        filled = np.full(CHUNK << ((len(piece) - 1) // CHUNK).bit_length(), piece[0])
         filled[: len(piece)] = piece
         interrupt.check()
         yield filled, len(piece)
@@ -40,5 +55,7 @@ def block_means(image: np.ndarray, px: int) -> np.ndarray:
 
     Rows and columns at the end that fill no large pixel are left out.
     """
+    if px == 1:
+        return image
     h, w = (side // px for side in image.shape)
     return image[: h * px, : w * px].reshape(h, px, w, px).mean((1, 3))

@@ -17,7 +17,12 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photos import intensities
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.refine.padding import block_means, chunks, padded
-from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits, align_patches, make_templates
+from jaxsfm.sfm.refine.patch_alignment import (
+    AlignmentLimits,
+    align_patches,
+    make_templates,
+    to_host,
+)
 
 DEFAULTS = Refinement()
 """The radius of patches, the iterations and the limits are those of the refinement. In unlike light
@@ -77,17 +82,19 @@ def align_matches(
     for px in (2**octave for octave in reversed(range(octaves))):
         image0, image1 = (padded(block_means(image, px)) for image in (gray0, gray1))
         octave = Pixels.octave(px)
+        at0, at1 = (octave.from_original(xy) for xy in (xy0, xy1))
+        calls = []
         for piece, count in chunks(np.arange(len(xy1))):
-            at0, at1 = (octave.from_original(xy[piece]) for xy in (xy0, xy1))
-            templates = make_templates(image0, at0, patch)
-            found = align_patches(
-                image1, templates, at1, affine[piece], patch, iterations=DEFAULTS.iterations
+            templates = make_templates(image0, at0[piece], patch)
+            outcome = align_patches(
+                image1, templates, at1[piece], affine[piece], patch, iterations=DEFAULTS.iterations
             )
-            moved = octave.to_original(np.asarray(found.xy)).astype(np.float32)
-            off_plane = np.linalg.norm(moved - on_plane[piece], axis=1)
-            good = (limits.accept(found, at1) & (off_plane < max_error_px))[:count]
-            rows = piece[:count][good]
-            xy1[rows], aligned[rows] = moved[:count][good], True
+            calls.append((count, outcome))
+        found = to_host(calls)
+        moved = octave.to_original(np.asarray(found.xy)).astype(np.float32)
+        off_plane = np.linalg.norm(moved - on_plane, axis=1)
+        good = limits.accept(found, at1) & (off_plane < max_error_px)
+        xy1[good], aligned[good] = moved[good], True
     return AlignedMatches(pixels1.to_original(xy1), aligned)
 
 

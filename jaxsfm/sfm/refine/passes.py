@@ -23,6 +23,7 @@ from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
@@ -132,7 +133,7 @@ def refine_model(
 
     Args:
       reconstruction: from the mapper; not changed.
-      read: intensities by image name; called several times per image and pass.
+      read: intensities by image name; may be called several times per image.
       refine_intrinsics: whether bundle adjustment moves focal lengths and distortion.
       evidence: images that the mapper left out, and matches to place them and weak views by.
       threads: of bundle adjustment. With one thread the model is repeatable to the last byte.
@@ -142,6 +143,7 @@ def refine_model(
     """
     sizes, evidence = _working_sizes(reconstruction, read, evidence)
     model = Model.from_colmap(reconstruction, sizes)
+    images = DeviceImages(read)
     figures: list[PassFigures] = []
     limits = AlignmentLimits.of(refinement)
     for number in range(refinement.passes):
@@ -149,7 +151,7 @@ def refine_model(
             break
         if number == 1:
             limits = limits._replace(max_shift_px=limits.max_shift_px / 2)
-        blocks = list(align_blocks(model, read, refinement, limits))
+        blocks = list(align_blocks(model, images, refinement, limits))
         aligned, weak = _gather(model, blocks)
         weak_names = sorted(model.views[k].name for k in weak)
         adjusted = _adjust(aligned, weak, sizes, refinement, refine_intrinsics, threads)
@@ -183,7 +185,7 @@ def refine_model(
         model, placed = place_weak_views(
             model,
             weak_names,
-            read,
+            images,
             sizes,
             refinement=refinement,
             refine_intrinsics=refine_intrinsics,

@@ -1,8 +1,11 @@
-"""The alignment of patches (`jaxsfm.core.align`), called with arrays of the host, and the limits
-within which its outcome counts.
+"""The alignment of patches (`jaxsfm.core.align`) in calls that the host does not wait for, and the
+limits within which its outcome counts.
+
+Images and templates stay on the device. The outcomes of several calls come to the host together.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -44,22 +47,17 @@ class AlignmentLimits(NamedTuple):
 
 
 class PaddedImage(NamedTuple):
-    """An image in one of the few shapes that the alignment is compiled for."""
+    """An image on the device, in one of the few shapes that the alignment is compiled for."""
 
-    map: np.ndarray
+    map: jax.Array
     """float32 (h, w, 1), zero beyond the image."""
-    size: np.ndarray
+    size: jax.Array
     """int32 (2,): height and width of the image."""
 
 
 def make_templates(image: PaddedImage, xy: np.ndarray, patch: Patch) -> Templates:
-    """Reference patches around keypoints (n, 2) of an image, on the device."""
-    return align_core.make_templates(
-        image.map,  # pyright: ignore[reportArgumentType]
-        image.size,  # pyright: ignore[reportArgumentType]
-        np.float32(xy),  # pyright: ignore[reportArgumentType]
-        patch,
-    )
+    """Reference patches around keypoints (n, 2) of an image; on the device, without waiting."""
+    return align_core.make_templates(*image, jax.device_put(np.float32(xy)), patch)
 
 
 def align_patches(
@@ -71,21 +69,51 @@ def align_patches(
     *,
     iterations: int,
 ) -> Aligned:
-    """Move reference patches over an image until they agree with it; on the host.
+    """Move reference patches over an image until they agree; on the device, without waiting.
 
     Args:
       start: (n, 2), where each patch starts, pixels of the image.
       affine: (n, 2, 2), from offsets in the reference image to offsets in this image.
       iterations: Gauss-Newton steps.
     """
-    return jax.device_get(
-        align_core.align(
-            image.map,  # pyright: ignore[reportArgumentType]
-            image.size,  # pyright: ignore[reportArgumentType]
-            templates,
-            np.float32(start),  # pyright: ignore[reportArgumentType]
-            np.float32(affine),  # pyright: ignore[reportArgumentType]
-            patch,
-            iterations=iterations,
-        )
+    start, affine = jax.device_put((np.float32(start), np.float32(affine)))
+    return align_core.align(*image, templates, start, affine, patch, iterations=iterations)
+
+
+def to_host(calls: Sequence[tuple[int, Aligned]]) -> Aligned:
+    """Wait for the outcomes of calls, and join them as arrays of the host.
+
+    Args:
+      calls: for each call, how many of its rows count (`jaxsfm.sfm.refine.padding.chunks`), and
+        its outcome.
+    """
+    counts = [count for count, _ in calls]
+    found = jax.device_get([outcome for _, outcome in calls])
+    columns = zip(*found, strict=True)
+    return Aligned(
+        *(
+            np.concatenate([each[:count] for count, each in zip(counts, column, strict=True)])
+            for column in columns
+        )  # pyright: ignore[reportArgumentType]
     )
+
+
+Started = TypeVar("Started")
+
+
+def overlapped(work: Iterable[Started]) -> Iterator[Started]:
+    """Yield each piece of work when it is done, which is after the next one has been started.
+
+    So the device has work while the host prepares more. Whoever iterates knows that everything is
+    done but the two latest pieces, and what only the earlier ones used may be dropped.
+
+    Args:
+      work: starts a piece when it is asked for the next one, and gives its arrays, of which some
+        are still being computed.
+    """
+    last: list[Started] = []
+    for piece in work:
+        if last:
+            yield jax.block_until_ready(last.pop())
+        last.append(piece)
+    yield from jax.block_until_ready(last)

@@ -5,7 +5,6 @@ moved onto the point's reference patch. Points are taken in blocks, so that memo
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -14,17 +13,24 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.core.align import Patch, Templates, square_patch
-from jaxsfm.io.photos import Reader
+from jaxsfm.core.align import Aligned, Patch, Templates, square_patch
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import Candidates, find_candidates
-from jaxsfm.sfm.refine.padding import chunks, padded
-from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits, align_patches, make_templates
+from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.device_templates import DeviceTemplates
+from jaxsfm.sfm.refine.padding import chunks
+from jaxsfm.sfm.refine.patch_alignment import (
+    AlignmentLimits,
+    align_patches,
+    make_templates,
+    overlapped,
+    to_host,
+)
 from jaxsfm.sfm.refine.plane_geometry import ReferencePatches
 
 CELLS = 5_000_000
-"""Points times views that are looked at together. Each takes about 100 bytes, and each point
-2.7 kB."""
+"""Points times views that are looked at together. Each takes about 100 bytes. Each point takes
+2.7 kB on the device, rounded up to a power of two of points."""
 MIN_BLOCK, MAX_BLOCK = 1000, 100_000
 """Points of a block, whatever the number of views."""
 SLACK = 0.25
@@ -71,34 +77,32 @@ def _templates(
     patches: ReferencePatches,
     wanted: np.ndarray,
     views: Sequence[View],
-    read: Reader,
+    images: DeviceImages,
     patch: Patch,
-) -> Templates:
-    """Templates of the wanted patches. One view's image is in memory at a time."""
-    n, q = len(patches.points), len(patch.weights)
-    store = [
-        np.zeros((n, q, 1), np.float32),
-        np.zeros((n, q, 1, 2), np.float32),
-        np.zeros((n, 2, 2), np.float32),
-        np.zeros((n, 2, 2), np.float32),
-        np.zeros((n, 2), np.float32),
-        np.zeros(n, np.float32),
-        np.zeros(n, bool),
-    ]
-    for k in np.unique(patches.reference[wanted]):
-        image = padded(read(views[k].name)[0])
-        for piece, count in chunks(wanted[patches.reference[wanted] == k]):
-            made = jax.device_get(make_templates(image, patches.xy[piece], patch))
-            for every, some in zip(store, made, strict=True):
-                every[piece[:count]] = some[:count]
-    return Templates(*store)  # pyright: ignore[reportArgumentType]
+) -> DeviceTemplates:
+    """Templates of the wanted patches."""
+    templates = DeviceTemplates(len(patches.points), len(wanted))
+    reference = patches.reference[wanted]
+
+    def started() -> Iterator[list[tuple[np.ndarray, Templates]]]:
+        for k in np.unique(reference):
+            image = images.take(views[k].name)
+            yield [
+                (piece[:count], make_templates(image, patches.xy[piece], patch))
+                for piece, count in chunks(wanted[reference == k])
+            ]
+
+    for of_one_view in overlapped(started()):
+        for rows, made in of_one_view:
+            templates.put(rows, made)
+    return templates
 
 
 def _align(
     found: Candidates,
-    templates: Templates,
+    templates: DeviceTemplates,
     views: Sequence[View],
-    read: Reader,
+    images: DeviceImages,
     patch: Patch,
     limits: AlignmentLimits,
     *,
@@ -107,14 +111,24 @@ def _align(
     """Where the candidates end, and which of them agree with their templates."""
     moved = found.start.copy()
     agrees = np.zeros(len(moved), bool)
-    for k in np.unique(found.view):
-        image = padded(read(views[k].name)[0])
-        for piece, count in chunks(np.flatnonzero(found.view == k)):
-            some = jax.tree.map(lambda a, p=found.point[piece]: a[p], templates)
-            start, affine = found.start[piece], found.affine[piece]
-            result = align_patches(image, some, start, affine, patch, iterations=iterations)
-            moved[piece[:count]] = result.xy[:count]
-            agrees[piece[:count]] = limits.accept(result, start)[:count]
+
+    def started() -> Iterator[tuple[np.ndarray, list[tuple[int, Aligned]]]]:
+        # Templates were made in ascending order of views. Backwards, the images that were taken
+        # last are used first (`DeviceImages`).
+        for k in np.unique(found.view)[::-1]:
+            image, rows = images.take(views[k].name), np.flatnonzero(found.view == k)
+            calls = []
+            for piece, count in chunks(rows):
+                some = templates.take(found.point[piece])
+                start, affine = found.start[piece], found.affine[piece]
+                outcome = align_patches(image, some, start, affine, patch, iterations=iterations)
+                calls.append((count, outcome))
+            yield rows, calls
+
+    for rows, calls in overlapped(started()):
+        result = to_host(calls)
+        moved[rows] = result.xy
+        agrees[rows] = limits.accept(result, found.start[rows])
     return moved, agrees
 
 
@@ -173,7 +187,7 @@ def _blocks(
 
 def align_blocks(
     model: Model,
-    read: Reader,
+    images: DeviceImages,
     refinement: Refinement,
     limits: AlignmentLimits,
     *,
@@ -183,7 +197,7 @@ def align_blocks(
 
     Args:
       model: every point has an observation.
-      read: intensities by the name of a view.
+      images: those of the views, in the model's pixels.
       limits: what an aligned keypoint must fulfil to count.
       targets: indices of views. Only observations in these views are aligned, and only points that
         they may show are looked at. None: all views.
@@ -196,9 +210,9 @@ def align_blocks(
         seen = plane_geometry.visibility(part, normal[rows])
         patches = plane_geometry.reference_patches(part, normal[rows], seen)
         found = find_candidates(views, patches, seen, refinement, targets=targets)
-        templates = _templates(patches, np.unique(found.point), views, read, patch)
+        templates = _templates(patches, np.unique(found.point), views, images, patch)
         moved, agrees = _align(
-            found, templates, views, read, patch, limits, iterations=refinement.iterations
+            found, templates, views, images, patch, limits, iterations=refinement.iterations
         )
         tracked = seen.tracked[found.point, found.view]
         yield AlignedBlock(rows, patches, found, moved, agrees, tracked)

@@ -16,9 +16,9 @@ from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.photos import Reader
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, Evidence, matched_points
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, OctavePose, PoseHypothesis, follow, trusted
 
@@ -54,7 +54,7 @@ def _structure(model: Model, weak: Sequence[int]) -> tuple[Model, np.ndarray]:
 def place_weak_views(
     model: Model,
     weak: Sequence[str],
-    read: Reader,
+    images: DeviceImages,
     sizes: Sizes,
     *,
     refinement: Refinement,
@@ -68,7 +68,8 @@ def place_weak_views(
 
     Args:
       weak: names of views.
-      read, sizes: as in `jaxsfm.sfm.refine.passes.refine_model`, of the unmapped images too.
+      images: those of the views and the unmapped images, in working pixels.
+      sizes: as in `jaxsfm.sfm.refine.passes.refine_model`, of the unmapped images too.
       refine_intrinsics: whether the focal length of a placed view moves too, if no other view has
         its camera.
 
@@ -79,20 +80,20 @@ def place_weak_views(
         View.without_pose(name, image_id, camera, sizes[name][0], Pixels(sizes[name][1]))
         for name, image_id, camera in evidence.unmapped
     ]
-    images, count = [*model.views, *outside], len(model.views)
+    every, count = [*model.views, *outside], len(model.views)
     weak_ones = [k for k, view in enumerate(model.views) if view.name in weak]
-    wanted = [*weak_ones, *range(count, len(images))]
+    wanted = [*weak_ones, *range(count, len(every))]
     structure, rows = _structure(model, weak_ones)
     poses: dict[int, list[PoseHypothesis]] = {k: [] for k in wanted}
     if len(rows) and refinement.weak_octaves:
-        poses = _starts(images, structure, wanted, evidence, refinement, refine_intrinsics)
-        follow([pose for mine in poses.values() for pose in mine], structure, read, refinement)
+        poses = _starts(every, structure, wanted, evidence, refinement, refine_intrinsics)
+        follow([pose for mine in poses.values() for pose in mine], structure, images, refinement)
     placements, best = [], {}
     for k, mine in poses.items():
         right = [pose for pose in map(trusted, mine) if pose is not None]
         if right:
             best[k] = min(right, key=lambda pose: pose.doubt_px)
-        placements.append(_placement(images[k].name, k < count, mine, best.get(k)))
+        placements.append(_placement(every[k].name, k < count, mine, best.get(k)))
     return (_with_placed(model, best, rows) if best else model), placements
 
 

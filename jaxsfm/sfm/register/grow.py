@@ -15,7 +15,7 @@ from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
-from jaxsfm.io.photos import Reader
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.register.locate_view import Localization, locate
 from jaxsfm.sfm.register.triangulate import new_points
 
@@ -47,7 +47,7 @@ def grow(
     model: Model,
     unregistered: Mapping[str, UnregisteredView],
     matches: Mapping[Pair, PairResult],
-    read: Reader,
+    images: DeviceImages,
     *,
     refinement: Refinement | None,
     seed: int = 0,
@@ -57,7 +57,7 @@ def grow(
 
     Args:
       matches: of unregistered views with views and with each other, original pixels.
-      read: intensities of all these views, by name.
+      images: those of all these views, in working pixels.
       refinement: the model's; None: it was not refined.
       on_view: called for every view that is registered.
     """
@@ -77,7 +77,7 @@ def grow(
                 each.view,
                 part,
                 matches_with(name, around, matches),
-                read,
+                images,
                 refinement=refinement or Refinement(),
                 own_camera=each.own_camera,
                 seed=seed,
@@ -91,7 +91,7 @@ def grow(
         model = _with_located(model, located, fresh)
         placed += sorted(fresh)
         latest = set(fresh)
-        more = new_points(model, fresh, matches, read, refinement=refinement)
+        more = new_points(model, fresh, matches, images, refinement=refinement)
         model = model.with_tracks(model.tracks.joined(more))
 
 

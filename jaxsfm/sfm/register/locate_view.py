@@ -15,8 +15,8 @@ from jaxsfm.colmap.resection import MIN_POINTS, find_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.refine.octave_pose import (
     MAX_DOUBT_PX,
@@ -69,7 +69,7 @@ def locate(
     image: View,
     model: Model,
     matches: Mapping[Pair, PairResult],
-    read: Reader,
+    images: DeviceImages,
     *,
     refinement: Refinement,
     own_camera: bool,
@@ -80,7 +80,7 @@ def locate(
     Args:
       image: size, pixels and camera of the photo; its pose plays no part.
       matches: of the photo with the views, original pixels.
-      read: intensities of the photo and of the views, by name.
+      images: those of the photo and of the views, in working pixels.
       own_camera: estimate the focal length too. It is estimated from nothing, unless the camera's
         was known before (`has_prior_focal_length`).
     """
@@ -104,7 +104,7 @@ def locate(
         return _nowhere(len(xy), matches)
     pose = PoseHypothesis(view=found, own_camera=own_camera)
     if refinement.weak_octaves:
-        follow([pose], model, read, refinement)
+        follow([pose], model, images, refinement)
     best = trusted(pose)
     if best is None and near.sum() < MIN_COUNT:
         return Localization(

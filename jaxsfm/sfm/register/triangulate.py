@@ -11,7 +11,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.io.photos import Reader
+from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
@@ -117,7 +117,7 @@ def new_points(
     model: Model,
     fresh: Collection[str],
     matches: Mapping[Pair, PairResult],
-    read: Reader,
+    images: DeviceImages,
     *,
     refinement: Refinement | None,
 ) -> Tracks:
@@ -126,7 +126,7 @@ def new_points(
     Args:
       fresh: names of the views that are new in the model.
       matches: original pixels.
-      read: intensities by the name of a view.
+      images: those of the views, in working pixels.
       refinement: that of the model: the observations are moved onto one patch each, as the model's
         were. None: they stay where they were matched.
     """
@@ -134,7 +134,7 @@ def new_points(
     if refinement is None or len(found.tracks.points) < MIN_POINTS:
         return found.tracks
     limits = AlignmentLimits.of(refinement)
-    blocks = align_blocks(found, read, refinement, limits)
+    blocks = align_blocks(found, images, refinement, limits)
     parts = [part for block in blocks for part in block.observations()]
     aligned = found.with_tracks(Tracks.from_parts(found.tracks.points, parts))
     return _agreeing(aligned, refinement.max_error_px).tracks
