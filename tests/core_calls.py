@@ -368,7 +368,6 @@ def calls() -> dict[str, Call]:
         "bundle.pose_loss": Call(
             bundle.pose_loss, (around, around._replace(translations=_floats(9, 3, 3)))
         ),
-        "bundle_steps.triangulate": Call(bundle_steps.triangulate, (*around, *measured[1:3]), (0,)),
         "bundle_steps.residuals": Call(bundle_steps.residuals, (posed, measured), (0,)),
         "bundle_steps.derivatives": Call(
             _bind(bundle_steps.derivatives, exact=False), (posed, measured)
@@ -492,6 +491,7 @@ def calls() -> dict[str, Call]:
         "numerics.squared_norm": Call(numerics.squared_norm, (xy0,)),
         "numerics.inverse_norm": Call(numerics.inverse_norm, (xy0,)),
         "numerics.unit": Call(numerics.unit, (xy0,)),
+        "numerics.across": Call(jax.vmap(numerics.across), (_rows(0),)),
         "numerics.argmax_first": Call(_bind(numerics.argmax_first, axis=1), (xy0,)),
         "numerics.compact": Call(_bind(numerics.compact, size=30), (xy0[:, 0] > 0,)),
         "numerics.one_by_one": Call(

@@ -27,8 +27,8 @@ from jaxsfm.core.bundle_steps import (
     moved,
     residuals,
     solve,
-    triangulate,
 )
+from jaxsfm.core.homography import homogeneous
 from jaxsfm.core.numerics import at_least_float32, inverse_norm, unit
 
 CONVERGED_PX = 0.01
@@ -110,10 +110,11 @@ def adjust(
     fixed = lax.stop_gradient(measured)
 
     first = relative_to_first(start)
-    scene = Scene(first.rotations, first.translations, triangulate(*first, xy, weight))
+    scene = Scene(first.rotations, first.translations, _triangulated(first, xy, weight))
     scene = lax.stop_gradient(scene)
     posed = seen[:2].any(1).all() & (jnp.sum(scene.translations[1] ** 2) > 0)
     scene = lax.stop_gradient(levenberg_marquardt(scene, fixed, steps=steps))
+    posed &= jnp.any(seen.any(0) & (scene.points[:, 3] != 0))  # points at infinity show no shift
 
     # One Newton step, whose gradient is a function of what was measured and whose Hessian is
     # constant. Its value is nearly zero; its derivative is the one of the implicit function.
@@ -155,3 +156,13 @@ def pose_loss(cameras: Cameras, reference: Cameras) -> Float[Array, ""]:
     turned = jnp.sum((ours.rotations - theirs.rotations)[1:] ** 2, axis=(1, 2)) / 2
     apart = unit(ours.translations[1:]) - unit(theirs.translations[1:])
     return jnp.mean(turned + jnp.sum(apart**2, axis=-1))
+
+
+def _triangulated(cameras: Cameras, xy: Array, weight: Array) -> Float[Array, "p 4"]:
+    """Points by the direct linear transform (Hartley and Zisserman 2004, section 12.2)."""
+    rotations, translations, intrinsics = cameras
+    rays = einsum("cij,cpj->cpi", jnp.linalg.inv(intrinsics), homogeneous(xy))
+    poses = jnp.concatenate([rotations, translations[..., None]], axis=-1)[:, None]
+    rows = rays[..., :2, None] * poses[..., 2:, :] - poses[..., :2, :]
+    normal = einsum("cpki,cpkj->pij", rows * weight[..., None, None], rows)
+    return jnp.linalg.eigh(normal)[1][..., 0]

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsfm.core.homography import homogeneous
-from jaxsfm.core.numerics import HIGHEST, unit
+from jaxsfm.core.numerics import HIGHEST, across, unit
 
 einsum = functools.partial(jnp.einsum, precision=HIGHEST)
 triangular_solve = functools.partial(lax.linalg.triangular_solve, left_side=True, lower=True)
@@ -56,24 +55,6 @@ class Step(NamedTuple):
     """Whether the observations determine the cameras."""
 
 
-def triangulate(
-    rotations: Float[Array, "c 3 3"],
-    translations: Float[Array, "c 3"],
-    intrinsics: Float[Array, "c 3 3"],
-    xy: Float[Array, "c p 2"],
-    weight: Float[Array, "c p"],
-) -> Float[Array, "p 4"]:
-    """Homogeneous points by the direct linear transform.
-
-    Source: Hartley and Zisserman 2004, section 12.2.
-    """
-    rays = einsum("cij,cpj->cpi", jnp.linalg.inv(intrinsics), homogeneous(xy))
-    poses = jnp.concatenate([rotations, translations[..., None]], axis=-1)[:, None]
-    rows = rays[..., :2, None] * poses[..., 2:, :] - poses[..., :2, :]
-    normal = einsum("cpki,cpkj->pij", rows * weight[..., None, None], rows)
-    return jnp.linalg.eigh(normal)[1][..., 0]
-
-
 def residuals(scene: Scene, measured: Measured) -> Float[Array, "c p 2"]:
     """Projections minus keypoints, pixels."""
     over_points = jax.vmap(_residual, (None, None, None, 0, 0))
@@ -104,12 +85,11 @@ def derivatives(
             return jax.grad(half_cost)(origin), jax.hessian(half_cost)(origin)
         here, slopes = residual(origin), jax.jacfwd(residual)(origin)
         influence = weight / (1 + measured.sharpness * jnp.sum(here**2)) ** 2
-        gradient = influence * einsum("ki,k->i", slopes, here)
-        return gradient, influence * einsum("ki,kj->ij", slopes, slopes)
+        return tuple(influence * einsum("ki,k...->i...", slopes, x) for x in (here, slopes))
 
     over_points = jax.vmap(one, (None, None, None, None, 0, 0, 0, 0))
     over_cameras = jax.vmap(over_points, (0, 0, 0, 0, None, None, 0, 0))
-    free, tangents = _camera_basis(scene.translations), jax.vmap(_tangent)(scene.points)
+    free, tangents = _camera_basis(scene.translations), jax.vmap(across)(scene.points)
     cameras = scene.rotations, scene.translations, free, measured.intrinsics
     return over_cameras(*cameras, scene.points, tangents, measured.xy, measured.weight)
 
@@ -129,11 +109,8 @@ def solve(
     right = jnp.concatenate([mixed, gradients[..., 6:].sum(0)[..., None]], axis=-1)
     right = triangular_solve(lower, right)
     known = einsum("pik,pil->kl", right, right)
-
-    blocks = (
-        hessians[..., :6, :6].sum(1)[:, :, None] * jnp.eye(c, dtype=own.dtype)[:, None, :, None]
-    )
-    blocks = blocks.reshape(6 * c, 6 * c)
+    diagonal = jnp.eye(c, dtype=own.dtype)[:, None, :, None]
+    blocks = (hessians[..., :6, :6].sum(1)[:, :, None] * diagonal).reshape(6 * c, 6 * c)
     factor, solved = _cholesky(blocks, blocks - known[:-1, :-1], damping)
     down = gradients[..., :6].sum(1).reshape(-1, 1) - known[:-1, -1:]
     down = triangular_solve(factor, down)
@@ -153,8 +130,8 @@ def moved(scene: Scene, cameras: Float[Array, "c 6"], points: Float[Array, "p 3"
     rotations = 1.5 * rotations - 0.5 * einsum("cij,cjk->cik", rotations, square)
     translations = scene.translations + by[:, 3:]
     translations = translations.at[1].set(unit(translations[1]))
-    across = einsum("pij,pj->pi", jax.vmap(_tangent)(scene.points), points)
-    return Scene(rotations, translations, unit(scene.points + across))
+    to = scene.points + einsum("pij,pj->pi", jax.vmap(across)(scene.points), points)
+    return Scene(rotations, translations, unit(to))
 
 
 def levenberg_marquardt(scene: Scene, measured: Measured, *, steps: Int[Array, ""] | int) -> Scene:
@@ -164,8 +141,8 @@ def levenberg_marquardt(scene: Scene, measured: Measured, *, steps: Int[Array, "
         squared = jnp.sum(residuals(scene, measured) ** 2, axis=-1)
         return jnp.sum(measured.weight * squared / (1 + measured.sharpness * squared))
 
-    eps = jnp.finfo(scene.points.dtype).eps
-    enough = eps * jnp.sum(measured.weight)  # shifts of sqrt(eps) pixels
+    # This is the sum for shifts of sqrt(eps) pixels.
+    enough = jnp.finfo(scene.points.dtype).eps * jnp.sum(measured.weight)
 
     def more(state):
         *_, squared, count = state
@@ -182,8 +159,8 @@ def levenberg_marquardt(scene: Scene, measured: Measured, *, steps: Int[Array, "
         squared = jnp.where(step.solved, step.squared, jnp.inf)
         return scene, jnp.where(better, error, least), damping, squared, count + 1
 
-    damping, squared = (jnp.asarray(x, scene.points.dtype) for x in (1e-3, jnp.inf))
-    return lax.while_loop(more, one_step, (scene, cost(scene), damping, squared, jnp.int32(0)))[0]
+    numbers = (jnp.asarray(x, scene.points.dtype) for x in (1e-3, jnp.inf))
+    return lax.while_loop(more, one_step, (scene, cost(scene), *numbers, jnp.int32(0)))[0]
 
 
 def _residual(rotation: Array, translation: Array, k: Array, point: Array, xy: Array) -> Array:
@@ -194,8 +171,8 @@ def _residual(rotation: Array, translation: Array, k: Array, point: Array, xy: A
 
 
 def _cholesky(whole: Array, matrix: Array, damping: Array | float) -> tuple[Array, Array]:
-    """The lower factor of matrix + damping diag(whole), and whether every number is determined; if
-    one is not, the factor is the identity. Numbers that may not change get a diagonal of 1."""
+    """The lower factor of matrix + damping diag(whole), and whether it determines every number; if
+    not, the identity. Numbers that may not change get a diagonal of 1."""
     diagonal = jnp.diagonal(whole, axis1=-2, axis2=-1)
     eye = jnp.eye(whole.shape[-1], dtype=whole.dtype)
     more = jnp.where(diagonal == 0, 1.0, damping * diagonal)
@@ -203,8 +180,9 @@ def _cholesky(whole: Array, matrix: Array, damping: Array | float) -> tuple[Arra
     # A pivot is what is known of a number while those before it are free. If it is below this share
     # of what is known while they are held, it is rounding (2e-5 in float32; scenes have 2e-4).
     share = float(jnp.finfo(whole.dtype).eps) ** (2 / 3)
+    least = jnp.maximum(diagonal, share * diagonal.max(-1, keepdims=True)) * share
     pivots = jnp.diagonal(lower, axis1=-2, axis2=-1) ** 2
-    determined = jnp.all(pivots > share * diagonal, axis=-1)
+    determined = jnp.all((pivots > least) | (diagonal == 0), axis=-1)
     return jnp.where(determined[..., None, None], lower, eye), determined
 
 
@@ -212,14 +190,7 @@ def _camera_basis(translations: Float[Array, "c 3"]) -> Float[Array, "c 6 6"]:
     """How cameras move: the first not at all, the second at right angles to its translation."""
     basis = jnp.zeros((len(translations), 6, 6), translations.dtype)
     basis = basis.at[1:].set(jnp.eye(6, dtype=basis.dtype)).at[1, :, 5].set(0.0)
-    return basis.at[1, 3:, 3:5].set(_tangent(translations[1]))
-
-
-def _tangent(x: Float[Array, " n"]) -> Float[Array, "n m"]:
-    """Columns at right angles to a unit vector and to each other: those of the reflection that maps
-    the vector to the last axis (Householder's)."""
-    v = x.at[-1].add(jnp.where(x[-1] >= 0, 1.0, -1.0).astype(x.dtype))
-    return (jnp.eye(len(x), dtype=x.dtype) - 2 * v[:, None] * v / jnp.sum(v**2))[:, :-1]
+    return basis.at[1, 3:, 3:5].set(across(translations[1]))
 
 
 def _rotation(by: Float[Array, " 3"]) -> Float[Array, "3 3"]:

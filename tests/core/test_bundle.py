@@ -207,6 +207,8 @@ def degenerate(kind: str) -> tuple[Cameras, Observations]:
     if kind == "rotation only":
         image = observations_of(true._replace(translations=0 * true.translations), box)
         return true, seen._replace(xy=image.xy)
+    if kind == "one image twice":
+        return true, seen._replace(xy=np.stack([seen.xy[0]] * 3))
     if kind == "a line":
         image = observations_of(true, box * [1, 0, 0, 1] + [0, 0, 6, 0])
         return true, seen._replace(xy=image.xy)
@@ -217,7 +219,16 @@ def degenerate(kind: str) -> tuple[Cameras, Observations]:
 
 @pytest.mark.parametrize("x64", [False, True])
 @pytest.mark.parametrize(
-    "kind", ["four points", "one place", "rotation only", "a line", "no weights", "a blind camera"]
+    "kind",
+    [
+        "four points",
+        "one place",
+        "one image twice",
+        "rotation only",
+        "a line",
+        "no weights",
+        "a blind camera",
+    ],
 )
 def test_a_degenerate_scene_does_not_converge_and_its_gradient_is_zero(kind, x64):
     given = *degenerate(kind), scene(11, noise=0.0)[0]
