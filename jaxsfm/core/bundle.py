@@ -104,7 +104,7 @@ def adjust(
         lambda x: at_least_float32(jnp.asarray(x)), (start, observations)
     )
     xy, weight = observations
-    weight = jnp.where((weight > 0).sum(0) > 1, weight, 0.0)
+    weight = jnp.where((weight > 0).sum(0, dtype=jnp.int32) > 1, weight, 0.0)
     seen = weight > 0
     measured = Measured(start.intrinsics, xy, weight, jnp.asarray(scale, weight.dtype) ** -2)
     fixed = lax.stop_gradient(measured)
@@ -113,6 +113,8 @@ def adjust(
     scene = Scene(first.rotations, first.translations, _triangulated(first, xy, weight))
     scene = lax.stop_gradient(scene)
     posed = seen[:2].any(1).all() & (jnp.sum(scene.translations[1] ** 2) > 0)
+    numbers, views, points = (x.sum(dtype=jnp.int32) for x in (seen, seen.any(1), seen.any(0)))
+    posed &= 2 * numbers >= 6 * views + 3 * points - 7
     scene = lax.stop_gradient(levenberg_marquardt(scene, fixed, steps=steps))
     posed &= jnp.any(seen.any(0) & (scene.points[:, 3] != 0))  # points at infinity show no shift
 

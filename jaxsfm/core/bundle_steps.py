@@ -178,8 +178,8 @@ def _cholesky(whole: Array, matrix: Array, damping: Array | float) -> tuple[Arra
     more = jnp.where(diagonal == 0, 1.0, damping * diagonal)
     lower = lax.linalg.cholesky(matrix + more[..., None] * eye)
     # A pivot is what is known of a number while those before it are free. If it is below this share
-    # of what is known while they are held, it is rounding (2e-5 in float32; scenes have 2e-4).
-    share = float(jnp.finfo(whole.dtype).eps) ** (2 / 3)
+    # of what is known while they are held, it is rounding (1e-4 in float32; scenes have 2.5e-4).
+    share = 0.3 * float(jnp.finfo(whole.dtype).eps) ** 0.5
     least = jnp.maximum(diagonal, share * diagonal.max(-1, keepdims=True)) * share
     pivots = jnp.diagonal(lower, axis1=-2, axis2=-1) ** 2
     determined = jnp.all((pivots > least) | (diagonal == 0), axis=-1)

@@ -148,7 +148,7 @@ def test_the_gradient_of_a_pose_loss_reaches_the_scores_of_walks():
                 for by in (step, 0.0, -step)
             ]
         )
-    slope = sum(np.sum(g * w) for g, w in zip(here[1], way, strict=True))
+    slope = sum(np.sum(g * np.asarray(w)) for g, w in zip(here[1], way, strict=True))
     assert abs(slope) > 1e-6
     difference = (ahead[0] - behind[0]) / (2 * step)
     np.testing.assert_allclose(slope, difference, **tolerances.EXACT_GRADIENT)
