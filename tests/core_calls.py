@@ -20,6 +20,8 @@ from jaxsfm.core import (
     alexnet,
     align,
     blocks,
+    bundle,
+    bundle_steps,
     consensus,
     grid,
     interpolate,
@@ -185,6 +187,22 @@ def _cameras() -> tuple[np.ndarray, ...]:
     return k, k, rotation, _floats(6, 3)
 
 
+def _scene() -> tuple[bundle_steps.Scene, bundle_steps.Measured]:
+    """Three cameras beside each other, and twelve points before them."""
+    points = _floats(5, 12, 4, scale=0.3) + np.float32([0, 0, 3, 0.6])
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    scene = bundle_steps.Scene(
+        np.stack([np.eye(3, dtype=np.float32)] * 3),
+        np.float32([[0, 0, 0], [-1, 0, 0], [-2, 0.5, 0]]),
+        points,
+    )
+    k = np.stack([_cameras()[0]] * 3)
+    seen = (points[:, :3] + scene.translations[:, None] * points[:, 3:]) @ k[0].T
+    xy = seen[..., :2] / seen[..., 2:] + _floats(6, 3, 12, 2)
+    weight = np.abs(_floats(7, 3, 12)) + np.float32(0.1)
+    return scene, bundle_steps.Measured(k, xy, weight, np.float32(0.01))
+
+
 def _pair_shape(preset: str):
     return PRESETS[preset].pair
 
@@ -323,6 +341,10 @@ def calls() -> dict[str, Call]:
     one = np.float32(1)
     soft = {"temperature": 0.7}
     rgb, rgb_size = _photo(64, 64), np.asarray([60, 50], np.int32)
+    posed, measured = _scene()
+    around = bundle.Cameras(*posed[:2], measured.intrinsics)
+    slopes = _floats(8, 3, 12, 2, 9)
+    normal = np.einsum("cpki,cpkj->cpij", slopes, slopes)
     table = {
         "align.square_patch": Call(lambda: align.square_patch(2), (), (0,)),
         "interpolate.sample": Call(interpolate.sample, (image, image_size, at)),
@@ -338,6 +360,29 @@ def calls() -> dict[str, Call]:
         "blocks.convolve": Call(blocks.convolve, (x, size, layers)),
         "blocks.scores_and_pool": Call(
             _bind(blocks.scores_and_pool, large=True), (x, size, layers)
+        ),
+        "bundle.adjust": Call(
+            bundle.adjust, (around, bundle.Observations(*measured[1:3])), (0, 1, 2, 3)
+        ),
+        "bundle.relative_to_first": Call(bundle.relative_to_first, (around,), (0, 1)),
+        "bundle.pose_loss": Call(
+            bundle.pose_loss, (around, around._replace(translations=_floats(9, 3, 3)))
+        ),
+        "bundle_steps.residuals": Call(bundle_steps.residuals, (posed, measured), (0,)),
+        "bundle_steps.derivatives": Call(
+            _bind(bundle_steps.derivatives, exact=False), (posed, measured)
+        ),
+        "bundle_steps.derivatives[exact]": Call(
+            _bind(bundle_steps.derivatives, exact=True), (posed, measured)
+        ),
+        "bundle_steps.solve": Call(bundle_steps.solve, (slopes[:, :, 0], normal)),
+        "bundle_steps.moved": Call(
+            bundle_steps.moved,
+            (posed, _floats(8, 3, 6, scale=0.1), _floats(9, 12, 3, scale=0.1)),
+            (0, 1, 2),
+        ),
+        "bundle_steps.levenberg_marquardt": Call(
+            _bind(bundle_steps.levenberg_marquardt, steps=5), (posed, measured), (0, 1, 2)
         ),
         "coarse_to_fine.window_cells": Call(
             c2f.window_cells, (cells[:, 0], f0.coarse_grid, f0.fine_grid)
@@ -452,6 +497,7 @@ def calls() -> dict[str, Call]:
         "numerics.squared_norm": Call(numerics.squared_norm, (xy0,)),
         "numerics.inverse_norm": Call(numerics.inverse_norm, (xy0,)),
         "numerics.unit": Call(numerics.unit, (xy0,)),
+        "numerics.across": Call(jax.vmap(numerics.across), (_rows(0),)),
         "numerics.argmax_first": Call(_bind(numerics.argmax_first, axis=1), (xy0,)),
         "numerics.compact": Call(_bind(numerics.compact, size=30), (xy0[:, 0] > 0,)),
         "numerics.one_by_one": Call(
@@ -586,6 +632,9 @@ def calls() -> dict[str, Call]:
         ),
         "soft_matching.epipolar_loss": Call(
             soft_matching.epipolar_loss, (np.abs(_floats(0, 24, 24)), xy0, xy1, f)
+        ),
+        "soft_matching.observed": Call(
+            soft_matching.observed, ([xy0, xy1, xy1], [np.abs(_floats(0, 24, 24))] * 2), (0, 1)
         ),
         "soft_matching.pair_loss": Call(
             soft_matching.pair_loss,

@@ -2,6 +2,8 @@
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from jaxsfm.core.vgg import BLOCKS
 
@@ -306,3 +308,36 @@ def one_to_one(cells: np.ndarray, keep: np.ndarray, score: np.ndarray) -> np.nda
 def inliers(h, xy0, xy1, threshold: float) -> np.ndarray:
     """Points that h moves to less than `threshold` from their partners."""
     return np.linalg.norm(transfer(np.asarray(h, np.float64), xy0) - xy1, axis=1) < threshold
+
+
+def bundle_adjustment(cameras, points: np.ndarray, xy: np.ndarray, weight: np.ndarray) -> tuple:
+    """Rotations, translations and points of the least weighted sum of squared distances, found by
+    scipy from near the minimum, all poses free; afterwards in the frame of the first camera, with
+    the second at distance 1. The fourth result is the weighted root mean square distance."""
+    c = len(cameras.rotations)
+    turns = Rotation.from_matrix(cameras.rotations).as_rotvec()
+
+    def parts(x):
+        return x[: 3 * c].reshape(c, 3), x[3 * c : 6 * c].reshape(c, 3), x[6 * c :].reshape(-1, 3)
+
+    def residuals(x):
+        turns, shifts, points = parts(x)
+        out = []
+        for k in range(c):
+            seen = Rotation.from_rotvec(turns[k]).apply(points) + shifts[k]
+            image = seen @ cameras.intrinsics[k].T
+            distance = image[:, :2] / image[:, 2:] - xy[k]
+            out.append(np.sqrt(weight[k])[:, None] * distance)
+        return np.concatenate(out).ravel()
+
+    begin = np.concatenate([x.ravel() for x in (turns, cameras.translations, points)])
+    tight = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
+    found = least_squares(residuals, begin, jac="3-point", **tight)
+    turns, shifts, points = parts(found.x)
+    rotations = Rotation.from_rotvec(turns).as_matrix()
+    points = points @ rotations[0].T + shifts[0]
+    rotations = rotations @ rotations[0].T
+    shifts = shifts - rotations @ shifts[0]
+    length = np.linalg.norm(shifts[1])
+    error = np.sqrt(np.sum(found.fun**2) / np.sum(weight))
+    return rotations, shifts / length, points / length, error

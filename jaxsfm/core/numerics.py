@@ -67,6 +67,13 @@ def unit(x: Float[Array, "*batch c"]) -> Float[Array, "*batch c"]:
     return x * inverse_norm(x)[..., None]
 
 
+def across(x: Float[Array, " n"]) -> Float[Array, "n m"]:
+    """n - 1 columns at right angles to a unit vector and to each other: those of the reflection
+    that maps the vector to the last axis (Householder's)."""
+    v = x.at[-1].add(jnp.where(x[-1] >= 0, 1.0, -1.0).astype(x.dtype))
+    return (jnp.eye(len(x), dtype=x.dtype) - 2 * v[:, None] * v / jnp.sum(v**2))[:, :-1]
+
+
 def argmax_first(x: Float[Array, "*shape"], *, axis: int) -> tuple[Array, Array]:
     """The maximum along an axis, and the lowest index that reaches it.
 

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxsfm.core.bundle import Observations
 from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.losses import sampson_distances
-from jaxsfm.core.numerics import HIGHEST, unit
+from jaxsfm.core.numerics import HIGHEST, argmax_first, unit
 from jaxsfm.core.relocalize import relocalize
 from jaxsfm.core.scores import heads_of
 from jaxsfm.core.types import Levels
@@ -125,6 +126,28 @@ def epipolar_loss(
     squared = sampson_distances(f, xy0[:, None], xy1[None])
     error = squared / (squared + scale**2)
     return jnp.sum(matches * error) / (jnp.sum(matches) + 1e-12)
+
+
+def observed(
+    keypoints: Sequence[Float[Array, "_ 2"]], matches: Sequence[Float[Array, "n _"]]
+) -> Observations:
+    """Observations for `jaxsfm.core.bundle.adjust`: every cell of the first image is a point, which
+    each other image sees at the cell with the largest weight.
+
+    Gradients reach the keypoints, and through the weights the descriptors; which cell has the
+    largest weight is a decision without a gradient.
+
+    Args:
+      keypoints: of every image, pixels.
+      matches: for every image but the first, the weights of all pairs with it (`soft_mutual`).
+    """
+    xy, weight = [keypoints[0]], []
+    for places, weights in zip(keypoints[1:], matches, strict=True):
+        best, partner = argmax_first(weights, axis=1)
+        xy.append(places[partner])
+        weight.append(best)
+    # The first image sees a point as surely as the image that sees it best.
+    return Observations(jnp.stack(xy), jnp.stack([jnp.max(jnp.stack(weight), axis=0), *weight]))
 
 
 def pair_loss(

@@ -42,6 +42,14 @@ def test_unit_rows_have_norm_one(seed, size):
     np.testing.assert_allclose(np.linalg.norm(numerics.unit(jnp.asarray(x)), axis=1), 1.0, **UNIT)
 
 
+@settings(max_examples=20, deadline=None)
+@given(seeds, st.integers(2, 5))
+def test_columns_across_a_unit_vector_complete_it_to_an_orthonormal_basis(seed, n):
+    x = numerics.unit(jnp.asarray(rng_of(seed).normal(size=n), jnp.float32))
+    basis = np.column_stack([x, numerics.across(x)])
+    np.testing.assert_allclose(basis.T @ basis, np.eye(n), atol=1e-5)
+
+
 def test_the_unit_of_zero_is_zero_with_a_finite_gradient():
     zero = jnp.zeros((2, 4), jnp.float32)
     np.testing.assert_array_equal(numerics.unit(zero), zero)

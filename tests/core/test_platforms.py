@@ -17,7 +17,7 @@ from jax import export
 from strategies import rng_of
 
 from jaxsfm.config import PRESETS, PairShape
-from jaxsfm.core import align, features, pair, ransac, relocalize, sharded, soft_matching
+from jaxsfm.core import align, bundle, features, pair, ransac, relocalize, sharded, soft_matching
 from jaxsfm.core.backbones import BACKBONES
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair_shape import Products
@@ -106,6 +106,15 @@ def soft_pair():
     return gradient, given
 
 
+def adjustment():
+    def loss(start, seen, reference):
+        return bundle.pose_loss(bundle.adjust(start, seen, scale=3.0).cameras, reference)
+
+    cameras = bundle.Cameras(shaped(3, 3, 3), shaped(3, 3), shaped(3, 3, 3))
+    seen = bundle.Observations(shaped(3, 40, 2), shaped(3, 40))
+    return jax.value_and_grad(loss, argnums=(0, 1)), (cameras, seen, cameras)
+
+
 def walks(variant):
     scores = [shaped(HEIGHT // s, WIDTH // s) for s in (4, 2, 1)]
     cells = shaped(4 * COARSE, dtype=jnp.int32)
@@ -138,6 +147,7 @@ PROGRAMS = {
     "relocalize softly": lambda: walks("soft"),
     "relocalize straight-through": lambda: walks("straight-through"),
     "soft matching and its gradient": soft_pair,
+    "bundle adjustment and its gradient": adjustment,
     "templates": templates,
     "align": alignment,
 }
