@@ -48,11 +48,11 @@ def test_lanes_in_turn_are_the_function_with_and_without_batched_arguments():
     """Trees of arguments and results, keys, and vmaps in vmaps."""
 
     def draw(key, scale, pair):
-        return {"x": scale * jax.random.uniform(key, (3,)) + pair[0], "y": pair[1]}
+        return {"x": scale * jax.random.uniform(key, (3,), jnp.float32) + pair[0], "y": pair[1]}
 
     in_turn = in_turn_on_cpus(draw)
     keys = jax.random.split(jax.random.key(0), 6).reshape(2, 3)
-    pair = jnp.arange(6.0).reshape(2, 3), jnp.float32(7)
+    pair = jnp.arange(6, dtype=jnp.float32).reshape(2, 3), jnp.float32(7)
     axes = 0, None, (0, None)
     for vmapped in (jax.vmap, lambda f, axes: jax.vmap(jax.vmap(f, axes), axes)):
         some = (keys, pair) if vmapped is not jax.vmap else (keys[0], (pair[0][0], pair[1]))
@@ -70,7 +70,7 @@ def test_on_a_cpu_each_lane_of_a_loop_takes_its_own_turns_only():
     def count_to(end):
         return lax.while_loop(lambda x: x < end, add, jnp.int32(0))
 
-    ends = jnp.asarray([1, 6, 0])
+    ends = jnp.asarray([1, 6, 0], jnp.int32)
     found = jax.jit(jax.vmap(in_turn_on_cpus(count_to)))(ends)
     jax.effects_barrier()
     np.testing.assert_array_equal(found, ends)
