@@ -88,7 +88,7 @@ DATA_SETS: dict[str, DataSet] = {
         tuple(
             f"{name}/{part}" for name in _STRECHA_SETS for part in ("images", "gt_dense_cameras")
         ),
-        "strecha, daynight",
+        "strecha, daynight, ambiguous",
     ),
     "aachen": DataSet(
         "Aachen Day-Night 1.1: localization by day and night (Sattler et al., CVPR 2018)",

@@ -40,7 +40,7 @@ LONG = (
     "weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
-        for name in ("strecha", "daynight", "wxbs", "homography", "planes", "warps")
+        for name in ("strecha", "daynight", "ambiguous", "wxbs", "homography", "planes", "warps")
     ),
 )
 FENCED = re.compile(r"^```(?:bash|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)
