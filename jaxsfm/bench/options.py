@@ -4,22 +4,20 @@ Nothing heavy is imported here, so that `jaxsfm bench NAME --help` is quick.
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 
 
-def _names(values: Sequence[str]) -> list[str]:
+def split_names(values: Sequence[str]) -> list[str]:
     """Names separated by commas, blanks or both."""
     return [name for value in values for name in value.split(",") if name]
 
 
-def _check_side(size: int, option: str) -> None:
+def check_side(size: int, option: str) -> None:
     """Raise UserError for a working size that is too small."""
     if size < MIN_SIDE:
         raise UserError(f"{option} must be at least {MIN_SIDE} pixels; got {size}")
@@ -42,7 +40,7 @@ class BenchOptions:
         Raises:
           UserError: there is no name, or one that is not in `known`.
         """
-        names = _names(self.methods)
+        names = split_names(self.methods)
         if not names:
             raise UserError("--methods: none given")
         if unknown := [name for name in names if name not in known]:
@@ -51,23 +49,23 @@ class BenchOptions:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Sets(BenchOptions):
+class SetOptions(BenchOptions):
     sets: tuple[str, ...] | None = None
     """Names of the sets to use, separated by commas or blanks. Without it, all sets."""
 
     def chosen_sets(self) -> list[str] | None:
         """The names in `sets`; None stands for all."""
-        return None if self.sets is None else _names(self.sets)
+        return None if self.sets is None else split_names(self.sets)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Network(BenchOptions):
+class NetworkOptions(BenchOptions):
     network: WeightsChoice = USUAL_WEIGHTS
     """Which files the network's parameters are read from."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seeds(BenchOptions):
+class SeedOptions(BenchOptions):
     seeds: int = 5
     """How often each method is run, with seeds 0, 1, ..."""
 
@@ -77,7 +75,7 @@ class _Seeds(BenchOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlanesOptions(_Sets, _Seeds):
+class PlanesOptions(SetOptions, SeedOptions):
     """Options of `bench planes`."""
 
     root: Path
@@ -87,7 +85,7 @@ class PlanesOptions(_Sets, _Seeds):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class WarpsOptions(_Network, _Seeds):
+class WarpsOptions(NetworkOptions, SeedOptions):
     """Options of `bench warps`."""
 
     root: Path
@@ -99,7 +97,7 @@ class WarpsOptions(_Network, _Seeds):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PairOptions(_Sets, _Network, _Seeds):
+class PairOptions(SetOptions, NetworkOptions, SeedOptions):
     """Options of the benchmarks of image pairs.
 
     Attributes:
@@ -122,7 +120,7 @@ class PairOptions(_Sets, _Network, _Seeds):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.max_size is not None:
-            _check_side(self.max_size, "--max-size")
+            check_side(self.max_size, "--max-size")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,153 +146,3 @@ class HomographyOptions(PairOptions):
     """
 
     root: Path
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Runs(_Sets, _Network):
-    """Options of the benchmarks of whole reconstructions.
-
-    Attributes:
-      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
-        paper, default, robust: the presets. paper-grid, paper-learned: the preset paper with
-        keypoints at the centres of cells or at the largest learned scores. paper-grid-80px: the
-        same as paper-grid with the paper's threshold for it, 80 pixels. paper-naive: the preset
-        paper, with matches that are followed down to pixels instead of relocalization. paper-k4: K
-        = 4 instead of 2. paper-conv4, paper-pool5: the layers conv4_3/conv3_3 or pool5/conv5_3
-        instead of pool4/pool3. grid, reloc, learned:
-        the preset default without refinement; keypoints are at the centres of cells (grid), at the
-        largest norms (reloc) or at the largest learned scores (learned). PRESET-no-IDEA,
-        PRESET-norm and so on: as in bench wxbs. PRESET-no-placing: default or robust without the
-        separate placing of weak views.
-      threads: Number of COLMAP's threads; -1 uses all cores.
-    """
-
-    methods: tuple[str, ...]
-    threads: int = -1
-
-    def __post_init__(self) -> None:
-        from jaxsfm.runs.run_options import check_threads
-
-        check_threads(self.threads)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _OneSeed(_Runs):
-    seed: int = 0
-    """Seed of all random choices."""
-
-    def __post_init__(self) -> None:
-        from jaxsfm.runs.run_options import check_seed
-
-        super().__post_init__()
-        check_seed(self.seed)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StrechaOptions(_OneSeed):
-    """Options of `bench strecha`.
-
-    Attributes:
-      root: Folder of the sets: SET/images/K.txt, SET/gt_dense_cameras/*.camera.
-      intrinsics: known: the cameras are those of the sets' K.txt and stay fixed. unknown: each
-        photo has its own camera, which is guessed and refined.
-      best_pairs: Map only the N pairs of each image that have the most inliers; the paper has N =
-        5. rootsift maps all pairs.
-      out: Folder for databases and models. A later run continues from what is there.
-    """
-
-    root: Path
-    methods: tuple[str, ...] = ("rootsift,grid,reloc,default",)
-    intrinsics: Literal["known", "unknown"] = "known"
-    best_pairs: int | None = None
-    out: Path | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.best_pairs is not None and self.best_pairs < 1:
-            raise UserError(f"--best-pairs must be at least 1; got {self.best_pairs}")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DayNightOptions(_OneSeed):
-    """Options of `bench daynight`.
-
-    Attributes:
-      root: Folder of the data. It has scenes (SCENE/day, SCENE/night and SCENE/reference), or
-        Strecha sets, or Aachen Day-Night. In Strecha sets, each photo in turn is replaced by a
-        synthetic night photo.
-      subsets: Aachen only: a file with the subsets, such as the 98 of the paper. Each line names a
-        night photo and then its day photos, as paths below images_upright. Without it, the subsets
-        are those of image_pairs_to_match.txt.
-      poses: Aachen only: write the poses of the night photos to FOLDER/Aachen_eval_METHOD.txt, for
-        the evaluation server, because the reference poses of these photos are not public.
-      curves: Write the cumulative curves of the nights' position and rotation errors to this PNG
-        file (figure 4 of the paper). The errors themselves are in the --json file.
-      severity: How dark the synthetic night is. 0 is day, 1 is clean, 2 is noisy, 3 is dark, 5 is
-        nothing but noise.
-      denoise: Whether the camera of the synthetic night removes noise.
-      jpeg: Whether the camera of the synthetic night stores JPEG.
-    """
-
-    root: Path
-    methods: tuple[str, ...] = ("rootsift,paper-grid,paper,default,robust",)
-    subsets: Path | None = None
-    poses: Path | None = None
-    curves: Path | None = None
-    severity: float = 2.0
-    denoise: bool = True
-    jpeg: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (math.isfinite(self.severity) and self.severity >= 0):
-            raise UserError(f"--severity must be at least 0; got {self.severity}")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class AmbiguousOptions(_Runs, _Seeds):
-    """Options of `bench ambiguous`.
-
-    Attributes:
-      root: Folder of sets in the layout of bench strecha: SET/images/K.txt,
-        SET/gt_dense_cameras/*.camera. Without it, only synthetic scenes are used.
-      sets: Names of sets in --root and of synthetic scenes, separated by commas or blanks. Without
-        it, all sets of --root and all synthetic scenes. The scenes are synthetic-KIND,
-        synthetic-KIND-poster (one poster) and synthetic-KIND-posters (a poster on every repeat but
-        one). KIND is room, tower, box or street; a room has no more than one poster.
-      methods: Methods to compare, separated by commas or blanks. colmap: every verified pair of
-        default, given to COLMAP's incremental mapper. colmap-global: the same for COLMAP's global
-        mapper. The others are those of bench strecha.
-      sizes: Limits for the longer side of a photo in pixels, separated by commas or blanks.
-        Synthetic scenes are rendered at this size.
-      seeds: How often each method is run, with seeds 0, 1, ... Synthetic scenes are drawn from the
-        same seeds.
-      out: Folder for scenes, databases and models. A later run continues from what is there.
-    """
-
-    root: Path | None = None
-    sets: tuple[str, ...] | None = None
-    methods: tuple[str, ...] = ("rootsift,colmap,colmap-global,default,robust",)
-    sizes: tuple[str, ...] = ("800",)
-    seeds: int = 1
-    out: Path | None = None
-
-    def __post_init__(self) -> None:
-        _Runs.__post_init__(self)
-        _Seeds.__post_init__(self)
-        self.chosen_sizes()
-
-    def chosen_sizes(self) -> list[int]:
-        """The numbers in `sizes`.
-
-        Raises:
-          UserError: there is no number, or one that is too small.
-        """
-        texts = _names(self.sizes)
-        if not texts:
-            raise UserError("--sizes: none given")
-        for text in texts:
-            if not text.isascii() or not text.isdigit():
-                raise UserError(f"--sizes: {text!r} is not a number of pixels")
-            _check_side(int(text), "--sizes")
-        return [int(text) for text in texts]

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import cv2
 
 from jaxsfm.bench.inputs import check_root, choose_sets, usable_image
+from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night import synthetic_night
-from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.strecha_sets import strecha_intrinsics
 from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import Poses, read_poses

@@ -5,13 +5,11 @@ from typing import Annotated, TypeVar
 
 import tyro
 
+from jaxsfm.bench.model_options import AmbiguousOptions, DayNightOptions, StrechaOptions
 from jaxsfm.bench.options import (
-    AmbiguousOptions,
     BenchOptions,
-    DayNightOptions,
     HomographyOptions,
     PlanesOptions,
-    StrechaOptions,
     WarpsOptions,
     WxbsOptions,
 )
