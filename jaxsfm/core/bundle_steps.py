@@ -97,6 +97,7 @@ def derivatives(
 def solve(
     gradients: Float[Array, "c p 9"],
     hessians: Float[Array, "c p 9 9"],
+    *,
     damping: Float[Array, ""] | float = 0.0,
 ) -> Step:
     """The step -(H + damping diag(H))^-1 g. It is linear in the gradients."""
@@ -150,7 +151,7 @@ def levenberg_marquardt(scene: Scene, measured: Measured, *, steps: Int[Array, "
 
     def one_step(state):
         scene, least, damping, _, count = state
-        step = solve(*derivatives(scene, measured, exact=False), damping)
+        step = solve(*derivatives(scene, measured, exact=False), damping=damping)
         there = moved(scene, step.cameras, step.points)
         error = cost(there)
         better = step.solved & (error <= least)
