@@ -102,8 +102,8 @@ class Config:
     only rounds."""
     products: Products = "float32"
     """Type of the descriptors whose products decide which cells match. Sums are float32. The types
-    of 16 bits are meant for accelerators, where they halve the memory of a photo; on CPUs they only
-    round."""
+    of 16 bits halve the memory of a photo's joined descriptors. Accelerators also multiply them
+    faster; CPUs convert them to float32 first."""
     keypoints: Keypoints = "relocalized"
     """Where the keypoint of a fine cell lies: at the pixel that it walks to by the largest norms
     (the rule of the paper) or by learned scores (`jaxsfm.io.relocalizer`), or at the centre of the

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import tyro
 
 from jaxsfm.bench.accelerator_programs import (
-    Photos,
+    PaddedPhotos,
     agreement,
     compiled_programs,
     rendered_photos,
@@ -85,7 +85,7 @@ def device_rates() -> Rates:
 
 
 def measure(
-    weights: Weights, name: str, config: Config, photos: Photos, rates: Rates
+    weights: Weights, name: str, config: Config, photos: PaddedPhotos, rates: Rates
 ) -> tuple[list[Measured], Found]:
     """Images and pairs of one preset on the first device, and what the pair's work depends on."""
     first = jax.devices()[0]

@@ -27,7 +27,7 @@ ENOUGH = 64
 """Images, or pairs, of which batches are made: as many as a run has at least."""
 
 
-class Photos(NamedTuple):
+class PaddedPhotos(NamedTuple):
     """Two padded photos, as a run gives them to the device."""
 
     images: np.ndarray
@@ -37,14 +37,14 @@ class Photos(NamedTuple):
     num_coarse: int
 
 
-def rendered_photos(width: int, height: int) -> Photos:
+def rendered_photos(width: int, height: int) -> PaddedPhotos:
     """Two neighbouring views of the rendered room."""
     views = [render(room(), arc(7)[k], (width, height)) for k in (2, 3)]
     rows, columns = padded_size((width, height))
     images = np.zeros((2, rows, columns, 3), np.uint8)
     images[:, :height, :width] = views
     size = np.asarray([height, width], np.int32)
-    return Photos(images, size, feature_capacity((width, height)).num_coarse)
+    return PaddedPhotos(images, size, feature_capacity((width, height)).num_coarse)
 
 
 class Programs(NamedTuple):
@@ -53,13 +53,15 @@ class Programs(NamedTuple):
     extract: Callable[[], object]
     match: Callable[[], object]
     images: int
+    """Number of photos in a batch."""
     pairs: int
+    """Number of pairs in a batch."""
     bytes_per_image: float
     bytes_per_pair: float
     keypoints: np.ndarray
-    """Of both photos, (2, cells, 2)."""
+    """The keypoints of both photos, (2, cells, 2)."""
     matches: PairMatches
-    """Of the first pair, on the host."""
+    """The matches of the first pair, on the host."""
     found: Found
 
 
@@ -68,7 +70,10 @@ def _program_bytes(compiled: jax.stages.Compiled) -> float:
     return float(memory.temp_size_in_bytes + memory.output_size_in_bytes) if memory else 0.0
 
 
-def compiled_programs(weights: Weights, config: Config, photos: Photos, mesh: Mesh) -> Programs:
+def compiled_programs(
+    weights: Weights, config: Config, photos: PaddedPhotos, mesh: Mesh
+) -> Programs:
+    """Compile the programs of a preset for the first device of a mesh, and run each once."""
     execution, device = Execution(), mesh.devices.flat[0]
     pixels = photos.images.shape[1] * photos.images.shape[2]
     images = images_at_once(execution, mesh, pixels, ENOUGH)

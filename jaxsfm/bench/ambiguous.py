@@ -20,11 +20,11 @@ from jaxsfm.bench.strecha import CameraErrors, camera_errors
 from jaxsfm.bench.strecha_models import MethodRun, set_models, take_matches
 from jaxsfm.bench.strecha_sets import StrechaSet, find_sets, read_set
 from jaxsfm.colmap.poses import model_poses
-from jaxsfm.errors import writing
+from jaxsfm.errors import UserError, writing
 
 SAME_MATCHES = ("default", *MAPPERS)
 """Methods that have the same matches, which are computed once."""
-SHOWN = 4
+GROUPS_SHOWN = 4
 """The number of groups that the table shows; the JSON file has all of them."""
 
 
@@ -71,10 +71,12 @@ def _choose(options: AmbiguousOptions) -> dict[str, Path | None]:
       UserError: there are no sets in --root, or a name is unknown.
     """
     found = {} if options.root is None else {f.name: f for f in find_sets(options.root, None)}
+    if taken := sorted(found.keys() & set(SCENES)):
+        raise UserError(f"--root {options.root}: {taken[0]} is the name of a synthetic scene")
     places: dict[str, Path | None] = {**found, **dict.fromkeys(SCENES)}
     chosen = options.chosen_sets()
     names = list(places) if chosen is None else chosen
-    where = options.root or "the list of synthetic scenes"
+    where = "the synthetic scenes" if options.root is None else f"{options.root} or synthetic"
     return {name: places[name] for name in choose_sets({n: n for n in places}, names, where)}
 
 
@@ -156,8 +158,8 @@ def counts(rows: list[AmbiguousRow]) -> Counts:
 
 
 def _sizes(sizes: list[int]) -> str:
-    """The sizes of groups as text, with no more than `SHOWN` of them."""
-    return "+".join([*map(str, sizes[:SHOWN]), *["..."] * (len(sizes) > SHOWN)])
+    """The sizes of groups as text, with no more than `GROUPS_SHOWN` of them."""
+    return "+".join([*map(str, sizes[:GROUPS_SHOWN]), *["..."] * (len(sizes) > GROUPS_SHOWN)])
 
 
 def cells(row: AmbiguousRow) -> Cells:

@@ -93,7 +93,9 @@ RUN_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-
 MAPPERS: dict[str, Mapper] = {"colmap": "incremental", "colmap-global": "global"}
 """Methods that hand the matches of `default` to COLMAP: every verified pair, to this mapper.
 
-Neither our view graph nor our refinement takes part.
+Neither our view graph nor our refinement takes part. As for all methods, the mapper is started
+again from other initial pairs if its model lacks photos, and the global mapper is tried if the
+incremental one gives no model (`jaxsfm.colmap.mapper.build_models`).
 """
 _MAPPED = dataclasses.replace(CONFIGS["default"], view_graph=False, refinement=None)
 AMBIGUOUS_METHODS = (*RUN_METHODS, *MAPPERS)

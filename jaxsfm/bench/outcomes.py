@@ -32,7 +32,7 @@ may be misplaced without the model being another one."""
 WHOLE = 0.9
 """A right model is whole if it has at least this share of the photos, as for the mapper
 (`jaxsfm.colmap.mapper.MISSING`)."""
-PART = 3
+MIN_PHOTOS = 3
 """Models of fewer photos are not judged: two photos agree with nearly every third."""
 
 Outcome = Literal["right", "split", "wrong, noticed", "wrong, not noticed", "no model"]
@@ -43,8 +43,8 @@ OUTCOMES: tuple[Outcome, ...] = (
     "wrong, not noticed",
     "no model",
 )
-"""Right: the largest model is right, and whole. Split: it is right but not whole, and so is every
-other model, so only their connection is missing. Wrong: a model is not right; the run said so
+"""Right: every model is right, and the largest is whole. Split: every model is right, but the
+largest is not whole, so only connections are missing. Wrong: a model is not right; the run said so
 (`doubt`), or it did not."""
 
 
@@ -144,7 +144,7 @@ def _fitted(ours: _Arrays, reference: _Arrays, member: np.ndarray, limit: float)
     source, target = ours.centres[member], reference.centres[member]
     for centres in (source, target):
         spread = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
-        if len(centres) < PART or spread[1] <= COLLINEAR * spread[0]:
+        if len(centres) < MIN_PHOTOS or spread[1] <= COLLINEAR * spread[0]:
             return member
     fit: Similarity = umeyama(source, target)
     off = fit.scale * ours.centres @ fit.rotation.T + fit.translation - reference.centres
@@ -160,7 +160,7 @@ def judge(models: Sequence[Poses], truth: Poses, *, noticed: bool) -> Judgement:
       truth: the reference poses of all photos that should be registered.
       noticed: whether the run says that its model may be wrong.
     """
-    judged = [model for model in models if len(pair_names(model, truth)) >= PART]
+    judged = [model for model in models if len(pair_names(model, truth)) >= MIN_PHOTOS]
     if not judged:
         return Judgement("no model", [])
     sizes = [[len(group) for group in groups(model, truth)] for model in judged]

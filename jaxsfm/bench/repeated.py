@@ -51,7 +51,8 @@ class RepeatedScene(NamedTuple):
     posters: list[TexturedPlane]
     """A poster for each repeat except the last. Those that hang are also among the planes."""
     facing: CameraPose
-    """A camera that sees nothing but the first repeat and what repeats with it."""
+    """A camera that sees nothing but the first repeat and what repeats with it. It and `step` say
+    what the scene promises, and serve its tests."""
 
 
 def _around(
@@ -187,5 +188,6 @@ def write_repeated(folder: Path, name: str, seed: int, size: tuple[int, int]) ->
         for i, pose in enumerate(scene.poses):
             photo = f"view{i:02d}.png"
             rgb = render(scene.planes, pose, size)
-            cv2.imwrite(str(images / photo), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+            if not cv2.imwrite(str(images / photo), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
+                raise OSError(f"{images / photo} cannot be written")
             (cameras / f"{photo}.camera").write_text(camera_text(k, pose, size))

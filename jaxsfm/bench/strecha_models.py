@@ -17,6 +17,7 @@ from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
+from jaxsfm.errors import writing
 from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.io.pairs import best_pairs, exhaustive_pairs
 from jaxsfm.io.weights import chosen_weights
@@ -62,7 +63,7 @@ class SetModels(NamedTuple):
     models: "list[pycolmap.Reconstruction]"
     """The one with most images first; empty if there is none."""
     seconds: dict[str, float]
-    """Of each stage."""
+    """The time of each stage."""
     report: RunReport | None
     """What the run says of its models; None for methods that are not runs of ours."""
 
@@ -83,9 +84,9 @@ def take_matches(work: Path, other: Path) -> None:
     A folder that is there already stays as it is. A run in the new folder uses those matches that
     its own settings would give, and computes the rest.
     """
-    if work.exists() or not (other / RECORD).is_file():
+    if work.exists() or not (other / RECORD).is_file() or not (other / "matches").is_dir():
         return
-    with atomic_folder(work) as fresh:
+    with writing(f"--out {work}"), atomic_folder(work) as fresh:
         shutil.copytree(other / "matches", fresh / "matches")
         for name in (RECORD, SECONDS):
             if (other / name).is_file():

@@ -29,7 +29,7 @@ from jaxsfm.core.bundle_steps import (
     solve,
 )
 from jaxsfm.core.homography import homogeneous
-from jaxsfm.core.numerics import at_least_float32, inverse_norm, unit
+from jaxsfm.core.numerics import inverse_norm, unit
 
 CONVERGED_PX = 0.01
 """An adjustment has converged if its last Newton step moves projections by less than this (root
@@ -91,8 +91,8 @@ def adjust(
     Args:
       start: two cameras or more in any frame and of any scale; the first two at different places.
       scale: the distance, pixels, beyond which a keypoint loses influence (Geman and McClure's
-        loss). By default it is infinite, which gives least squares.
-      steps: the most steps.
+        loss); above 0. By default it is infinite, which gives least squares.
+      steps: the largest number of steps.
 
     Raises:
       ValueError: there are fewer than two cameras.
@@ -100,10 +100,10 @@ def adjust(
     count = len(start.rotations)
     if count < 2:
         raise ValueError(f"bundle adjustment needs two cameras or more, but was given {count}")
-    start, observations = jax.tree.map(
-        lambda x: at_least_float32(jnp.asarray(x)), (start, observations)
-    )
-    xy, weight = observations
+    given = jax.tree.map(jnp.asarray, (start, observations))
+    wide = any(x.dtype == jnp.float64 for x in jax.tree.leaves(given))
+    dtype = jnp.float64 if wide else jnp.float32
+    start, (xy, weight) = jax.tree.map(lambda x: x.astype(dtype), given)
     weight = jnp.where((weight > 0).sum(0, dtype=jnp.int32) > 1, weight, 0.0)
     seen = weight > 0
     measured = Measured(start.intrinsics, xy, weight, jnp.asarray(scale, weight.dtype) ** -2)

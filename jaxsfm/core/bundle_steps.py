@@ -68,7 +68,8 @@ def derivatives(
     """Gradient and Hessian of half the cost of each keypoint, in the steps of its camera (6) and of
     its point (3). If not `exact`, the Hessian is that of Gauss and Newton."""
 
-    def one(rotation, translation, basis, k, point, tangent, xy, weight):
+    def one(camera, place, xy, weight):
+        (rotation, translation, basis, k), (point, tangent) = camera, place
         origin = jnp.zeros(9, xy.dtype)
 
         def residual(step):
@@ -87,11 +88,10 @@ def derivatives(
         influence = weight / (1 + measured.sharpness * jnp.sum(here**2)) ** 2
         return tuple(influence * einsum("ki,k...->i...", slopes, x) for x in (here, slopes))
 
-    over_points = jax.vmap(one, (None, None, None, None, 0, 0, 0, 0))
-    over_cameras = jax.vmap(over_points, (0, 0, 0, 0, None, None, 0, 0))
+    over_cameras = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (0, None, 0, 0))
     free, tangents = _camera_basis(scene.translations), jax.vmap(across)(scene.points)
     cameras = scene.rotations, scene.translations, free, measured.intrinsics
-    return over_cameras(*cameras, scene.points, tangents, measured.xy, measured.weight)
+    return over_cameras(cameras, (scene.points, tangents), measured.xy, measured.weight)
 
 
 def solve(

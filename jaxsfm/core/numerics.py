@@ -29,7 +29,7 @@ def descriptor_products(
 
     Descriptors of 16 bits are multiplied as they are on accelerators. CPUs convert them to float32
     first. Both multiply the same numbers: the product of two numbers of 16 bits has at most 22
-    digits, so float32 holds it exactly. Only the order of the sums differs.
+    binary digits, so float32 holds it exactly. Only the order of the sums differs.
     """
     converted = functools.partial(_converted_products, subscripts)
     if a.dtype != b.dtype or a.dtype.itemsize > 2:
@@ -69,7 +69,7 @@ def unit(x: Float[Array, "*batch c"]) -> Float[Array, "*batch c"]:
 
 def across(x: Float[Array, " n"]) -> Float[Array, "n m"]:
     """n - 1 columns at right angles to a unit vector and to each other: those of the reflection
-    that maps the vector to the last axis (Householder's)."""
+    that maps the vector to the last axis or to its opposite (Householder's)."""
     v = x.at[-1].add(jnp.where(x[-1] >= 0, 1.0, -1.0).astype(x.dtype))
     return (jnp.eye(len(x), dtype=x.dtype) - 2 * v[:, None] * v / jnp.sum(v**2))[:, :-1]
 

@@ -46,7 +46,7 @@ class DeviceFeatures(NamedTuple):
 
 
 def put_on_devices(
-    features: ImageFeatures, num_coarse: int, mesh: Mesh, *, products: Products = "float32"
+    features: ImageFeatures, num_coarse: int, mesh: Mesh, *, products: Products
 ) -> DeviceFeatures:
     """Join an image's octaves on all devices of a mesh, padded to `num_coarse` coarse cells."""
     bare = features.dense._replace(coarse=(), fine=())

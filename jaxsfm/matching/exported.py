@@ -55,7 +55,8 @@ def export_programs(
       size: (width, height) of the photos, at most `config.max_size`; they are not reduced.
       platforms: the platforms that the programs can run on.
       batch: the extraction is for any number of photos. CPUs compute them in turn, and accelerators
-        all together, with about 3000 bytes of memory for each pixel.
+        all together. `jaxsfm.matching.execution.ACCELERATOR_BYTES_PER_PIXEL` is the memory that a
+        run plans for.
 
     Raises:
       UserError: flatbuffers is not installed.

@@ -121,10 +121,13 @@ def test_a_small_run_measures_every_preset_and_writes_its_figures(tmp_path, caps
     assert accelerator.main(size=(128, 128), presets=("paper",), json=file) == 0
     printed = capsys.readouterr().out
     figures = json.loads(file.read_text())
-    assert [row["what"] for row in figures["rows"]] == ["images", "pairs"]
+    measured = [(row["numbers"], row["what"]) for row in figures["rows"]]
+    assert measured == [
+        (kind, what) for kind in ("float32", "bfloat16") for what in ("images", "pairs")
+    ]
     for row in figures["rows"]:
         assert row["per_second"] > 0 and 0 < row["products"] < 2 and row["megabytes"] > 0
-        assert f"| {row['preset']} | {row['what']} |" in printed
+        assert f"| {row['preset']} | {row['numbers']} | {row['what']} |" in printed
     assert figures["found"]["paper"]["tentative"] > 0
     assert all(device.name in printed for device in DEVICES)
 

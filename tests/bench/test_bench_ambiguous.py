@@ -78,9 +78,17 @@ def test_the_table_ends_with_the_number_of_each_outcome_of_each_method():
 
 def test_sizes_are_numbers_separated_by_commas_or_blanks():
     assert AmbiguousOptions(sizes=("400,600", "800")).chosen_sizes() == [400, 600, 800]
-    for sizes, word in ((("400,x",), "'x'"), (("",), "none given"), (("8",), "at least")):
+    assert AmbiguousOptions(sizes=("400,400",)).chosen_sizes() == [400]
+    wrong = (("400,x", "'x'"), ("", "none given"), ("8", "at least"), ("60", "three quarters"))
+    for sizes, word in wrong:
         with pytest.raises(UserError, match=word):
-            AmbiguousOptions(sizes=sizes)
+            AmbiguousOptions(sizes=(sizes,))
+
+
+def test_a_set_may_not_be_called_as_a_synthetic_scene(strecha, tmp_path, capsys):
+    shutil.copytree(strecha / "room", tmp_path / "synthetic-box")
+    assert main(["bench", "ambiguous", "--root", str(tmp_path), "--sets", "synthetic-box"]) == 2
+    assert "synthetic-box is the name of a synthetic scene" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -204,8 +204,9 @@ SYMBOLIC = {
     "templates": (any_templates, {"h", "w", "keypoints"}),
     "align": (any_alignment, {"h", "w", "keypoints"}),
 }
-"""Programs that are lowered once for all sizes, and the sizes that are not known then. The sizes of
-photos and of lists of cells are not among them (docs/decisions/accelerators.md)."""
+"""Programs that are lowered once for all sizes, and the sizes that are not known then. For
+extraction and matching, the sizes of photos and of lists of cells are not among them
+(docs/decisions/accelerators.md)."""
 
 
 @pytest.mark.parametrize("name", SYMBOLIC)

@@ -17,15 +17,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsfm
+from jaxsfm.cli.config_options import MatchingChoice
 from jaxsfm.config import Config, preset
 from jaxsfm.core.features import stored
 from jaxsfm.core.layers import FINE_STRIDES
 from jaxsfm.core.octaves import join_octaves
-from jaxsfm.core.sharded import device_mesh
+from jaxsfm.core.sharded import device_mesh, join_everywhere
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import feature_capacity, image_capacity
 from jaxsfm.io.images import ImageError, read_image
-from jaxsfm.matching import execution
+from jaxsfm.matching import device_cache, execution
 from jaxsfm.matching.device_cache import ImageCache, tile_order
 from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.extraction import extract_images, image_features
@@ -314,3 +315,29 @@ def test_executions_refuse_what_makes_no_sense():
             Execution(**wrong)
     with pytest.raises(UserError, match="--devices 99: there are"):
         execution.select_devices(Execution(devices=99))
+
+
+@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+def test_matches_are_computed_from_descriptors_of_the_type_that_the_config_says(
+    features, monkeypatch, products
+):
+    """The option, the config and the arrays on the device agree."""
+    config = MatchingChoice(preset="paper", products=products).config()
+    assert config.products == products
+    seen = []
+
+    def noted(*args, **kwargs):
+        found = join_everywhere(*args, **kwargs)
+        seen.append(found)
+        return found
+
+    monkeypatch.setattr(device_cache, "join_everywhere", noted)
+    bare = [
+        each._replace(
+            dense=each.dense._replace(coarse=each.dense.coarse[:1], fine=each.dense.fine[:1])
+        )
+        for each in list(features.values())[:2]
+    ]
+    match_features(*bare, config=config)
+    assert len(seen) == 2
+    assert {x.dtype.name for each in seen for x in (each.coarse, each.fine)} == {products}

@@ -48,18 +48,20 @@ FILES = ("jaxsfm/core", "jaxsfm/sfm/refine", "jaxsfm/sfm/register", "jaxsfm/sfm/
 ALIGN = ("tests/core/test_align.py", "tests/core/test_alignment_noise.py")
 NUMERICS, BACKBONES = "tests/core/test_numerics_and_grid.py", "tests/core/test_backbones.py"
 PAIR, BATCHES = "tests/core/test_pair.py", "tests/matching/test_batches.py"
+PRODUCTS = "tests/core/test_products.py"
 REFINE, WEAK = "tests/sfm/test_refine.py", "tests/sfm/test_weak_views.py"
 DEVICE = "tests/sfm/test_device_images.py"
 TESTS: dict[str, tuple[str, ...]] = {
     "core/alexnet": (BACKBONES,),
     "core/align": ALIGN,
     "core/blocks": ("tests/core/test_blocks.py", "tests/core/test_vgg.py"),
+    "core/bundle_steps": ("tests/core/test_bundle.py",),
     "core/features": ("tests/core/test_features.py", BACKBONES),
     "core/grid": (NUMERICS,),
     "core/interpolate": ALIGN,
     "core/night": ("tests/core/test_night_model.py", "tests/core/test_views.py"),
-    "core/numerics": (NUMERICS,),
-    "core/octaves": ("tests/core/test_octaves.py",),
+    "core/numerics": (NUMERICS, PRODUCTS),
+    "core/octaves": ("tests/core/test_octaves.py", PRODUCTS),
     "core/pair_shape": ("tests/core/test_presets.py", "tests/core/test_platforms.py"),
     "core/ransac": ("tests/core/test_ransac.py", "tests/core/test_planes.py"),
     "core/sharded": (BATCHES,),

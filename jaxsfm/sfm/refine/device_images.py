@@ -33,7 +33,7 @@ class DeviceImages:
     def octave(self, px: int) -> "DeviceImages":
         """The same images with pixels `px` times as large, in the same memory."""
         reduced = copy.copy(self)
-        reduced._px = px
+        reduced._px = self._px * px
         return reduced
 
     def take(self, name: str) -> PaddedImage:

@@ -79,6 +79,8 @@ def align_matches(
     on_plane, affine = pixels1.from_original(on_plane), affine * s0 / s1[:, None]
     patch, limits = square_patch(DEFAULTS.radius), AlignmentLimits.of(DEFAULTS)
     aligned = np.zeros(len(xy1), bool)
+    if not len(xy1):
+        return AlignedMatches(pixels1.to_original(xy1), aligned)
     for px in (2**octave for octave in reversed(range(octaves))):
         image0, image1 = (padded(block_means(image, px)) for image in (gray0, gray1))
         octave = Pixels.octave(px)

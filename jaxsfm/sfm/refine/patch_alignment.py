@@ -104,8 +104,9 @@ Started = TypeVar("Started")
 def overlapped(work: Iterable[Started]) -> Iterator[Started]:
     """Yield each piece of work when it is done, which is after the next one has been started.
 
-    So the device has work while the host prepares more. Whoever iterates knows that everything is
-    done but the two latest pieces, and what only the earlier ones used may be dropped.
+    So the device has work while the host prepares more. When a piece is yielded, it and all before
+    it are done, and only the next one may still run. What only the earlier ones used may be
+    dropped.
 
     Args:
       work: starts a piece when it is asked for the next one, and gives its arrays, of which some

@@ -214,5 +214,7 @@ def align_blocks(
         moved, agrees = _align(
             found, templates, views, images, patch, limits, iterations=refinement.iterations
         )
+        # Otherwise they would stay on the device beside those of the next block.
+        del templates
         tracked = seen.tracked[found.point, found.view]
         yield AlignedBlock(rows, patches, found, moved, agrees, tracked)
