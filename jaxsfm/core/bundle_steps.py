@@ -86,7 +86,8 @@ def derivatives(
             return jax.grad(half_cost)(origin), jax.hessian(half_cost)(origin)
         here, slopes = residual(origin), jax.jacfwd(residual)(origin)
         influence = weight / (1 + measured.sharpness * jnp.sum(here**2)) ** 2
-        return tuple(influence * einsum("ki,k...->i...", slopes, x) for x in (here, slopes))
+        weighted = influence * slopes
+        return einsum("ki,k->i", weighted, here), einsum("ki,kj->ij", weighted, slopes)
 
     over_cameras = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (0, None, 0, 0))
     free, tangents = _camera_basis(scene.translations), jax.vmap(across)(scene.points)
