@@ -113,11 +113,14 @@ def test_every_product_states_its_precision(name):
             assert equation.params["precision"] is not None, equation
 
 
+X64_MODULES = ("coarse_to_fine", "matching", "lanes", "products")
+
+
 @pytest.mark.slow
 def test_the_laws_of_matching_hold_where_jax_has_64_bits():
     """The tests of some modules, in a process that is started with JAX_ENABLE_X64=1."""
     here = Path(__file__).parent
-    modules = [str(here / f"test_{name}.py") for name in ("coarse_to_fine", "matching")]
+    modules = [str(here / f"test_{name}.py") for name in X64_MODULES]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *modules]
     done = subprocess.run(
         command, env=os.environ | {"JAX_ENABLE_X64": "1"}, capture_output=True, text=True
