@@ -119,13 +119,16 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     shutil.copytree(strecha, root)
     args = ["bench", "ambiguous", "--root", str(root), "--json", str(out), "--threads", "1"]
     args += ["--sizes", "240", "--out", str(tmp_path / "work")]
-    methods = ["rootsift", "default", "colmap", "colmap-global"]
-    assert main([*args, "--sets", "room,synthetic-box", "--methods", ",".join(methods)]) == 0
+    assert main([*args, "--sets", "room", "--methods", "rootsift,default"]) == 0
     rows = json.loads(out.read_text())["rows"]
-    assert [row["method"] for row in rows] == 2 * methods
-    assert [row["set"] for row in rows] == 4 * ["room"] + 4 * ["synthetic-box"]
+    assert [row["method"] for row in rows] == ["rootsift", "default"]
     assert rows[1]["outcome"] == "right"  # the room of the demo does not repeat itself
-    for row in rows[4:]:
+
+    methods = ["default", "colmap", "colmap-global"]
+    assert main([*args, "--sets", "synthetic-box", "--methods", ",".join(methods)]) == 0
+    rows = json.loads(out.read_text())["rows"]
+    assert [row["method"] for row in rows] == methods
+    for row in rows:
         assert row["images"] == 20 and row["outcome"] in OUTCOMES and row["size"] == 240
         # A group is a part of a model, and COLMAP has nothing to say against its models.
         assert all(
@@ -142,7 +145,7 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     before = {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}
     assert main([*args, "--sets", "synthetic-box", "--methods", "default"]) == 0
     again = json.loads(out.read_text())["rows"]
-    assert [each["groups"] for each in again] == [rows[5]["groups"]]
+    assert [each["groups"] for each in again] == [rows[0]["groups"]]
     assert before == {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}
 
 
