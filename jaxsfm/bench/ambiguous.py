@@ -16,7 +16,7 @@ from jaxsfm.bench.methods import AMBIGUOUS_METHODS, MAPPERS
 from jaxsfm.bench.model_options import AmbiguousOptions
 from jaxsfm.bench.outcomes import OUTCOMES, Outcome, doubt, extent, judge
 from jaxsfm.bench.repeated import SCENES, write_repeated
-from jaxsfm.bench.strecha import CameraErrors, camera_errors
+from jaxsfm.bench.strecha import ModelRow, camera_errors, not_evaluated_lines
 from jaxsfm.bench.strecha_models import MethodRun, set_models, take_matches
 from jaxsfm.bench.strecha_sets import StrechaSet, find_sets, read_set
 from jaxsfm.colmap.poses import model_poses
@@ -36,15 +36,11 @@ class Task(NamedTuple):
     seed: int
 
 
-class AmbiguousRow(CameraErrors):
+class AmbiguousRow(ModelRow):
     """The figures of one task and one method."""
 
-    set: str
     size: int
     seed: int
-    method: str
-    images: int
-    """The number of reference poses."""
     models: list[int]
     """The number of photos in each model, the largest first."""
     groups: list[list[int]]
@@ -56,8 +52,6 @@ class AmbiguousRow(CameraErrors):
     """The largest distance of two reference cameras, units of the reference."""
     position_share: float | None
     """The mean position error divided by the extent."""
-    stages: dict[str, float]
-    """Seconds of each stage."""
 
 
 Counts = dict[str, dict[Outcome, int]]
@@ -187,11 +181,7 @@ def cells(row: AmbiguousRow) -> Cells:
 def table_lines(result: BenchFigures[AmbiguousRow, Counts]) -> list[str]:
     """All rows, and how often each method had each outcome."""
     lines = table([cells(row) for row in result["rows"]])
-    lines += [
-        f"{row['set']} {row['method']}: {row['not_evaluated']}"
-        for row in result["rows"]
-        if row["not_evaluated"]
-    ]
+    lines += not_evaluated_lines(result["rows"])
     summed: list[Cells] = [
         {"method": method, **{outcome: str(n) for outcome, n in each.items()}}
         for method, each in result["summary"].items()

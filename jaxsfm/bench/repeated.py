@@ -23,7 +23,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from jaxsfm.bench.synthetic import (
@@ -32,6 +31,7 @@ from jaxsfm.bench.synthetic import (
     camera_text,
     look_at,
     render,
+    write_photo,
 )
 from jaxsfm.bench.walls import moved, posters, shift, texture, turn, wall
 from jaxsfm.colmap.poses import CameraPose
@@ -115,8 +115,8 @@ def _street(rng: np.random.Generator, seed: int) -> RepeatedScene:
         wall(front / 2, gap, depth, texture(rng, gap)),
     ]
     sides = [wall(0.0, depth, 0.0, texture(rng, depth)) for _ in range(2)]
-    for side, x, angle in ((sides[0], front / 2, -np.pi / 2), (sides[1], -front / 2, -np.pi / 2)):
-        house.append(moved(moved(side, turn(angle)), shift(x)))
+    for side, x in zip(sides, (front / 2, -front / 2), strict=True):
+        house.append(moved(moved(side, turn(-np.pi / 2)), shift(x)))
     motions = [shift(period * k) for k in range(passed)]
     everywhere = [shift(period * k) for k in range(-hidden, passed + hidden)]
     planes = [moved(each, motion) for motion in everywhere for each in house]
@@ -187,7 +187,5 @@ def write_repeated(folder: Path, name: str, seed: int, size: tuple[int, int]) ->
         np.savetxt(images / "K.txt", k, fmt="%.9g")
         for i, pose in enumerate(scene.poses):
             photo = f"view{i:02d}.png"
-            rgb = render(scene.planes, pose, size)
-            if not cv2.imwrite(str(images / photo), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
-                raise OSError(f"{images / photo} cannot be written")
+            write_photo(images / photo, render(scene.planes, pose, size))
             (cameras / f"{photo}.camera").write_text(camera_text(k, pose, size))

@@ -14,12 +14,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-
 from jaxsfm.bench.inputs import check_root, choose_sets, usable_image
 from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night import synthetic_night
 from jaxsfm.bench.strecha_sets import strecha_intrinsics
+from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import Poses, read_poses
 from jaxsfm.errors import UserError
@@ -75,7 +74,7 @@ def synthetic_scene(folder: Path, target: Path, options: DayNightOptions) -> Sce
             jpeg=options.jpeg,
         )
         night = f"{NIGHT}{Path(name).stem}.png"
-        cv2.imwrite(str(target / night), cv2.cvtColor(dark, cv2.COLOR_RGB2BGR))
+        write_photo(target / night, dark)
         images[name], images[night] = image, inspect_image(target / night, name=night)
         if name in stored:
             truth[name] = truth[night] = poses[stored[name]]

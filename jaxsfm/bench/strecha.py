@@ -47,16 +47,21 @@ class CameraErrors(TypedDict):
     """Why there are no errors; empty if there are."""
 
 
-class StrechaRow(CameraErrors):
-    """The figures of one set and one method."""
+class ModelRow(CameraErrors):
+    """The figures that benchmarks of models have for each set and method."""
 
     set: str
     method: str
     images: int
     """The number of reference poses."""
-    registered: int
     stages: dict[str, float]
     """Seconds of each stage."""
+
+
+class StrechaRow(ModelRow):
+    """The figures of one set and one method."""
+
+    registered: int
     model: ModelFigures | None
 
 
@@ -209,6 +214,15 @@ def cells(row: StrechaRow) -> Cells:
     return found | {"seconds": f"{sum(row['stages'].values()):.1f}"}
 
 
+def not_evaluated_lines(rows: Sequence[ModelRow]) -> list[str]:
+    """Why models have no errors, a line for each of them."""
+    return [
+        f"{row['set']} {row['method']}: {row['not_evaluated']}"
+        for row in rows
+        if row["not_evaluated"]
+    ]
+
+
 def table_lines(result: BenchFigures[StrechaRow, StrechaSummary]) -> list[str]:
     """The paper's table with the paper's own rows, and the ratios to RootSIFT."""
     ours = [
@@ -221,11 +235,7 @@ def table_lines(result: BenchFigures[StrechaRow, StrechaSummary]) -> list[str]:
         for name, method, position, turn in [*ours, *theirs]
     ]
     lines = table([*map(cells, result["rows"]), *averages])
-    lines += [
-        f"{row['set']} {row['method']}: {row['not_evaluated']}"
-        for row in result["rows"]
-        if row["not_evaluated"]
-    ]
+    lines += not_evaluated_lines(result["rows"])
     for method, sets in result["summary"]["ratios"].items():
         mean = ", ".join(f"{key} {value:.2f}" for key, value in sets["mean"].items())
         lines.append(f"{method} / {BASELINE} (sets: {len(sets) - 1}): {mean}")

@@ -171,6 +171,12 @@ def camera_text(k: np.ndarray, pose: CameraPose, size: tuple[int, int]) -> str:
     return "\n".join([*lines, f"{size[0]} {size[1]}"]) + "\n"
 
 
+def write_photo(path: Path, rgb: np.ndarray) -> None:
+    """Write an image, uint8 RGB; OSError if it cannot be written, which OpenCV does not raise."""
+    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
+        raise OSError(f"{path} cannot be written")
+
+
 def write_scene(
     folder: Path, *, num_views: int = 7, size: tuple[int, int] = (640, 480), seed: int = 0
 ) -> Poses:
@@ -190,7 +196,7 @@ def write_scene(
         rgb = render(planes, pose, size)
         if dark:
             rgb = night(rgb, seed=seed)
-        cv2.imwrite(str(images / name), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        write_photo(images / name, rgb)
         (reference / f"{name}.camera").write_text(camera_text(k, pose, size))
         poses[name] = pose
     np.savetxt(folder / "K.txt", k, fmt="%.9g")

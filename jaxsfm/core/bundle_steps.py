@@ -79,8 +79,7 @@ def derivatives(
             return _residual(turned, translation + by[3:], k, there, xy)
 
         def half_cost(step):
-            squared = jnp.sum(residual(step) ** 2)
-            return 0.5 * weight * squared / (1 + measured.sharpness * squared)
+            return 0.5 * _cost(weight, jnp.sum(residual(step) ** 2), measured.sharpness)
 
         if exact:
             return jax.grad(half_cost)(origin), jax.hessian(half_cost)(origin)
@@ -141,7 +140,7 @@ def levenberg_marquardt(scene: Scene, measured: Measured, *, steps: Int[Array, "
 
     def cost(scene):
         squared = jnp.sum(residuals(scene, measured) ** 2, axis=-1)
-        return jnp.sum(measured.weight * squared / (1 + measured.sharpness * squared))
+        return jnp.sum(_cost(measured.weight, squared, measured.sharpness))
 
     # This is the sum for shifts of sqrt(eps) pixels.
     enough = jnp.finfo(scene.points.dtype).eps * jnp.sum(measured.weight)
@@ -163,6 +162,11 @@ def levenberg_marquardt(scene: Scene, measured: Measured, *, steps: Int[Array, "
 
     numbers = (jnp.asarray(x, scene.points.dtype) for x in (1e-3, jnp.inf))
     return lax.while_loop(more, one_step, (scene, cost(scene), *numbers, jnp.int32(0)))[0]
+
+
+def _cost(weight: Array, squared: Array, sharpness: Array) -> Array:
+    """The robust loss of Geman and McClure, of squared distances."""
+    return weight * squared / (1 + sharpness * squared)
 
 
 def _residual(rotation: Array, translation: Array, k: Array, point: Array, xy: Array) -> Array:
