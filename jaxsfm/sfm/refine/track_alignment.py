@@ -49,6 +49,8 @@ class AlignedBlock(NamedTuple):
     """Its `point` counts within the block."""
     moved: np.ndarray
     """float64 (m, 2): where the candidates ended, working pixels."""
+    score: np.ndarray
+    """float (m,): their normalised cross-correlation with their patches there, -1 .. 1."""
     agrees: np.ndarray
     """bool (m,): which candidates agree with their patches."""
     tracked: np.ndarray
@@ -107,9 +109,10 @@ def _align(
     limits: AlignmentLimits,
     *,
     iterations: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where the candidates end, and which of them agree with their templates."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the candidates end, their scores there, and which of them agree with their templates."""
     moved = found.start.copy()
+    score = np.zeros(len(moved))
     agrees = np.zeros(len(moved), bool)
 
     def started() -> Iterator[tuple[np.ndarray, list[tuple[int, Aligned]]]]:
@@ -128,8 +131,9 @@ def _align(
     for rows, calls in overlapped(started()):
         result = to_host(calls)
         moved[rows] = result.xy
+        score[rows] = result.score
         agrees[rows] = limits.accept(result, found.start[rows])
-    return moved, agrees
+    return moved, score, agrees
 
 
 def neighbourhoods(tracks: Tracks, count: int) -> np.ndarray:
@@ -211,10 +215,10 @@ def align_blocks(
         patches = plane_geometry.reference_patches(part, normal[rows], seen)
         found = find_candidates(views, patches, seen, refinement, targets=targets)
         templates = _templates(patches, np.unique(found.point), views, images, patch)
-        moved, agrees = _align(
+        moved, score, agrees = _align(
             found, templates, views, images, patch, limits, iterations=refinement.iterations
         )
         # Otherwise they would stay on the device beside those of the next block.
         del templates
         tracked = seen.tracked[found.point, found.view]
-        yield AlignedBlock(rows, patches, found, moved, agrees, tracked)
+        yield AlignedBlock(rows, patches, found, moved, score, agrees, tracked)
