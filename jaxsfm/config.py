@@ -133,6 +133,9 @@ class Config:
     view_graph: bool = False
     """Whether only pairs that the view graph trusts are given to the mapper
     (`jaxsfm.sfm.view_graph`)."""
+    checked: bool = False
+    """Whether models are checked for photos that contradict each other, and made again without the
+    pairs that joined them (`jaxsfm.sfm.check`)."""
     refinement: Refinement | None = None
     """Settings of the refinement. With `None` the model of the mapper is not refined."""
 
@@ -148,7 +151,8 @@ class Config:
     def matching(self) -> dict[str, object]:
         """The settings that matches depend on, as plain data."""
         parts = dataclasses.asdict(self)
-        del parts["aligned_octaves"], parts["view_graph"], parts["refinement"]
+        for later in ("aligned_octaves", "view_graph", "checked", "refinement"):
+            del parts[later]
         return parts
 
     def __post_init__(self) -> None:
@@ -203,6 +207,7 @@ _DEFAULT = Config(
     pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
     aligned_octaves=4,
     view_graph=True,
+    checked=True,
     refinement=Refinement(),
 )
 PRESETS: dict[str, Config] = {

@@ -97,7 +97,7 @@ Neither our view graph nor our refinement takes part. As for all methods, the ma
 again from other initial pairs if its model lacks photos, and the global mapper is tried if the
 incremental one gives no model (`jaxsfm.colmap.mapper.build_models`).
 """
-_MAPPED = dataclasses.replace(CONFIGS["default"], view_graph=False, refinement=None)
+_MAPPED = dataclasses.replace(CONFIGS["default"], view_graph=False, checked=False, refinement=None)
 AMBIGUOUS_METHODS = (*RUN_METHODS, *MAPPERS)
 """The methods of `bench ambiguous`."""
 

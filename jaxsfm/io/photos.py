@@ -39,6 +39,12 @@ class Photos:
         sizes = [file.size for file in self.files.values()]
         return float(np.median([max(s) / max(working_size(s, *self._limits)) for s in sizes]))
 
+    def working_size(self, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
+        """(width, height) of the working image; original pixels per working pixel, (x, y)."""
+        own = self.files[name].size
+        width, height = working_size(own, *self._limits)
+        return (width, height), (own[0] / width, own[1] / height)
+
     def rgb(self, name: str) -> WorkingImage:
         """Colours uint8 (h, w, 3) of the working image; original pixels per working pixel."""
         max_size, enlarge = self._limits

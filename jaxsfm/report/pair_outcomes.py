@@ -43,6 +43,8 @@ class PairOutcomes(NamedTuple):
             return ""
         if row.verified and row.view_graph is not None:
             verdict = row.view_graph
+            if verdict.refuted:
+                return f"{row.colmap_inliers} inliers, but {verdict.reason}"
             if verdict.rotation_error_deg is None:
                 return f"{row.colmap_inliers} inliers, but they give no relative pose"
             return (

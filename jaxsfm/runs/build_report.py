@@ -72,8 +72,9 @@ class NewPhotos(NamedTuple):
 def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> RunReport:
     """The report of a new run, without the evaluation."""
     made, results = stages.reconstructed, stages.results
+    verified, verdicts = made.verification.verified, made.mapping.verdicts
     about, counts = stages.external.about, stages.external.counts(results)
-    untrusted = sum(not verdict.trusted for verdict in made.verdicts.values())
+    untrusted = sum(not verdict.trusted for verdict in verdicts.values())
     report = RunReport(
         format=FORMAT,
         version=stages.identity.version,
@@ -92,19 +93,19 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
             tried=len(results),
             verified=sum(r.num_inliers > 0 for r in results.values()),
             handed_on=len(stages.handed_on),
-            trusted=len(made.verified) - untrusted if made.verdicts else None,
+            trusted=len(verified) - untrusted if verdicts else None,
             overflowed=sum(r.num_dropped > 0 for r in results.values()),
-            each=_pair_rows(counts, stages.handed_on, made.verified, made.verdicts),
+            each=_pair_rows(counts, stages.handed_on, verified, verdicts),
         ),
         given=None if about is None else from_json(UsedExternalMatches, about),
         models=[_model_row(model) for model in made.models],
-        mapping=made.attempts,
+        mapping=made.mapping.attempts,
         refinement=made.refinement,
         lost=[],
         seconds=stages.seconds,
     )
     sizes = {image.name: image.size for image in stages.usable}
-    return explained(report, config, sizes, made.angles)
+    return explained(report, config, sizes, made.verification.angles)
 
 
 def extended_report(

@@ -13,9 +13,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.database import drop_pairs, read_images, write_database
+from jaxsfm.colmap.database import read_images, write_database
 from jaxsfm.colmap.intrinsics import KnownCameras, check_fits
-from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
+from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.config import Config, Refinement
@@ -27,10 +27,11 @@ from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
+from jaxsfm.sfm.check.model_check import ModelCheck
+from jaxsfm.sfm.mapping import MappingFigures, VerifiedPairs, build_checked_models
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 from jaxsfm.sfm.stage_files import VerificationFigures
-from jaxsfm.sfm.view_graph import trusted_pairs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -48,12 +49,15 @@ class StageCache(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Reconstructed(VerificationFigures):
+class Reconstructed:
     """The models of verified matches, and how they came about."""
 
+    verification: VerificationFigures
+    mapping: MappingFigures
     models: "list[pycolmap.Reconstruction]"
     """The model with most images first; empty if there is none."""
-    attempts: list[Attempt]
+    checks: list[ModelCheck | None]
+    """For each model; None where it was not checked."""
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
 
@@ -102,18 +106,24 @@ def reconstruct(
         stage_files.write_verification(folder, figures)
 
     def build(folder: Path) -> None:
-        two_views = read_two_views(checked / DATABASE)
-        models, attempts = build_models(checked / DATABASE, two_views, options, on_image=on_image)
-        write_models(models, folder / SPARSE)
-        stage_files.write_attempts(folder, attempts)
-
-    def refine(folder: Path) -> None:
-        models = read_models(mapped / SPARSE, checked / DATABASE)
-        models, figures = _refined(
-            models, photos, config.refinement, options, matches, checked / DATABASE, on_pass
+        two_views = read_two_views(verified / DATABASE)
+        models, figures = build_checked_models(
+            VerifiedPairs(verified / DATABASE, two_views, matches, photos),
+            folder / DATABASE,
+            config=config,
+            options=options,
+            on_image=on_image,
         )
         write_models(models, folder / SPARSE)
-        stage_files.write_refinement(folder, figures)
+        stage_files.write_mapping(folder, figures)
+
+    def refine(folder: Path) -> None:
+        models = read_models(mapped / SPARSE, mapped / DATABASE)
+        models, figures, order = _refined(
+            models, photos, config.refinement, options, matches, mapped / DATABASE, on_pass
+        )
+        write_models(models, folder / SPARSE)
+        stage_files.write_refinement(folder, figures, order)
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         stages, key = kept or (WorkFolder(Path(scratch), {}), "")
@@ -121,22 +131,24 @@ def reconstruct(
         camera = _plain(intrinsics)
         verifying = [options.seed, options.threads, options.scale, config.view_graph]
         key = digest(key, by_image, camera, verifying, package_versions())
-        checked = stages.stage("verified", key, verify_matches)
-        key = digest(key, dataclasses.asdict(options))
+        verified = stages.stage("verified", key, verify_matches)
+        checking = config.checked and dataclasses.asdict(config.refinement or Refinement())
+        key = digest(key, dataclasses.asdict(options), checking)
         mapped = stages.stage("mapped", key, build)
         on_mapped()
         key = digest(key, config.refinement and dataclasses.asdict(config.refinement))
         refined = stages.stage("refined", key, refine)
-        shutil.copyfile(checked / DATABASE, database)
-        verification = stage_files.read_verification(checked)
-        refinement = stage_files.read_refinement(refined)
+        shutil.copyfile(mapped / DATABASE, database)
+        mapping = stage_files.read_mapping(mapped)
+        refinement, order = stage_files.read_refinement(refined)
         models = read_models(refined / SPARSE, database)
         if config.refinement is not None and None in refinement:
             stages.forget_stage("refined")  # a photo could not be read; perhaps it can next time
         return Reconstructed(
-            **vars(verification),
+            verification=stage_files.read_verification(verified),
+            mapping=mapping,
             models=models,
-            attempts=stage_files.read_attempts(mapped),
+            checks=[mapping.checks[k] for k in order],
             refinement=refinement,
         )
 
@@ -149,7 +161,7 @@ def _plain(intrinsics: KnownCameras | None) -> Json:
 
 
 def _verified(database: Path, options: MapOptions, view_graph: bool) -> VerificationFigures:
-    """Verify the matches of a database, and drop the geometry of pairs that are not trusted."""
+    """Verify the matches of a database."""
     verify(
         database,
         VerificationOptions(
@@ -160,11 +172,7 @@ def _verified(database: Path, options: MapOptions, view_graph: bool) -> Verifica
         ),
     )
     two_views = read_two_views(database)
-    geometries = {pair: view.geometry for pair, view in two_views.items()}
-    verdicts = trusted_pairs(geometries) if view_graph else {}
-    drop_pairs(database, [pair for pair, v in verdicts.items() if not v.trusted])
     return VerificationFigures(
-        verdicts=verdicts,
         verified={pair: view.geometry.num_inliers for pair, view in two_views.items()},
         angles={pair: view.tri_angle_deg for pair, view in two_views.items()},
     )
@@ -178,13 +186,17 @@ def _refined(
     matches: Mapping[Pair, PairResult],
     database: Path,
     on_pass: Callable[[], None],
-) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None]]":
+) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None], list[int]]":
     """Refine the models, if asked for, and colour their points.
 
     They are refined one after the other, each with the unmapped images that none before took.
 
     Args:
       database: of all images, with those that are in no model.
+
+    Returns:
+      the models, the one with most images first; what was done to each; for each, its index among
+      the given models.
     """
     cameras = read_images(database)
     mapped = {name for model in models for name in registered(model)}
@@ -214,4 +226,4 @@ def _refined(
     order = sorted(range(len(refined)), key=lambda k: -refined[k].num_reg_images())
     for model in refined:
         colour_points(model, photos.rgb)
-    return [refined[k] for k in order], [figures[k] for k in order]
+    return [refined[k] for k in order], [figures[k] for k in order], order

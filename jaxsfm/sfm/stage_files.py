@@ -7,6 +7,8 @@ from pathlib import Path
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.io.pairs import Pair
+from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
+from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import PassFigures, RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import Verdict
@@ -16,10 +18,8 @@ FIGURES = "figures.json"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VerificationFigures:
-    """The results of verification and of the view graph."""
+    """The results of verification."""
 
-    verdicts: dict[Pair, Verdict]
-    """The view graph's decisions, by pair; empty if it is switched off."""
     verified: dict[Pair, int]
     """Number of two-view inliers, by pair that has any."""
     angles: dict[Pair, float]
@@ -28,12 +28,7 @@ class VerificationFigures:
 
 def write_verification(folder: Path, figures: VerificationFigures) -> None:
     """Write the figures of the stage `verified` into its folder."""
-    plain = {
-        "verdicts": [[pair, dataclasses.asdict(v)] for pair, v in figures.verdicts.items()],
-        "verified": [
-            [pair, count, figures.angles[pair]] for pair, count in figures.verified.items()
-        ],
-    }
+    plain = [[pair, count, figures.angles[pair]] for pair, count in figures.verified.items()]
     (folder / FIGURES).write_text(json.dumps(plain), encoding="utf-8")
 
 
@@ -41,40 +36,66 @@ def read_verification(folder: Path) -> VerificationFigures:
     """Read what `write_verification` wrote."""
     plain = json.loads((folder / FIGURES).read_text(encoding="utf-8"))
     return VerificationFigures(
-        verdicts={(a, b): Verdict(**row) for (a, b), row in plain["verdicts"]},
-        verified={(a, b): count for (a, b), count, _ in plain["verified"]},
-        angles={(a, b): angle for (a, b), _, angle in plain["verified"]},
+        verified={(a, b): count for (a, b), count, _ in plain},
+        angles={(a, b): angle for (a, b), _, angle in plain},
     )
 
 
-def write_attempts(folder: Path, attempts: Sequence[Attempt]) -> None:
+def write_mapping(folder: Path, figures: MappingFigures) -> None:
     """Write the figures of the stage `mapped` into its folder."""
-    plain = [dataclasses.asdict(attempt) for attempt in attempts]
+    plain = {
+        "verdicts": [[pair, dataclasses.asdict(v)] for pair, v in figures.verdicts.items()],
+        "attempts": [dataclasses.asdict(attempt) for attempt in figures.attempts],
+        "checks": [check and dataclasses.asdict(check) for check in figures.checks],
+    }
     (folder / FIGURES).write_text(json.dumps(plain), encoding="utf-8")
 
 
-def read_attempts(folder: Path) -> list[Attempt]:
-    """Read what `write_attempts` wrote."""
+def read_mapping(folder: Path) -> MappingFigures:
+    """Read what `write_mapping` wrote."""
+    plain = json.loads((folder / FIGURES).read_text(encoding="utf-8"))
     attempts = []
-    for row in json.loads((folder / FIGURES).read_text(encoding="utf-8")):
+    for row in plain["attempts"]:
         pair = row["initial_pair"]
         attempts.append(Attempt(**row | {"initial_pair": pair and tuple(pair)}))
-    return attempts
+    return MappingFigures(
+        verdicts={(a, b): Verdict(**row) for (a, b), row in plain["verdicts"]},
+        attempts=attempts,
+        checks=[row and _check(row) for row in plain["checks"]],
+    )
 
 
-def write_refinement(folder: Path, figures: Sequence[RefinementFigures | None]) -> None:
-    """Write the figures of the stage `refined` into its folder; None: a model was not refined."""
-    plain = [each and dataclasses.asdict(each) for each in figures]
+def _check(row: dict[str, list]) -> ModelCheck:
+    return ModelCheck(
+        groups=row["groups"],
+        contradictions=[Contradiction(**each) for each in row["contradictions"]],
+        other_places=[OtherPlace(**each) for each in row["other_places"]],
+    )
+
+
+def write_refinement(
+    folder: Path, figures: Sequence[RefinementFigures | None], order: Sequence[int]
+) -> None:
+    """Write the figures of the stage `refined` into its folder.
+
+    Args:
+      figures: for each model; None: it was not refined.
+      order: for each model, its index among the models of the stage `mapped`.
+    """
+    rows = [each and dataclasses.asdict(each) for each in figures]
+    plain = {"models": rows, "order": list(order)}
     (folder / FIGURES).write_text(json.dumps(plain), encoding="utf-8")
 
 
-def read_refinement(folder: Path) -> list[RefinementFigures | None]:
+def read_refinement(folder: Path) -> tuple[list[RefinementFigures | None], list[int]]:
     """Read what `write_refinement` wrote."""
-    return [
+    plain = json.loads((folder / FIGURES).read_text(encoding="utf-8"))
+    figures = [
         row
         and RefinementFigures(
             passes=[PassFigures(**each) for each in row["passes"]],
             placed=[Placement(**each) for each in row["placed"]],
         )
-        for row in json.loads((folder / FIGURES).read_text(encoding="utf-8"))
+        for row in plain["models"]
     ]
+    return figures, plain["order"]

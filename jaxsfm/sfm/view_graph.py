@@ -46,6 +46,8 @@ class Verdict:
     """The pair's own rotation against the averaged ones; None: it has none."""
     reason: str = ""
     """Why it is not trusted; empty for trusted pairs."""
+    refuted: bool = False
+    """The photos contradict each other where the pair joined them (`jaxsfm.sfm.check`)."""
 
 
 def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -67,8 +69,15 @@ def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
     }
 
 
-def trusted_pairs(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, Verdict]:
-    """Decide for every pair, of image names in order, whether it is trusted."""
+def trusted_pairs(
+    geometries: Mapping[Pair, PairGeometry], *, strict: bool = False
+) -> dict[Pair, Verdict]:
+    """Decide for every pair, of image names in order, whether it is trusted.
+
+    Args:
+      strict: strong pairs may not have any rotation either. This is for photos of repeated
+        structure, whose false pairs are as strong as true ones.
+    """
     strength = strengths(geometries)
     ranked = sorted(geometries, key=lambda p: (-strength[p], p))
     known = [p for p in ranked if geometries[p].rotation is not None and strength[p] > 0]
@@ -81,7 +90,7 @@ def trusted_pairs(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, Verdict
             reason = "no relative pose"
         else:
             error = float(_error_deg(pair, geometries, rotations))
-            if error > TOLERANCE_DEG and strength[pair] < STRONG:
+            if error > TOLERANCE_DEG and (strict or strength[pair] < STRONG):
                 reason = (
                     f"its rotation is {error:.0f} deg from the one that stronger pairs give "
                     f"(its strength is {strength[pair]:.3f} of 1)"

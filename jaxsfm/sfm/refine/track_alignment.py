@@ -110,7 +110,7 @@ def _align(
     *,
     iterations: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the candidates end, their scores there, and which of them agree with their templates."""
+    """Where the candidates end, their scores there, and which agree with their templates."""
     moved = found.start.copy()
     score = np.zeros(len(moved))
     agrees = np.zeros(len(moved), bool)

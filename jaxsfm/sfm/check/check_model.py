@@ -1,0 +1,128 @@
+"""The check of one model after mapping: do its photos agree with it, and with no other model?"""
+
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+from jaxsfm.colmap.model import Model
+from jaxsfm.config import Refinement
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.sfm.check.agreement import Agreement, agreement, thinned
+from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, share
+from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
+from jaxsfm.sfm.check.other_places import Refused, other_places
+from jaxsfm.sfm.check.pair_fit import MIN_FIT, pair_fits
+from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.device_images import DeviceImages
+
+MIN_VIEWS = 3
+"""A model of two photos is not checked: nothing in it can contradict the pair that it is made of.
+"""
+MIN_POINTS = 30
+"""A model with fewer points is not checked."""
+MIN_CONTRADICTED = 10
+"""Fewer contradictions between two photos do not refute their pair. A block has at least six."""
+
+
+class VerifiedMatches(NamedTuple):
+    """The matches that a model may rest on."""
+
+    matches: Mapping[Pair, PairResult]
+    """By pair, original pixels."""
+    pairs: Collection[Pair]
+    """Those that COLMAP verified."""
+    seed: int
+    """For RANSAC."""
+
+
+class Checked(NamedTuple):
+    """The outcome of a check."""
+
+    check: ModelCheck
+    refuted: dict[Pair, Contradiction]
+    """Pairs that agree with the model and whose two photos contradict each other there."""
+    suspected: dict[Pair, Contradiction]
+    """Pairs that agree with the model and join groups that contradict each other. Some of them may
+    be right: then the groups were joined wrongly elsewhere."""
+    explained: set[Pair]
+    """Pairs that agree with the model. No photo contradicts another one there."""
+
+
+def check_model(
+    model: Model, images: DeviceImages, given: VerifiedMatches, refinement: Refinement
+) -> Checked | None:
+    """Check a model.
+
+    If groups of its photos contradict each other, the pairs that joined them are refuted. Otherwise
+    second places are looked for, by the pairs that the model does not agree with.
+
+    Args:
+      images: those of the views, in the model's pixels.
+      refinement: how patches are aligned, and when they agree.
+
+    Returns:
+      None if the model is too small.
+
+    Raises:
+      ImageError: an image of the model cannot be read any more.
+    """
+    if len(model.views) < MIN_VIEWS or len(model.tracks.points) < MIN_POINTS:
+        return None
+    model = thinned(model)
+    names = [view.name for view in model.views]
+    found = agreement(model, images, refinement)
+    grouping = group_views(found)
+    contradictions = _named(grouping, names)
+    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
+    fits = pair_fits(model, normal, given.matches, given.pairs)
+    fitting = [pair for pair, fit in fits.items() if fit >= MIN_FIT]
+    refuted = _refuted(found, names, fitting)
+    suspected = {
+        pair: each
+        for pair in fitting
+        for each in contradictions
+        if _joins(pair, each) and pair not in refuted
+    }
+    places = []
+    if not contradictions:
+        against = {pair: given.matches[pair] for pair in fits if fits[pair] < MIN_FIT}
+        refused = Refused(against, given.seed)
+        places = other_places(model, normal, images, refinement, refused)
+    groups = [sorted(names[k] for k in group) for group in grouping.groups]
+    check = ModelCheck(groups=groups, contradictions=contradictions, other_places=places)
+    explained = set(fitting) - refuted.keys() - suspected.keys()
+    return Checked(check, refuted, suspected, explained)
+
+
+def _joins(pair: Pair, each: Contradiction) -> bool:
+    """Whether a pair has one photo in either group."""
+    one, other = (set(group) & set(pair) for group in (each.images, each.others))
+    return bool(one and other)
+
+
+def _refuted(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pair, Contradiction]:
+    """The pairs whose two photos contradict each other."""
+    index = {name: k for k, name in enumerate(names)}
+    shares = share(*found)
+    refuted = {}
+    for pair in fitting:
+        a, b = (index[name] for name in pair)
+        counts = [(found.contradicted[i, j], found.tested[i, j]) for i, j in ((a, b), (b, a))]
+        least, tested = min(counts)
+        if shares[a, b] > MAX_CONTRADICTED and least >= MIN_CONTRADICTED:
+            refuted[pair] = Contradiction(
+                images=[pair[0]], others=[pair[1]], tested=int(tested), contradicted=int(least)
+            )
+    return refuted
+
+
+def _named(grouping: Grouping, names: list[str]) -> list[Contradiction]:
+    """The contradictions with the names of the photos."""
+    return [
+        Contradiction(
+            images=sorted(names[k] for k in each.groups[0]),
+            others=sorted(names[k] for k in each.groups[1]),
+            tested=each.tested,
+            contradicted=each.contradicted,
+        )
+        for each in grouping.contradictions
+    ]

@@ -1,0 +1,125 @@
+"""Second places of photos: whether a photo also fits where pairs say that the model ignores.
+
+Pairs that do not agree with a model are usually false. Then the photo shows something else where
+they would put it. If it shows the same, nothing tells the two places apart, and another model
+explains the photos as well.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.resection import find_view
+from jaxsfm.colmap.view import View
+from jaxsfm.config import Refinement
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.sfm.check.agreement import Agreement, agreement
+from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
+from jaxsfm.sfm.check.model_check import OtherPlace
+from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.view_graph import rotation_angle_deg
+
+MIN_INLIERS = 30
+"""Fewer matches give no second place: the fewest inliers from which COLMAP's mapper adds a photo.
+"""
+MIN_AGREED = 50
+"""The least number of points that the photo must show, seen from its second place."""
+OTHER_ROTATION_DEG = 15.0
+"""A place is another one if it is turned by more..."""
+OTHER_DISTANCE = 0.2
+"""... or moved by more than this share of the distance to the points that it shows."""
+
+
+class Refused(NamedTuple):
+    """What speaks for other places: the pairs that a model does not agree with."""
+
+    pairs: Mapping[Pair, PairResult]
+    """Their matches, original pixels."""
+    seed: int
+    """For RANSAC."""
+
+
+def other_place(
+    model: Model,
+    normal: np.ndarray,
+    images: DeviceImages,
+    refinement: Refinement,
+    refused: Refused,
+    k: int,
+) -> OtherPlace | None:
+    """The second place of a view; None if it has none.
+
+    Args:
+      normal: float64 (points, 3), of the model's points.
+      images: those of the views, in the model's pixels.
+      k: index of the view.
+    """
+    view = model.views[k]
+    partners = [a if b == view.name else b for a, b in refused.pairs if view.name in (a, b)]
+    own = {pair: each for pair, each in refused.pairs.items() if view.name in pair}
+    # What the view itself has contributed to the model holds at its first place only.
+    others = model.select(model.tracks.view != k)
+    xy, points = matched_points(view, others, normal, own)
+    there = find_view(
+        view,
+        xy,
+        points,
+        max_error_px=MATCH_ERROR_PX,
+        estimate_focal_length=False,
+        seed=refused.seed,
+    )
+    if there is None or not _elsewhere(view, there, points):
+        return None
+    at, _ = there.project(points)
+    fits = np.linalg.norm(at - xy, axis=1) < MATCH_ERROR_PX
+    if fits.sum() < MIN_INLIERS:
+        return None
+    moved = others.with_views([*model.views[:k], there, *model.views[k + 1 :]])
+    tested, contradicted = _shown(agreement(moved, images, refinement, targets=[k]), k)
+    if tested - contradicted < MIN_AGREED or contradicted > MAX_CONTRADICTED * tested:
+        return None
+    return OtherPlace(
+        image=view.name,
+        pairs=sorted(partners),
+        agreed=tested - contradicted,
+        contradicted=contradicted,
+        rotation_deg=float(rotation_angle_deg(there.rotation, view.rotation)),
+    )
+
+
+def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
+    """Whether a place is another one than that of the view; from both, points (n, 3) are seen."""
+    away = np.linalg.norm(there.centre - view.centre)
+    distance = np.median(np.linalg.norm(points - there.centre, axis=1))
+    turned = rotation_angle_deg(there.rotation, view.rotation)
+    return bool(turned > OTHER_ROTATION_DEG or away > OTHER_DISTANCE * distance)
+
+
+def _shown(found: Agreement, k: int) -> tuple[int, int]:
+    """The points tested in a view, and the contradictions: means over the views that see them."""
+    counts = found.tested[:, k]
+    if not counts.any():
+        return 0, 0
+    weight = counts / counts.sum()
+    return round(weight @ counts), round(weight @ found.contradicted[:, k])
+
+
+def other_places(
+    model: Model,
+    normal: np.ndarray,
+    images: DeviceImages,
+    refinement: Refinement,
+    refused: Refused,
+) -> list[OtherPlace]:
+    """The second places of all views of a model, sorted by name. Arguments as in `other_place`."""
+    named = {name for pair in refused.pairs for name in pair}
+    found = [
+        other_place(model, normal, images, refinement, refused, k)
+        for k, view in enumerate(model.views)
+        if view.name in named
+    ]
+    places = [place for place in found if place is not None]
+    return sorted(places, key=lambda place: place.image)
