@@ -100,6 +100,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         models=[_model_row(model) for model in made.models],
         mapping=made.attempts,
         refinement=made.refinement,
+        checks=made.checks,
         lost=[],
         seconds=stages.seconds,
     )
@@ -158,6 +159,8 @@ def extended_report(
             ),
         ),
         models=[_model_row(model) for model in models],
+        # The model has other photos and points now, which no check has seen.
+        checks=[],
         extended=[*(old.extended or ()), extension],
         evaluation=None,
         evaluation_failed=None,

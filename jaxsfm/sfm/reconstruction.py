@@ -27,6 +27,7 @@ from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
+from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 from jaxsfm.sfm.stage_files import VerificationFigures
@@ -56,6 +57,8 @@ class Reconstructed(VerificationFigures):
     attempts: list[Attempt]
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
+    checks: list[ModelCheck | None]
+    """For each model; None where it was not checked."""
 
 
 def reconstruct(
@@ -138,6 +141,7 @@ def reconstruct(
             models=models,
             attempts=stage_files.read_attempts(mapped),
             refinement=refinement,
+            checks=[None] * len(models),
         )
 
 
