@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxsfm.colmap.poses import Poses
 from jaxsfm.report.run_report import RunReport
+from jaxsfm.report.verdict import in_words
 from jaxsfm.sfm.evaluation import COLLINEAR, Similarity, pair_names, umeyama
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
@@ -63,19 +64,23 @@ def extent(truth: Poses) -> float:
 
 
 def doubt(report: RunReport | None) -> str:
-    """What a run says against its own best model; empty if it presents the model as right.
+    """What a run says against its own models; empty if it presents them as right.
 
     Photos that are missing, and groups of photos that no pair joins, say nothing against the photos
-    that are in the model. Today a run has one thing to say: that its refinement was taken back,
-    because too few patches agreed with the model. COLMAP says nothing.
+    that are in a model. A run has two things to say: that its verdict is amber or red, and that the
+    refinement of its best model was taken back, because too few patches agreed with it. COLMAP says
+    nothing.
 
     Args:
       report: None for a method without a report.
     """
-    if report is None or not report.refinement or report.refinement[0] is None:
+    if report is None:
         return ""
-    passes = report.refinement[0].passes
-    return "too few patches agreed" if passes and not passes[0].accepted else ""
+    said = [in_words(report.verdict)] if report.verdict in ("amber", "red") else []
+    refinement = report.refinement[0] if report.refinement else None
+    if refinement and refinement.passes and not refinement.passes[0].accepted:
+        said.append("too few patches agreed")
+    return "; ".join(said)
 
 
 def groups(model: Poses, truth: Poses) -> list[list[str]]:

@@ -16,6 +16,8 @@ from jaxsfm.errors import UserError
 from jaxsfm.options import EngineChoice, ExecutionChoice, ReconstructionChoice, WeightsChoice
 
 Positional = tyro.conf.Positional
+DOUBTFUL = 3
+"""The exit status for a model that may be wrong."""
 
 
 def check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
@@ -53,6 +55,9 @@ def reconstruct(
         $ jaxsfm reconstruct PHOTOS --out OUT
         $ jaxsfm reconstruct PHOTOS --out OUT --intrinsics K.txt --preset robust
 
+    The exit status is 0 for a model, 1 if no model could be built, and 3 for a model that may be
+    wrong: its verdict, in the summary and in the report, is amber or red.
+
     Args:
       images: Folder with the photos; sub-folders are included.
       out: Folder for the results. If a run there was interrupted, the same command continues it.
@@ -78,6 +83,12 @@ def reconstruct(
             file=sys.stderr,
         )
         return 1
+    if report.verdict in ("amber", "red"):
+        print(
+            f"jaxsfm: the model may be wrong: see the verdict above and {out / 'report.html'}",
+            file=sys.stderr,
+        )
+        return DOUBTFUL
     return 0
 
 

@@ -12,7 +12,7 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split())
 MAX_DECODED_PIXELS = 250_000_000
 """Larger images (0.75 GB) are refused, or decoded at reduced size if their format allows it."""
+MOST_NAMED = 3
+"""The number of photos that a message names of a list."""
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _REDUCED = {
     2: cv2.IMREAD_REDUCED_COLOR_2,
@@ -149,6 +151,12 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
 def shown_name(name: str) -> str:
     """Return a file name for messages: line breaks and the like are replaced by escapes."""
     return name if name.isprintable() else name.encode("unicode_escape").decode()
+
+
+def named(names: Sequence[str], most: int = MOST_NAMED) -> str:
+    """The first names of a list for messages, and how many more there are."""
+    shown = ", ".join(shown_name(name) for name in names[:most])
+    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
 _SCAN_END = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")

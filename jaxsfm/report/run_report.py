@@ -28,11 +28,15 @@ from jaxsfm.report.run_results import (
     ViewGraph,
 )
 from jaxsfm.report.typed_json import OMITTED, Count, Misfit, Number, Range, T, from_json, to_json
+from jaxsfm.sfm.check.model_check import ModelCheck, VerdictColour
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 FILE = "report.json"
 FORMAT = 2
 """The version of the format. Reports of format 1 have no key `format`."""
+MIN_PHOTOS = 3
+"""Models of fewer photos have no verdict: two photos agree with nearly every third."""
+_WORST_FIRST: tuple[VerdictColour, ...] = ("red", "amber", "green")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,6 +79,8 @@ class RunReport:
     """Every start of the mapper."""
     refinement: list[RefinementFigures | None] = field(default_factory=list)
     """One for each model; None for a model that was not refined."""
+    checks: list[ModelCheck | None] = field(default_factory=list)
+    """One for each model; None for a model that was not checked. Empty after `jaxsfm extend`."""
     view_graph: ViewGraph = field(default_factory=ViewGraph)
     lost: list[LostPhoto]
     """Sorted by name."""
@@ -88,6 +94,23 @@ class RunReport:
     """Why the model could not be compared with the reference poses."""
     extended: list[Extension] | None = field(default=None, metadata=OMITTED)
     """Calls of `jaxsfm extend` since the run."""
+
+    @property
+    def checked(self) -> list[tuple[int, ModelCheck]]:
+        """The models that were checked and have enough photos for a verdict: the number N of the
+        folder `sparse/N`, and the check."""
+        rows = enumerate(zip(self.models, self.checks, strict=False))  # checks may be empty
+        return [
+            (number, check)
+            for number, (model, check) in rows
+            if check is not None and model.registered >= MIN_PHOTOS
+        ]
+
+    @property
+    def verdict(self) -> VerdictColour | None:
+        """The worst verdict on the models in `checked`; None if there are none."""
+        found = {check.verdict for _, check in self.checked}
+        return next((colour for colour in _WORST_FIRST if colour in found), None)
 
     def to_json(self) -> dict[str, Json]:
         """The report as plain JSON."""

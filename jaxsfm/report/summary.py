@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 
-from jaxsfm.io.images import shown_name
+from jaxsfm.io.images import named, shown_name
 from jaxsfm.io.pairs import describe
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import EvaluationReport, LostPhoto, ViewGraph
+from jaxsfm.report.verdict import model_verdicts, verdict_lines
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 MAX_GROUPS = 10
@@ -27,12 +28,6 @@ def evaluation_lines(evaluation: EvaluationReport) -> list[str]:
         ),
         f"within 10 deg    and a distance of {shares} (units of the reference)",
     ]
-
-
-def named(names: Sequence[str], most: int = 3) -> str:
-    """The first names of a list, and how many more there are."""
-    shown = ", ".join(shown_name(name) for name in names[:most])
-    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
 def component_lines(view_graph: ViewGraph) -> list[str]:
@@ -136,6 +131,7 @@ def summary_lines(report: RunReport) -> list[str]:
     refinement = report.refinement[0] if report.refinement else None
     if refinement and refinement.passes:
         lines += refinement_lines(refinement)
+    lines += verdict_lines(model_verdicts(report.checked))
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in report.seconds.items()))
     if pairs.overflowed:
         lines.append(

@@ -101,6 +101,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,
+        checks=made.checks,
         lost=[],
         seconds=stages.seconds,
     )
@@ -159,6 +160,8 @@ def extended_report(
             ),
         ),
         models=[_model_row(model) for model in models],
+        # The model has other photos and points now, which no check has seen.
+        checks=[],
         extended=[*(old.extended or ()), extension],
         evaluation=None,
         evaluation_failed=None,

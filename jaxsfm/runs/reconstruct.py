@@ -42,7 +42,8 @@ logger = logging.getLogger("jaxsfm")
 def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) -> dict[str, Json]:
     """Reconstruct a folder of photos; returns the content of `out`/report.json.
 
-    See `reconstruct_folder`, which returns the report as an object.
+    `checks` in it is what the photos say of each model, and `RunReport.from_json(...).verdict` is
+    the verdict that follows. See `reconstruct_folder`, which returns the report as an object.
     """
     return reconstruct_folder(images, out, config=config, options=options).to_json()
 

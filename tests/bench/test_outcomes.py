@@ -183,8 +183,22 @@ def test_a_run_doubts_its_model_when_its_refinement_was_taken_back():
     def report(*accepted):
         passes = [SimpleNamespace(accepted=each) for each in accepted]
         figures = [SimpleNamespace(passes=passes)] if accepted else []
-        return cast(RunReport, SimpleNamespace(refinement=figures))
+        return cast(RunReport, SimpleNamespace(refinement=figures, verdict=None))
 
     assert doubt(report(False)) == "too few patches agreed"
     for fine in (None, report(), report(True, True), report(True, False)):
         assert doubt(fine) == ""
+
+
+def test_a_run_doubts_its_model_when_its_verdict_is_amber_or_red():
+    def report(verdict, accepted=True):
+        figures = [SimpleNamespace(passes=[SimpleNamespace(accepted=accepted)])]
+        return cast(RunReport, SimpleNamespace(refinement=figures, verdict=verdict))
+
+    assert doubt(report("green")) == ""
+    for colour, words in (("amber", "two models explain"), ("red", "contradict each other")):
+        assert doubt(report(colour)).startswith(f"{colour}: ") and words in doubt(report(colour))
+        assert (
+            doubt(report(colour, accepted=False))
+            == f"{doubt(report(colour))}; too few patches agreed"
+        )

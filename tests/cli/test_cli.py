@@ -11,10 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from verdicts import with_verdicts
 
 from jaxsfm import options
 from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.main import BENCHMARKS, COMMANDS, main
+from jaxsfm.report.run_report import RunReport
+from jaxsfm.report.verdict import MEANING
 
 SIZE = (320, 240)
 
@@ -452,6 +455,22 @@ def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert captured.out.startswith(f"no model         {report['no_model']}\n")
     assert all(row["help"] for row in report["lost"])
+
+
+@pytest.mark.parametrize(
+    "colours, status",
+    [((None,), 0), (("green",), 0), (("green", "amber"), 3), (("red",), 3), ((), 1)],
+)
+def test_a_model_that_may_be_wrong_ends_with_3(
+    scene, tmp_path, plain, monkeypatch, capsys, colours, status
+):
+    found = with_verdicts(RunReport.from_json(plain[1]), *colours)
+    monkeypatch.setattr("jaxsfm.runs.reconstruct.reconstruct_folder", lambda *_, **__: found)
+    assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path)]) == status
+    captured = capsys.readouterr()
+    assert ("may be wrong" in captured.err) == (status == 3)
+    for colour in filter(None, colours):
+        assert f"{colour}: {MEANING[colour]}" in captured.out
 
 
 @pytest.mark.slow

@@ -16,6 +16,26 @@ from jaxsfm.report.typed_json import Misfit
 
 ERRORS = {"mean": 0.01, "median": 0.02, "max": 0.03}
 VERDICT = {"trusted": True, "strength": 0.5, "rotation_error_deg": 0.1, "reason": ""}
+CHECK = {
+    "groups": [sorted(NAMES)[:2], sorted(NAMES)[2:3]],
+    "contradictions": [
+        {
+            "images": sorted(NAMES)[:2],
+            "others": sorted(NAMES)[2:3],
+            "tested": 20,
+            "contradicted": 9,
+        }
+    ],
+    "other_places": [
+        {
+            "image": sorted(NAMES)[0],
+            "pairs": sorted(NAMES)[1:2],
+            "agreed": 20,
+            "contradicted": 1,
+            "rotation_deg": 90.0,
+        }
+    ],
+}
 NEAREST = {"pair": [NAMES[0], NAMES[3]], "missed": "7 tentative matches, 26 are needed"}
 
 
@@ -104,6 +124,7 @@ def whole(folder) -> dict:
         },
         "no_model": None,
         "refinement": [None],
+        "checks": [CHECK],
         "seconds": {"mapping": 1.5, "matching": 2},
     }
 

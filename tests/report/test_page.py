@@ -10,6 +10,7 @@ import shutil
 import numpy as np
 import pytest
 from kept_runs import HOSTILE, change_report, renamed
+from verdicts import NAMES, check_of, with_verdicts
 
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
@@ -25,6 +26,7 @@ from jaxsfm.report.page.view_graph import BEST_OF_EACH, chosen_edges
 from jaxsfm.report.page.write import page
 from jaxsfm.report.run_results import LostPhoto, PairRow
 from jaxsfm.report.scene import shown_scene
+from jaxsfm.report.verdict import model_verdicts
 from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.view_graph import Verdict
 
@@ -270,6 +272,49 @@ def test_a_run_in_parts_says_what_parts_them_and_what_may_help(plain, tmp_path):
     change_report(out, lambda report: report.update(models=[], no_model="nothing <fits>"))
     assert main(["report", str(out)]) == 0
     assert "<p>Nothing &lt;fits&gt;.</p>" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize("colour", ["green", "amber", "red"])
+def test_the_page_says_the_verdict_with_all_its_photos(plain, colour):
+    run = read_run(plain[0])
+    assert 'id="verdict"' not in page(run)
+    report = with_verdicts(run.report, colour)
+    body = without_scripts(page(dataclasses.replace(run, report=report)))
+    (verdict,) = model_verdicts(report.checked)
+    head, _, rest = body.partition('id="outcome"')
+    assert f"Verdict {verdict.headline}." in head and rest
+    assert (f"<b>What next:</b> {verdict.advice}." in head) == (colour != "green")
+    for name in NAMES:
+        assert (name in head) == (colour != "green"), name
+    for found in (*verdict.contradictions, *verdict.places):
+        assert f"<li>{found.text}." in head
+
+
+def test_a_page_of_a_doubtful_model_has_no_green_outcome(plain):
+    run = read_run(plain[0])
+    for colour, word in (("green", "good"), ("amber", "partial"), ("red", "partial")):
+        report = with_verdicts(run.report, colour)
+        text = page(dataclasses.replace(run, report=report))
+        assert f'class="outcome {word}"' in text
+
+
+def test_names_in_a_verdict_are_only_ever_text(plain):
+    run = read_run(plain[0])
+    check = check_of("amber")
+    place = dataclasses.replace(check.other_places[0], image=HOSTILE, pairs=[HOSTILE] * 5)
+    check = dataclasses.replace(check, other_places=[place])
+    text = page(dataclasses.replace(run, report=dataclasses.replace(run.report, checks=[check])))
+    assert (
+        HOSTILE not in text and html.escape(HOSTILE, quote=True).replace("&#x27;", "&#39;") in text
+    )
+
+
+def test_a_long_verdict_says_what_is_left_out(plain):
+    run = read_run(plain[0])
+    check = check_of("red")
+    many = dataclasses.replace(check, contradictions=check.contradictions * 40)
+    text = page(dataclasses.replace(run, report=dataclasses.replace(run.report, checks=[many])))
+    assert "25 more are in report.json." in text
 
 
 # -- never in a run's way -----------------------------------------------------------------------

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from verdicts import NAMES, with_verdicts
 
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
@@ -28,7 +29,8 @@ def old(tmp_path) -> Path:
 def test_a_report_of_the_first_format_is_read_and_loses_nothing(old):
     plain, report = json.loads(FORMAT_1.read_text()), read_report(old)
     assert "format" not in plain and report.format == 1
-    assert report.to_json() == plain | {"format": 1}
+    assert report.to_json() == plain | {"format": 1, "checks": []}
+    assert report.verdict is None
     assert report.models[0].registered == 7 and report.pairs.each[0].status == Status.VERIFIED
     assert report.options.others["mapper"] == "incremental"
     assert "registered       7 of 7 images" in summary_lines(report)
@@ -57,6 +59,39 @@ def test_a_report_that_cannot_be_read_says_where(old, change, says):
         read_report(old)
     assert str(old) in str(error.value) and "report.json" in str(error.value)
     assert says in str(error.value)
+
+
+# -- the verdict -----------------------------------------------------------------------------------
+
+
+def test_checks_are_written_and_read_again(old, tmp_path):
+    report = with_verdicts(read_report(old), "red", None, "amber")
+    write_report(tmp_path, report)
+    assert read_report(tmp_path) == report
+    plain = json.loads((tmp_path / "report.json").read_text())["checks"]
+    assert plain[0]["contradictions"][0]["images"] == NAMES[:4] and plain[1] is None
+
+
+@pytest.mark.parametrize(
+    "colours, worst",
+    [
+        ((), None),
+        ((None,), None),
+        (("green",), "green"),
+        (("green", None, "amber"), "amber"),
+        (("amber", "red", "green"), "red"),
+    ],
+)
+def test_the_verdict_of_a_run_is_the_worst_of_its_models(old, colours, worst):
+    report = with_verdicts(read_report(old), *colours)
+    assert report.verdict == with_verdicts(report, *reversed(colours)).verdict == worst
+
+
+def test_models_of_two_photos_have_no_verdict(old):
+    report = with_verdicts(read_report(old), "green", "red")
+    few = [report.models[0], dataclasses.replace(report.models[1], registered=2)]
+    assert report.verdict == "red"
+    assert dataclasses.replace(report, models=few).verdict == "green"
 
 
 # -- dataclasses as JSON ---------------------------------------------------------------------------

@@ -97,9 +97,10 @@ def test_a_new_photo_stands_where_it_was_taken(extended, scene):
     assert new.num_points3D > 100 and new.camera_id == 1
 
 
-def test_the_report_says_what_was_added_and_what_was_lost(extended):
+def test_the_report_says_what_was_added_and_what_was_lost(extended, plain):
     report = extended.report
     (row,) = report["extended"]
+    assert len(plain[1]["checks"]) == 1 and report["checks"] == []  # another model now
     assert row["added"] == ["elsewhere.png", "new.png"] and row["placed"] == ["new.png"]
     assert report["models"][0]["registered"] == 4
     (lost,) = report["lost"]

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.atomic import write_atomic
-from jaxsfm.io.images import shown_name
+from jaxsfm.io.images import MOST_NAMED, named, shown_name
 from jaxsfm.io.pairs import describe
 from jaxsfm.io.work_folder import PAGE
 from jaxsfm.report.finished_run import FinishedRun, read_run
@@ -25,9 +25,11 @@ from jaxsfm.report.page.photo_table import photo_table
 from jaxsfm.report.page.view_graph import view_graph
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.scene import shown_scene
-from jaxsfm.report.summary import named
 from jaxsfm.report.typed_json import to_json
+from jaxsfm.report.verdict import model_verdicts
 
+MAX_FINDINGS = 15
+"""The number of contradictions, and of second places, that the page lists for each model."""
 _ENVIRONMENT = jinja2.Environment(
     loader=jinja2.PackageLoader("jaxsfm.report.page", "."),
     autoescape=True,
@@ -91,6 +93,9 @@ def page(run: FinishedRun) -> str:
         title=shown_name(run.folder.absolute().name),
         plotly=Markup(plotly.offline.get_plotlyjs()),
         report=report,
+        verdicts=model_verdicts(report.checked),
+        most_findings=MAX_FINDINGS,
+        named_photos=MOST_NAMED,
         reference=run.reference,
         figures=dict(_figures(run, names)),
         pictures=pictures,

@@ -1,0 +1,148 @@
+"""The verdict on a model in words: whether its photos contradict it, and what to do then.
+
+The summary on the screen and the page say the same sentences.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from jaxsfm.io.images import named, shown_name
+from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace, VerdictColour
+
+MAX_FINDINGS = 3
+"""The number of contradictions, and of second places, that the summary lists for each model."""
+MEANING: dict[VerdictColour, str] = {
+    "green": "no photo contradicts the model",
+    "amber": "two models explain these photos",
+    "red": "photos contradict each other",
+}
+_DECISIVE = "neighbours overlap by more than half and something that occurs only once is in view"
+
+
+class Finding(NamedTuple):
+    """Something that speaks against a model."""
+
+    text: str
+    images: list[str]
+    others: list[str]
+    """The photos that contradict `images`, or the other photos of the pairs that give `images` a
+    second place."""
+
+
+class ModelVerdict(NamedTuple):
+    """The verdict on one model in words. Sentences start in lower case and have no full stop."""
+
+    colour: VerdictColour
+    headline: str
+    contradictions: list[Finding]
+    """The one with most contradicted points first."""
+    places: list[Finding]
+    """Second places of photos, the one with most points that agree first."""
+    decisive: str
+    """Photos that would decide between two places; empty if no photo has two."""
+    advice: str
+    """What to do next; empty for a model that nothing speaks against."""
+
+
+def in_words(colour: VerdictColour) -> str:
+    """A verdict and what it means."""
+    return f"{colour}: {MEANING[colour]}"
+
+
+def model_verdicts(checks: Sequence[tuple[int, ModelCheck]]) -> list[ModelVerdict]:
+    """The verdicts on several models in words.
+
+    Args:
+      checks: of each model that was checked, the number N of its folder `sparse/N`, and its check.
+        If model 0 alone was checked, the words do not name the folder.
+    """
+    alone = [number for number, _ in checks] == [0]
+    return [model_verdict(check, "" if alone else f"sparse/{n}") for n, check in checks]
+
+
+def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
+    """The verdict on one model in words.
+
+    Args:
+      model: the folder of the model, if the words should name it.
+    """
+    colour = check.verdict
+    contradictions = sorted(check.contradictions, key=lambda each: -each.contradicted)
+    places = sorted(check.other_places, key=lambda each: -each.agreed)
+    headline = in_words(colour)
+    if colour == "amber":
+        count = len({place.image for place in places})
+        fit = "1 photo fits" if count == 1 else f"{count} photos fit"
+        headline += f"; {fit} into the model in a second place"
+    return ModelVerdict(
+        colour=colour,
+        headline=headline + (f" ({model})" if model else ""),
+        contradictions=[
+            Finding(_against(each), each.images, each.others) for each in contradictions
+        ],
+        places=[Finding(_fits(each), [each.image], each.pairs) for each in places],
+        decisive=_decides(places[0]) if places else "",
+        advice=_advice(colour, places),
+    )
+
+
+def verdict_lines(verdicts: Sequence[ModelVerdict]) -> list[str]:
+    """The verdicts as lines of the summary; one line if all are green, none if there are none."""
+    if verdicts and all(each.colour == "green" for each in verdicts):
+        models = "the models" if len(verdicts) > 1 else "the model"
+        return [f"verdict          green: no photo contradicts {models}"]
+    return [line for each in verdicts for line in _model_lines(each)]
+
+
+def _model_lines(verdict: ModelVerdict) -> list[str]:
+    lines = [f"verdict          {verdict.headline}"]
+    for label, found in (
+        ("contradiction    ", verdict.contradictions),
+        ("second place     ", verdict.places),
+    ):
+        lines += [label + each.text for each in found[:MAX_FINDINGS]]
+        if more := len(found[MAX_FINDINGS:]):
+            lines.append(f"{label}{more} more {'is' if more == 1 else 'are'} in report.json")
+    if verdict.decisive:
+        lines.append(f"would decide     {verdict.decisive}")
+    if verdict.advice:
+        lines.append(f"what next        {verdict.advice}")
+    return lines
+
+
+def _against(found: Contradiction) -> str:
+    return (
+        f"{named(found.images)} against {named(found.others)}: {found.contradicted} of "
+        f"{found.tested} points that one group shows are missing in the other, which should show "
+        "them"
+    )
+
+
+def _fits(place: OtherPlace) -> str:
+    put = "the pair with {} puts" if len(place.pairs) == 1 else "the pairs with {} put"
+    return (
+        f"{shown_name(place.image)}, turned by {place.rotation_deg:.0f} degrees: "
+        f"{put.format(named(place.pairs))} it there; seen from there, it agrees with "
+        f"{place.agreed} points of the model and contradicts {place.contradicted}"
+    )
+
+
+def _decides(place: OtherPlace) -> str:
+    return (
+        f"photos taken on the way from {shown_name(place.image)} to {named(place.pairs)}, if "
+        + _DECISIVE
+    )
+
+
+def _advice(colour: VerdictColour, places: Sequence[OtherPlace]) -> str:
+    if colour == "red":
+        return (
+            "do not use this model as it is: add photos taken on the way from one group to the "
+            f"other, so that {_DECISIVE}, and run the same command again"
+        )
+    if colour == "amber":
+        return (
+            f"look whether {shown_name(places[0].image)} stands where the model has it; if you "
+            "cannot tell, add such photos and run the same command again"
+        )
+    return ""

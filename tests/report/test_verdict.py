@@ -1,0 +1,92 @@
+"""The verdict in words: on the screen, and for the page."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+from verdicts import NAMES, check_of, with_verdicts
+
+from jaxsfm.report.run_report import read_report
+from jaxsfm.report.summary import summary_lines
+from jaxsfm.report.verdict import MAX_FINDINGS, model_verdict, model_verdicts, verdict_lines
+
+FORMAT_1 = Path(__file__).parent / "report_of_format_1.json"
+
+
+@pytest.fixture
+def report(tmp_path):
+    (tmp_path / "report.json").write_bytes(FORMAT_1.read_bytes())
+    return read_report(tmp_path)
+
+
+def lines(report, *colours) -> list[str]:
+    """The lines of the summary that a report has more than one without checks."""
+    without = summary_lines(with_verdicts(report, *[None] * len(colours)))
+    return [x for x in summary_lines(with_verdicts(report, *colours)) if x not in without]
+
+
+def test_a_model_that_was_not_checked_has_no_line(report):
+    assert lines(report, None) == [] and "verdict" not in "\n".join(summary_lines(report))
+
+
+def test_green_is_one_line_for_any_number_of_models(report):
+    assert lines(report, "green") == ["verdict          green: no photo contradicts the model"]
+    assert lines(report, "green", None, "green") == [
+        "verdict          green: no photo contradicts the models"
+    ]
+
+
+def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(report):
+    head, place, decisive, advice = lines(report, "amber")
+    assert head == (
+        "verdict          amber: two models explain these photos; 1 photo fits into the model in a "
+        "second place"
+    )
+    others = f"{NAMES[1]}, {NAMES[2]}, {NAMES[3]} and 5 more"
+    assert place == (
+        f"second place     {NAMES[0]}, turned by 90 degrees: the pairs with {others} put it there; "
+        "seen from there, it agrees with 120 points of the model and contradicts 3"
+    )
+    assert decisive.startswith(
+        f"would decide     photos taken on the way from {NAMES[0]} to {others}"
+    )
+    assert "overlap by more than half" in decisive and "occurs only once" in decisive
+    assert advice.startswith(f"what next        look whether {NAMES[0]} stands")
+
+
+def test_red_names_both_groups_and_how_many_points_are_missing(report):
+    head, groups, advice = lines(report, "red")
+    assert head == "verdict          red: photos contradict each other"
+    assert groups.startswith(
+        f"contradiction    {NAMES[0]}, {NAMES[1]}, {NAMES[2]} and 1 more against {NAMES[4]}, "
+        f"{NAMES[5]}, {NAMES[6]} and 2 more: 312 of 400 points that one group shows are missing in "
+        "the other"
+    )
+    assert advice.startswith("what next        do not use this model as it is: add photos")
+
+
+def test_words_on_several_models_say_which_one(report):
+    text = "\n".join(lines(report, "green", None, "red"))
+    assert "green: no photo contradicts the model (sparse/0)\n" in text
+    assert "red: photos contradict each other (sparse/2)\n" in text
+    (alone,) = model_verdicts([(1, check_of("red"))])
+    assert alone.headline.endswith("(sparse/1)")
+
+
+def test_the_strongest_findings_come_first_and_the_others_are_counted():
+    check = check_of("amber")
+    (place,) = check.other_places
+    places = [dataclasses.replace(place, image=f"{n}.jpg", agreed=n) for n in (5, 80, 3, 70, 60)]
+    verdict = model_verdict(dataclasses.replace(check, other_places=places))
+    assert [each.images for each in verdict.places[:3]] == [["80.jpg"], ["70.jpg"], ["60.jpg"]]
+    assert "from 80.jpg to" in verdict.decisive and "5 photos fit" in verdict.headline
+    found = [x for x in verdict_lines([verdict]) if x.startswith("second place")]
+    assert len(found) == MAX_FINDINGS + 1
+    assert found[-1] == "second place     2 more are in report.json"
+
+
+def test_a_red_model_tells_of_second_places_too():
+    places = check_of("amber").other_places
+    check = dataclasses.replace(check_of("red"), other_places=places)
+    labels = [line[:17].strip() for line in verdict_lines([model_verdict(check)])]
+    assert labels == ["verdict", "contradiction", "second place", "would decide", "what next"]

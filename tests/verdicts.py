@@ -1,0 +1,30 @@
+"""Checks of models with each of the verdicts, made up."""
+
+import dataclasses
+
+from jaxsfm.report.run_report import RunReport
+from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace, VerdictColour
+
+NAMES = [f"checked{k}.jpg" for k in range(9)]
+
+
+def check_of(colour: VerdictColour) -> ModelCheck:
+    """A check with that verdict, which names all of NAMES."""
+    contradiction = Contradiction(images=NAMES[:4], others=NAMES[4:], tested=400, contradicted=312)
+    place = OtherPlace(
+        image=NAMES[0], pairs=NAMES[1:], agreed=120, contradicted=3, rotation_deg=89.6
+    )
+    return ModelCheck(
+        groups=[NAMES[:4], NAMES[4:]] if colour == "red" else [NAMES],
+        contradictions=[contradiction] if colour == "red" else [],
+        other_places=[place] if colour == "amber" else [],
+    )
+
+
+def with_verdicts(report: RunReport, *colours: VerdictColour | None) -> RunReport:
+    """A report with its best model once for each verdict; None is a model that was not checked."""
+    return dataclasses.replace(
+        report,
+        models=report.models[:1] * len(colours),
+        checks=[colour and check_of(colour) for colour in colours],
+    )
