@@ -60,8 +60,6 @@ class Reconstructed:
     """For each model; None where it was not checked."""
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
-    checks: list[ModelCheck | None]
-    """For each model; None where it was not checked."""
 
 
 def reconstruct(
@@ -152,7 +150,6 @@ def reconstruct(
             models=models,
             checks=[mapping.checks[k] for k in order],
             refinement=refinement,
-            checks=[None] * len(models),
         )
 
 

@@ -10,11 +10,10 @@ Single contradictions say little: alignment fails on leaves, in reflections, or 
 driven away. They count only in blocks, if most of the tested points around them are contradictions
 too. Only views that see a point from nearly the same side are compared.
 
-Source: the idea to test a model by points that views should see and do not is that of Zach,
-Irschara and Bischof 2008, "What can missing correspondences tell us about 3D structure and motion?", and
-Heinly, Dunn and Frahm 2014, "Correcting for duplicate scene structure in sparse 3D reconstruction".
-Both use keypoints and segments of images. Aligned patches also say that a view shows *another*
-surface in the same place, as one poster instead of another.
+Source: Zach, Irschara and Bischof 2008, "What can missing correspondences tell us about 3D structure
+and motion?", and Heinly, Dunn and Frahm 2014, "Correcting for duplicate scene structure in sparse
+3D reconstruction", test models by points that views should see and do not. Both use keypoints.
+Aligned patches also say that a view shows *another* surface in the same place.
 """
 
 from collections.abc import Sequence
