@@ -57,12 +57,14 @@ def find_view(
     max_error_px: float,
     estimate_focal_length: bool,
     seed: int,
+    min_inlier_share: float = MIN_INLIER_SHARE,
 ) -> View | None:
     """Find the pose of a view by RANSAC. The pose that `view` has plays no part.
 
     Args:
       xy, points: as in `adjust_view`; some of them may be wrong.
       max_error_px: the largest reprojection error of an inlier, working pixels.
+      min_inlier_share: RANSAC ends when it has surely found a pose with this share of inliers.
 
     Returns:
       None if no pose is found.
@@ -72,7 +74,7 @@ def find_view(
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.estimate_focal_length = estimate_focal_length
     options.ransac.max_error = max_error_px * view.mean_scale
-    options.ransac.min_inlier_ratio = MIN_INLIER_SHARE
+    options.ransac.min_inlier_ratio = min_inlier_share
     options.ransac.random_seed = seed
     camera = pycolmap.Camera(view.camera.todict())
     refinement = pycolmap.AbsolutePoseRefinementOptions()

@@ -10,10 +10,10 @@ Single contradictions say little: alignment fails on leaves, in reflections, or 
 driven away. They count only in blocks, if most of the tested points around them are contradictions
 too. Only views that see a point from nearly the same side are compared.
 
-Source: Zach, Irschara and Bischof 2008, "What can missing correspondences tell us about 3D structure
-and motion?", and Heinly, Dunn and Frahm 2014, "Correcting for duplicate scene structure in sparse
-3D reconstruction", test models by points that views should see and do not. Both use keypoints.
-Aligned patches also say that a view shows *another* surface in the same place.
+Source: Zach, Irschara and Bischof 2008, "What can missing correspondences tell us about 3D
+structure and motion?", and Heinly, Dunn and Frahm 2014, "Correcting for duplicate scene structure
+in sparse 3D reconstruction", test models by points that views should see and do not. Both use
+keypoints. Aligned patches also say that a view shows *another* surface in the same place.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,9 @@ from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
-POINTS_PER_VIEW = 1000
-"""At most so many points of a model are tested, per view. More do not change an outcome, but the
-tests of castle-P19 take 17 s with 1500 instead of 10 s."""
+POINTS_PER_VIEW, MAX_POINTS = 1000, 100_000
+"""At most so many points of a model are tested, per view and in all. Each is seen by several views,
+so every view has more than these to show."""
 OTHER_SCORE = 0.5
 """A patch shows something else if its normalised cross-correlation is lower. Patches that agree
 have at least 0.8. Between the two, nothing is said."""
@@ -88,9 +88,13 @@ class _Seen(NamedTuple):
     """bool (n, v)."""
 
 
-def thinned(model: Model) -> Model:
-    """The model with at most `POINTS_PER_VIEW` points per view, evenly taken by index."""
-    count, most = len(model.tracks.points), POINTS_PER_VIEW * len(model.views)
+def thinned(model: Model, *, per_view: int = POINTS_PER_VIEW) -> Model:
+    """The model with at most `per_view` points per view and `MAX_POINTS` in all.
+
+    They are taken evenly by index.
+    """
+    count = len(model.tracks.points)
+    most = min(per_view * len(model.views), MAX_POINTS)
     if count <= most:
         return model
     return model.with_tracks(model.tracks.select_points(np.arange(most) * count // most))
