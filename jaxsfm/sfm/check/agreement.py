@@ -150,22 +150,27 @@ def _tested(
     low &= (shown.sum(1) >= 2)[point]
     for k in np.unique(view):
         rows = np.flatnonzero(low & (view == k))
-        low[rows] = _not_hidden(views[k], seen, k, point[rows])
+        # A view itself says at which depth it shows surfaces. A target does not, because its own
+        # points have been left out; there the surfaces are those of the other views.
+        around = np.ones(len(points), bool) if targets is not None else shown[:, k]
+        low[rows] = _not_hidden(views[k], points[around], points[point[rows]])
     keep = agrees | low
     return seen, _Tests(point[keep], view[keep], xy[keep], low[keep])
 
 
-def _not_hidden(view: View, seen: _Seen, k: int, point: np.ndarray) -> np.ndarray:
-    """bool (m,): of points that a view does not show, those that nothing stands in front of.
+def _not_hidden(view: View, surface: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """bool (m,): of points (m, 3) that a view does not show, those that nothing stands in front of.
 
-    The view shows points near them that lie on the same surface or behind it.
+    Args:
+      surface: float64 (n, 3), points of surfaces. Near such a point of the image, they must have
+        the same depth or lie behind it.
     """
-    xy, depth = view.project(seen.points[seen.shown[:, k]])
+    xy, depth = view.project(surface)
     known = np.isfinite(xy).all(1)
     xy, depth = xy[known], depth[known]
-    if len(xy) < AROUND or not len(point):
-        return np.zeros(len(point), bool)
-    at, own = view.project(seen.points[point])
+    if len(xy) < AROUND or not len(points):
+        return np.zeros(len(points), bool)
+    at, own = view.project(points)
     distance, nearest = map(np.asarray, KDTree(xy).query(at, k=AROUND))
     near = distance < REACH * max(view.size)
     ratio = depth[nearest] / own[:, None]
