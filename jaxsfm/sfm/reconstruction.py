@@ -1,5 +1,5 @@
-"""From verified matches to models, in three stages: verification with the view graph, mapping, and
-refinement.
+"""From matches to models, in three stages: verification, mapping with the view graph and the check,
+and refinement.
 
 Each stage reads the files of the one before. So a stage whose files exist from an earlier run
 (`jaxsfm.run_folder`) gives what it would give if it ran again.
@@ -75,7 +75,7 @@ def reconstruct(
     on_pass: Callable[[], None] = lambda: None,
     on_mapped: Callable[[], None] = lambda: None,
 ) -> Reconstructed:
-    """Make COLMAP models from verified matches: view graph, mapping, refinement.
+    """Make COLMAP models from verified matches: mapping of trusted pairs, check, refinement.
 
     Pixel thresholds are multiplied by `Photos.median_scale`. Points get the colours of the photos.
 
