@@ -82,8 +82,8 @@ def reconstruct(
     Args:
       matches: the result of `match`.
       database: where to write the COLMAP database; a file there is replaced.
-      config: the one that the matches were made with. Its `view_graph` and `refinement` switch
-        those stages on.
+      config: the one that the matches were made with. Its `view_graph`, `checked` and `refinement`
+        switch those parts on.
       intrinsics: the known cameras. None takes one camera per photo.
       options: of the mapper. By default it is incremental, and refines the intrinsics unless they
         are given.
