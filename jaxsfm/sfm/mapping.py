@@ -68,16 +68,15 @@ class _Round(NamedTuple):
     verdicts: dict[Pair, Verdict]
     checks: list[Checked | None]
 
-    def against(self, known: Collection[Pair] = ()) -> dict[Pair, Contradiction]:
-        """The pairs, except `known` ones, that the next round must do without.
+    def against(self) -> dict[Pair, Contradiction]:
+        """The pairs that the next round must do without as well.
 
         Pairs that are suspected because of their groups are left out only if no pair is refuted by
         its own two photos: with these gone, the groups may be joined rightly.
         """
         done = [each for each in self.checks if each is not None]
-        refuted = {p: why for each in done for p, why in each.refuted.items() if p not in known}
-        suspected = {p: why for each in done for p, why in each.suspected.items() if p not in known}
-        return refuted or suspected
+        refuted = {pair: why for each in done for pair, why in each.refuted.items()}
+        return refuted or {pair: why for each in done for pair, why in each.suspected.items()}
 
     def explained(self) -> set[Pair]:
         """Pairs that agree with the models."""
@@ -110,12 +109,12 @@ def build_checked_models(
         trusted = _write_trusted(given, verdicts, database)
         models, tried = build_models(database, trusted, options, on_image=on_image)
         attempts.extend(tried)
-        return _Round(models, verdicts, _check(models, given, config, options.seed))
+        return _Round(models, verdicts, _check(models, given, refuted, config, options.seed))
 
     refuted: dict[Pair, Contradiction] = {}
     made = map_without(refuted)
     for _ in range(MAX_ROUNDS - 1):
-        against = made.against(refuted.keys())
+        against = made.against()
         if not against:
             break
         logger.info("photos contradict each other; mapping without %d pairs", len(against))
@@ -164,13 +163,17 @@ def _refuted(each: Contradiction) -> Verdict:
 
 
 def _check(
-    models: "list[pycolmap.Reconstruction]", given: VerifiedPairs, config: Config, seed: int
+    models: "list[pycolmap.Reconstruction]",
+    given: VerifiedPairs,
+    refuted: Collection[Pair],
+    config: Config,
+    seed: int,
 ) -> list[Checked | None]:
     """The checks of models; None where one was not checked."""
     if not config.checked:
         return [None] * len(models)
     checks: list[Checked | None] = []
-    matches = VerifiedMatches(given.matches, given.two_views.keys(), seed)
+    matches = VerifiedMatches(given.matches, given.two_views.keys(), refuted, seed)
     for each in models:
         sizes = {name: given.photos.working_size(name) for name in registered(each)}
         images = DeviceImages(given.photos.gray)

@@ -10,7 +10,7 @@ from jaxsfm.sfm.check.agreement import Agreement, agreement, thinned
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, share
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
 from jaxsfm.sfm.check.other_places import Refused, other_places
-from jaxsfm.sfm.check.pair_fit import MIN_FIT, pair_fits
+from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 
@@ -30,6 +30,8 @@ class VerifiedMatches(NamedTuple):
     """By pair, original pixels."""
     pairs: Collection[Pair]
     """Those that COLMAP verified."""
+    refuted: Collection[Pair]
+    """Those of them that earlier checks have refuted."""
     seed: int
     """For RANSAC."""
 
@@ -39,12 +41,13 @@ class Checked(NamedTuple):
 
     check: ModelCheck
     refuted: dict[Pair, Contradiction]
-    """Pairs that agree with the model and whose two photos contradict each other there."""
+    """Pairs that agree with the model and whose two photos contradict each other there, except
+    those that were refuted before."""
     suspected: dict[Pair, Contradiction]
     """Pairs that agree with the model and join groups that contradict each other. Some of them may
     be right: then the groups were joined wrongly elsewhere."""
     explained: set[Pair]
-    """Pairs that agree with the model. No photo contradicts another one there."""
+    """Pairs that agree with a model in which no photo contradicts another one."""
 
 
 def check_model(
@@ -74,14 +77,18 @@ def check_model(
     contradictions = _named(grouping, names)
     normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     fits = pair_fits(model, normal, given.matches, given.pairs)
-    fitting = [pair for pair, fit in fits.items() if fit >= MIN_FIT]
-    refuted = _refuted(found, names, fitting)
-    suspected = {
-        pair: each
-        for pair in fitting
-        for each in contradictions
-        if _joins(pair, each) and pair not in refuted
-    }
+    refuted, suspected = {}, {}
+    for least in (MIN_FIT, *LOWER_FITS) if contradictions else ():
+        fitting = [p for p, fit in fits.items() if fit >= least and p not in given.refuted]
+        refuted = _refuted(found, names, fitting)
+        suspected = {
+            pair: each
+            for pair in fitting
+            for each in contradictions
+            if _joins(pair, each) and pair not in refuted
+        }
+        if refuted or suspected:
+            break
     places = []
     if not contradictions:
         against = {pair: given.matches[pair] for pair in fits if fits[pair] < MIN_FIT}
@@ -89,7 +96,7 @@ def check_model(
         places = other_places(model, normal, images, refinement, refused)
     groups = [sorted(names[k] for k in group) for group in grouping.groups]
     check = ModelCheck(groups=groups, contradictions=contradictions, other_places=places)
-    explained = set(fitting) - refuted.keys() - suspected.keys()
+    explained = {pair for pair, fit in fits.items() if fit >= MIN_FIT and not contradictions}
     return Checked(check, refuted, suspected, explained)
 
 
