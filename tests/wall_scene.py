@@ -1,5 +1,6 @@
 """Rendered walls with exact cameras, points and pixels, as models: posters, repeats and matches."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -44,6 +45,7 @@ class Scene(NamedTuple):
         return [view.name for view in self.model.views]
 
 
+@functools.cache
 def picture(
     seed: int, *, left: float, width: float, height: float, z: float = 0.0
 ) -> TexturedPlane:

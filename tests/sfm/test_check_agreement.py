@@ -75,17 +75,16 @@ def test_halves_with_different_posters_contradict_each_other_in_both_directions(
 
 
 def test_a_view_that_has_no_part_in_the_model_can_be_compared_with_it(halves):
-    """What others see is known from their tracks; what it shows is found. It is nearly the same as
-    if the view had a part in the model."""
+    """What others see is known from their tracks; what it shows is found. It contradicts nearly as
+    many points as if it had a part in the model."""
     every = agreement_of(halves)
     for k in (1, 4):
         model = halves.model.select(halves.model.tracks.view != k)
         alone = agreement(model, halves.images, REFINEMENT, targets=[k])
         assert not np.delete(alone.tested, k, 1).any()
-        others = np.arange(len(ANGLES)) != k
-        np.testing.assert_allclose(alone.tested[others, k], every.tested[others, k], rtol=0.1)
+        assert (np.delete(alone.tested[:, k], k) > 300).all()
         across = (np.arange(len(ANGLES)) < HALF) != (k < HALF)
-        assert (alone.contradicted[across, k] > 0.7 * every.contradicted[across, k]).all()
+        assert (alone.contradicted[across, k] > 0.8 * every.contradicted[across, k]).all()
         assert not alone.contradicted[~across, k].any()
 
 
@@ -94,9 +93,7 @@ def test_points_that_something_in_front_hides_are_no_contradictions(monkeypatch)
     pillar = picture(5, left=-0.4, width=0.8, height=2.0, z=-1.5)
     seen = scene([([big_wall(), pillar], cameras(ANGLES))])
     assert not agreement_of(seen).contradicted.any()
-    monkeypatch.setattr(
-        module, "_not_hidden", lambda view, seen, k, point: np.ones(len(point), bool)
-    )
+    monkeypatch.setattr(module, "_not_hidden", lambda view, *_: np.ones(len(_[-1]), bool))
     assert agreement_of(seen).contradicted.sum() > 200  # if nobody asks what is in front
 
 
@@ -123,7 +120,8 @@ def test_only_views_from_nearly_the_same_distance_are_compared():
     near, middle, far = DISTANCE, 1.35 * DISTANCE, 1.82 * DISTANCE
     poses = [cameras([angle], distance=d)[0] for angle, d in ((-5, near), (0, middle), (5, far))]
     tested = agreement_of(scene([([big_wall()], poses)])).tested
-    assert tested[0, 1] and tested[1, 0] and tested[1, 2] and tested[2, 1]
+    # Most patches are those of the view in the middle. They are tested in the other two only.
+    assert tested[1, 0] > 300 and tested[1, 2] > 300
     assert not tested[0, 2] and not tested[2, 0] and 1.35 < MAX_DISTANCE_RATIO < 1.82
 
 
@@ -153,10 +151,9 @@ def random_tracks(points: int, views: int) -> Tracks:
 
 
 def test_a_thinned_model_has_few_points_per_view_taken_evenly_with_their_observations(monkeypatch):
-    monkeypatch.setattr(module, "POINTS_PER_VIEW", 10)
     views = scene([([big_wall()], cameras([0.0, 5.0]))]).model.views
     model = Model(views, random_tracks(70, 2))
-    small = thinned(model)
+    small = thinned(model, per_view=10)
     assert len(small.tracks.points) == 10 * 2 and small.views == views
     rows = [int(np.flatnonzero((model.tracks.points == p).all(1))[0]) for p in small.tracks.points]
     assert set(np.diff(rows)) == {3, 4} and rows[0] < 4 and rows[-1] > 65
@@ -170,4 +167,6 @@ def test_a_thinned_model_has_few_points_per_view_taken_evenly_with_their_observa
     for one, other in zip(small.tracks, thinned(model).tracks, strict=True):
         np.testing.assert_array_equal(one, other)
     few = Model(views, random_tracks(20, 2))
-    assert thinned(few) is few
+    assert thinned(few, per_view=10) is few and thinned(model) is model
+    monkeypatch.setattr(module, "MAX_POINTS", 5)
+    assert len(thinned(model).tracks.points) == 5
