@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from room_scene import exact_model, images_of
+from room_scene import exact_model, images_of, other_scene
 from wall_scene import (
     DISTANCE,
     REFINEMENT,
@@ -22,6 +22,7 @@ from jaxsfm.sfm.check.agreement import (
     MAX_DISTANCE_RATIO,
     MIN_COMPARED,
     Agreement,
+    Surface,
     agreement,
     thinned,
 )
@@ -86,6 +87,32 @@ def test_a_view_that_has_no_part_in_the_model_can_be_compared_with_it(halves):
         across = (np.arange(len(ANGLES)) < HALF) != (k < HALF)
         assert (alone.contradicted[across, k] > 0.8 * every.contradicted[across, k]).all()
         assert not alone.contradicted[~across, k].any()
+
+
+def test_what_a_view_observed_before_does_not_speak_for_it_when_it_is_tested(halves):
+    """Its photo is of something else now. It shows no surface that could hide nothing."""
+    name = halves.names[4]
+    elsewhere = halves._replace(photos=halves.photos | {name: other_scene(0)})
+    assert not agreement_of(elsewhere, targets=[4]).tested.any()
+
+
+def test_of_patches_that_agree_a_little_nothing_is_said():
+    """Noise over a photo takes most correlations to about 0.65: less than what agrees, more than
+    what shows something else. It is known that nothing hides the wall."""
+    seen = scene([([big_wall()], cameras(ANGLES))])
+    name, k = seen.names[4], 4
+    model = seen.model.select(seen.model.tracks.view != k)
+    surfaces = {k: Surface.of(model.views[k], model.tracks.points)}
+    photo = seen.photos[name]
+    spread = [
+        photo[y : y + 15, x : x + 15].std() for y in range(0, 340, 50) for x in range(0, 460, 70)
+    ]
+    for factor, blank in ((1.2, False), (20.0, True)):
+        noise = np.random.default_rng(0).normal(0, factor * np.median(spread), photo.shape)
+        images = seen._replace(photos=seen.photos | {name: photo + noise.astype(np.float32)}).images
+        found = agreement(model, images, REFINEMENT, targets=[k], surfaces=surfaces)
+        assert (found.contradicted.sum() > 1000) == blank
+        assert (found.tested[0, k] > 250) == blank
 
 
 def test_points_that_something_in_front_hides_are_no_contradictions(monkeypatch):

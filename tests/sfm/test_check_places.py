@@ -22,7 +22,13 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.check.other_places import MIN_INLIERS, Refused, other_place, other_places
+from jaxsfm.sfm.check.other_places import (
+    MIN_AGREED,
+    MIN_INLIERS,
+    Refused,
+    other_place,
+    other_places,
+)
 from jaxsfm.sfm.check.pair_fit import MIN_MATCHES, pair_fits
 from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.refine import plane_geometry
@@ -207,6 +213,16 @@ def test_few_matches_give_no_second_place(equal, count, found):
     few = matched(twins.pair, twins.keypoints0[:count], twins.keypoints1[:count])
     view = (seen.model, normals(seen.model), seen.images, REFINEMENT, refused(few))
     assert sum(other_place(*view, k) is not None for k in (0, 3)) == 2 * found
+
+
+@pytest.mark.parametrize(("points", "found"), [(MIN_AGREED - 5, False), (MIN_AGREED + 60, True)])
+def test_a_place_from_which_few_points_are_seen_is_no_second_place(equal, points, found):
+    """All matches agree in it; that is not enough."""
+    rows = np.flatnonzero((equal.plane == 0) | (np.cumsum(equal.plane == 1) <= points))
+    few = equal._replace(model=equal.model.with_tracks(equal.model.tracks.select_points(rows)))
+    against = refused(twin_matches(equal.model, 0, 3, TURNED))
+    place = other_place(few.model, normals(few.model), few.images, REFINEMENT, against, 0)
+    assert (place is not None) == found
 
 
 def test_matches_with_another_wall_give_no_second_place():
