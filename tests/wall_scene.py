@@ -111,7 +111,7 @@ def scene(seen_by: Sequence[tuple[Sequence[TexturedPlane], Sequence[CameraPose]]
     shown = []
     for some, poses in seen_by:
         own = [k for k, p in enumerate(planes) if any(p is one for one in some)]
-        where = np.asarray([own.index(k) if k in own else -1 for k in plane])
+        where = np.asarray([own.index(k) if k in own else -1 for k in plane.tolist()])
         for pose in poses:
             view = view_of(pose, len(views))
             views.append(view)

@@ -42,7 +42,7 @@ attempts = st.builds(
     initial_pair=st.none() | st.sampled_from(PAIRS),
     registered=st.lists(st.integers(0, 99), max_size=3),
 )
-checks = st.none() | st.sampled_from(["green", "amber", "red"]).map(check_of)
+checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red")])
 mappings = st.builds(
     MappingFigures,
     verdicts=st.dictionaries(st.sampled_from(PAIRS), verdicts),
