@@ -341,3 +341,45 @@ def bundle_adjustment(cameras, points: np.ndarray, xy: np.ndarray, weight: np.nd
     length = np.linalg.norm(shifts[1])
     error = np.sqrt(np.sum(found.fun**2) / np.sum(weight))
     return rotations, shifts / length, points / length, error
+
+
+# -- checks of models ------------------------------------------------------------------------------
+
+
+def grouped(tested, contradicted, most: float, least: int) -> tuple[list[set], dict]:
+    """Groups of views, the largest first, and what contradicts what: set by set, sum by sum.
+
+    Two groups agree if, in one of the two directions, at most the share `most` of the points of one
+    is contradicted by the other, and if both directions have `least` points. The pair of groups is
+    joined whose lesser share, with one contradiction more, is lowest.
+    """
+
+    def directions(one: frozenset, other: frozenset) -> list[tuple[int, int]]:
+        """(points, contradictions) of both directions, the better one first; none if too few."""
+        sums = []
+        for group, against in ((one, other), (other, one)):
+            n = sum(int(tested[i, j]) for i in group for j in against)
+            sums.append((n, sum(int(contradicted[i, j]) for i in group for j in against)))
+        if min(n for n, _ in sums) < least:
+            return []
+        return sorted(sums, key=lambda each: each[1] / each[0])
+
+    groups = [frozenset([k]) for k in range(len(tested))]
+    while True:
+        agreeing = []
+        for i, one in enumerate(groups):
+            for other in groups[i + 1 :]:
+                sums = directions(one, other)
+                if sums and sums[0][1] / sums[0][0] <= most:
+                    agreeing.append((min((c + 1) / n for n, c in sums), one, other))
+        if not agreeing:
+            break
+        _, one, other = min(agreeing, key=lambda each: each[0])
+        groups = [group for group in groups if group not in (one, other)] + [one | other]
+    against = {
+        frozenset((one, other)): directions(one, other)[0]
+        for i, one in enumerate(groups)
+        for other in groups[i + 1 :]
+        if directions(one, other)
+    }
+    return [set(g) for g in sorted(groups, key=lambda g: (-len(g), sorted(g)))], against

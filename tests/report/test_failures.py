@@ -301,6 +301,17 @@ def test_an_untrusted_pair_says_by_how_much_it_missed():
     assert "no relative pose" in lost["no_model"]
 
 
+def test_a_refuted_pair_says_what_contradicts_it_and_nothing_of_its_rotation():
+    pair, reason = ("a", "b"), "the photos it joins contradict each other: of 100 points, 30"
+    refuted = Verdict(
+        trusted=False, refuted=True, strength=0.0, rotation_error_deg=None, reason=reason
+    )
+    results = {pair: counts(Status.VERIFIED, 60, 30)}
+    found = explained("ab", results, {pair: 28}, [["b"]], verdicts={pair: refuted})
+    missed = found["view_graph"]["components"][0]["nearest"]["missed"]
+    assert missed == f"28 inliers, but {reason}"
+
+
 def test_the_least_number_of_inliers_is_colmaps():
     assert pycolmap.TwoViewGeometryOptions().min_num_inliers == COLMAP_MIN_INLIERS
 

@@ -10,6 +10,7 @@ from strategies import rng_of, seeds
 
 from jaxsfm.colmap.two_views import PairGeometry, spread
 from jaxsfm.sfm.view_graph import (
+    STRONG,
     mean_rotation,
     rotation_angle_deg,
     strengths,
@@ -125,6 +126,20 @@ def test_a_strong_pair_stays_whatever_its_rotation():
         pairs[names[0], names[2]] = PairGeometry(num_inliers=inliers, rotation=turned)
         verdict = trusted_pairs(pairs)[names[0], names[2]]
         assert verdict.trusted == stays and verdict.rotation_error_deg > 15
+
+
+def test_a_strong_pair_needs_a_right_rotation_only_where_it_is_asked_for():
+    """Photos of equal walls may be a strong pair, and turned against all others."""
+    rng = rng_of(1)
+    names, _, pairs = ring(rng)
+    false = (names[0], names[2])
+    turn = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    pairs[false] = PairGeometry(num_inliers=1000, rotation=turn @ pairs[false].rotation)
+    strict, default = trusted_pairs(pairs, strict=True), trusted_pairs(pairs)
+    assert all(verdict.trusted for verdict in default.values())
+    assert [pair for pair, verdict in strict.items() if not verdict.trusted] == [false]
+    assert strict[false].strength > STRONG and "deg" in strict[false].reason
+    assert not any(verdict.refuted for verdict in strict.values())
 
 
 def test_many_pairs_between_two_groups_stay_cheap():

@@ -1,0 +1,106 @@
+"""Laws of the check of a whole model, on rendered walls with exact cameras and pixels."""
+
+import numpy as np
+import pytest
+from wall_scene import (
+    REFINEMENT,
+    Scene,
+    big_wall,
+    cameras,
+    poster,
+    repeated,
+    scene,
+    true_matches,
+    twin_matches,
+)
+
+from jaxsfm.bench.walls import turn
+from jaxsfm.colmap.model import Model
+from jaxsfm.io.pairs import PairResult
+from jaxsfm.sfm.check.check_model import (
+    MIN_POINTS,
+    MIN_VIEWS,
+    Checked,
+    VerifiedMatches,
+    check_model,
+)
+from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
+
+FIRST, OTHERS = [f"{k}.png" for k in range(3)], [f"{k}.png" for k in range(3, 6)]
+ANGLES = [-10.0, -4.0, 3.0, -7.0, 0.0, 8.0]
+TURNED = turn(np.radians(70))._replace(translation=np.asarray([30.0, 0.0, 5.0]))
+
+
+def checked(seen: Scene, results: list[PairResult], model: Model | None = None) -> Checked | None:
+    matches = {result.pair: result for result in results}
+    given = VerifiedMatches(matches, matches.keys(), 0)
+    return check_model(model or seen.model, seen.images, given, REFINEMENT)
+
+
+def of_all_pairs(seen: Scene) -> list[PairResult]:
+    count = len(seen.model.views)
+    return [true_matches(seen.model, a, b) for a in range(count) for b in range(a + 1, count)]
+
+
+@pytest.fixture(scope="module")
+def right() -> Scene:
+    return scene([([big_wall(), poster(1)], cameras(ANGLES))])
+
+
+def test_a_right_model_is_green_and_explains_its_pairs(right):
+    results = of_all_pairs(right)
+    found = checked(right, results)
+    assert found is not None and found.check.verdict == "green"
+    assert found.check.groups == [FIRST + OTHERS] and found.check.other_places == []
+    assert not found.refuted and not found.suspected
+    assert found.explained == {result.pair for result in results}
+
+
+def test_two_walls_that_are_taken_for_one_are_red_and_the_pairs_that_join_them_are_refuted():
+    wall = big_wall()
+    seen = scene(
+        [([wall, poster(1)], cameras(ANGLES[:3])), ([wall, poster(2)], cameras(ANGLES[3:]))]
+    )
+    results = of_all_pairs(seen)
+    found = checked(seen, results)
+    assert found is not None and found.check.verdict == "red"
+    assert found.check.groups == [FIRST, OTHERS]
+    (told,) = found.check.contradictions
+    assert (told.images, told.others) == (FIRST, OTHERS)
+    assert MAX_CONTRADICTED * told.tested < told.contradicted < told.tested
+    across = {r.pair for r in results if (r.pair[0] in FIRST) != (r.pair[1] in FIRST)}
+    assert found.refuted.keys() | found.suspected.keys() == across and len(found.refuted) >= 5
+    assert not found.refuted.keys() & found.suspected.keys()
+    assert found.explained == {r.pair for r in results} - across
+    for pair, why in found.refuted.items():
+        assert ([why.images[0], why.others[0]] == list(pair)) and why.contradicted < why.tested
+    assert found.check.other_places == []
+
+
+def test_a_wall_that_is_like_another_is_amber_and_the_pairs_between_them_are_not_explained():
+    wall = big_wall()
+    seen = scene(
+        [
+            ([wall], cameras([-8.0, 0.0, 7.0])),
+            ([repeated(wall, TURNED)], cameras([-5.0, 2.0, 9.0], motion=TURNED)),
+        ]
+    )
+    false = twin_matches(seen.model, 0, 3, TURNED)
+    true = [true_matches(seen.model, 0, 1), true_matches(seen.model, 3, 5)]
+    found = checked(seen, [false, *true])
+    assert found is not None and found.check.verdict == "amber"
+    assert [place.image for place in found.check.other_places] == ["0.png", "3.png"]
+    assert found.explained == {result.pair for result in true} and not found.refuted
+    without = checked(seen, true)
+    assert without is not None and without.check.verdict == "green"
+
+
+def test_small_models_are_not_checked(right):
+    results = of_all_pairs(right)
+    for views in (MIN_VIEWS - 1, MIN_VIEWS):
+        part, _ = right.model.part(set((FIRST + OTHERS)[:views]))
+        assert (checked(right, results, part) is None) == (views < MIN_VIEWS)
+    tracks = right.model.tracks
+    for points in (MIN_POINTS - 1, MIN_POINTS):
+        few = right.model.with_tracks(tracks.select_points(np.arange(points)))
+        assert (checked(right, results, few) is None) == (points < MIN_POINTS)
