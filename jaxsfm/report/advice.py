@@ -98,7 +98,7 @@ def _more_handed_on(tried: Collection[PairRow]) -> Iterable[Advice]:
 
 
 def _more_trusted(crossing: Collection[PairRow]) -> Iterable[Advice]:
-    dropped = [row for row in crossing if row.verified and not row.trusted]
+    dropped = [row for row in crossing if row.outvoted]
     best = furthest(dropped)
     if best is not None:
         why = (

@@ -156,7 +156,7 @@ def _stage(own: Sequence[PairRow], connected: bool) -> tuple[Stage, str]:
     used = [row.colmap_inliers for row in own if row.trusted]
     if used and connected:
         return "no pose", f"{len(used)} verified pairs with up to {max(used)} inliers"
-    dropped = sum(row.verified for row in own) - len(used)
+    dropped = sum(row.outvoted for row in own)
     detail = (
         f"{max(row.inliers for row in own)} inliers in its best pair, {len(used)} pairs verified "
         "by COLMAP, none of which leads to the model"

@@ -52,6 +52,12 @@ class PairRow:
         """Whether the pair was given to the mapper."""
         return self.verified and (self.view_graph is None or self.view_graph.trusted)
 
+    @property
+    def outvoted(self) -> bool:
+        """Whether the view graph dropped the pair, so that `--view-graph no` keeps it."""
+        verdict = self.view_graph
+        return self.verified and verdict is not None and not (verdict.trusted or verdict.refuted)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TriedPairs:

@@ -1,5 +1,7 @@
 """Laws of the check of a whole model, on rendered walls with exact cameras and pixels."""
 
+from collections.abc import Set
+
 import numpy as np
 import pytest
 from wall_scene import (
@@ -16,7 +18,7 @@ from wall_scene import (
 
 from jaxsfm.bench.walls import turn
 from jaxsfm.colmap.model import Model
-from jaxsfm.io.pairs import PairResult
+from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.check_model import (
     MIN_POINTS,
     MIN_VIEWS,
@@ -31,9 +33,14 @@ ANGLES = [-10.0, -4.0, 3.0, -7.0, 0.0, 8.0]
 TURNED = turn(np.radians(70))._replace(translation=np.asarray([30.0, 0.0, 5.0]))
 
 
-def checked(seen: Scene, results: list[PairResult], model: Model | None = None) -> Checked | None:
+def checked(
+    seen: Scene,
+    results: list[PairResult],
+    model: Model | None = None,
+    refuted: Set[Pair] = frozenset(),
+) -> Checked | None:
     matches = {result.pair: result for result in results}
-    given = VerifiedMatches(matches, matches.keys(), 0)
+    given = VerifiedMatches(matches, matches.keys(), refuted, 0)
     return check_model(model or seen.model, seen.images, given, REFINEMENT)
 
 
@@ -75,6 +82,9 @@ def test_two_walls_that_are_taken_for_one_are_red_and_the_pairs_that_join_them_a
     for pair, why in found.refuted.items():
         assert ([why.images[0], why.others[0]] == list(pair)) and why.contradicted < why.tested
     assert found.check.other_places == []
+    again = checked(seen, results, refuted=found.refuted.keys())
+    assert again is not None and again.check == found.check
+    assert not again.refuted and again.suspected == found.suspected
 
 
 def test_a_wall_that_is_like_another_is_amber_and_the_pairs_between_them_are_not_explained():

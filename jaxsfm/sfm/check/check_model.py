@@ -47,7 +47,7 @@ class Checked(NamedTuple):
     """Pairs that agree with the model and join groups that contradict each other. Some of them may
     be right: then the groups were joined wrongly elsewhere."""
     explained: set[Pair]
-    """Pairs that agree with a model in which no photo contradicts another one."""
+    """Pairs that agree with the model and join no groups that contradict each other."""
 
 
 def check_model(
@@ -96,7 +96,8 @@ def check_model(
         places = other_places(model, normal, images, refinement, refused)
     groups = [sorted(names[k] for k in group) for group in grouping.groups]
     check = ModelCheck(groups=groups, contradictions=contradictions, other_places=places)
-    explained = {pair for pair, fit in fits.items() if fit >= MIN_FIT and not contradictions}
+    agreeing = [pair for pair, fit in fits.items() if fit >= MIN_FIT]
+    explained = {p for p in agreeing if not any(_joins(p, each) for each in contradictions)}
     return Checked(check, refuted, suspected, explained)
 
 
