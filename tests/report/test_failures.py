@@ -310,6 +310,8 @@ def test_a_refuted_pair_says_what_contradicts_it_and_nothing_of_its_rotation():
     found = explained("ab", results, {pair: 28}, [["b"]], verdicts={pair: refuted})
     missed = found["view_graph"]["components"][0]["nearest"]["missed"]
     assert missed == f"28 inliers, but {reason}"
+    (row,) = found["lost"]
+    assert "--view-graph no" not in row["detail"] and "--view-graph no" not in options(row)
 
 
 def test_the_least_number_of_inliers_is_colmaps():
