@@ -163,6 +163,8 @@ def _stage(own: Sequence[PairRow], connected: bool) -> tuple[Stage, str]:
     )
     if dropped:
         detail += f"; the view graph dropped {dropped} more (--view-graph no keeps them)"
+    if refuted := sum(row.view_graph is not None and row.view_graph.refuted for row in own):
+        detail += f"; the check of the model refuted {refuted} more"
     return "not connected", detail
 
 

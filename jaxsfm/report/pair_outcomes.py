@@ -50,8 +50,9 @@ class PairOutcomes(NamedTuple):
             return (
                 f"{row.colmap_inliers} inliers, but its rotation differs from that of stronger "
                 f"pairs by {verdict.rotation_error_deg:.0f} deg ({TOLERANCE_DEG:.0f} deg are "
-                f"allowed), and its strength is {verdict.strength:.3f} (a pair of strength "
-                f"{STRONG} or more may have any rotation)"
+                f"allowed), and its strength is {verdict.strength:.3f}"
+                + f" (a pair of strength {STRONG} or more may have any rotation)"
+                * (verdict.strength < STRONG)
             )
         if row.inliers and row.handed_on:
             return (

@@ -78,6 +78,15 @@ class _Round(NamedTuple):
         refuted = {pair: why for each in done for pair, why in each.refuted.items()}
         return refuted or {pair: why for each in done for pair, why in each.suspected.items()}
 
+    def contradicted(self) -> bool:
+        """Whether photos contradict each other in one of the models."""
+        return any(each is not None and each.check.contradictions for each in self.checks)
+
+    def num_checked(self) -> int:
+        """The number of photos in models that were checked."""
+        groups = [each.check.groups for each in self.checks if each is not None]
+        return sum(len(group) for each in groups for group in each)
+
     def explained(self) -> set[Pair]:
         """Pairs that agree with the models."""
         return {pair for each in self.checks if each is not None for pair in each.explained}
@@ -93,9 +102,10 @@ def build_checked_models(
 ) -> "tuple[list[pycolmap.Reconstruction], MappingFigures]":
     """Map verified pairs until no photo contradicts the others, in at most `MAX_ROUNDS` rounds.
 
-    Pairs that were left out are taken back if they agree with the models of the last round. If
-    photos still contradict each other then, the models are returned all the same, and their checks
-    say so.
+    Pairs that were left out are taken back in one more round, if they agree with models in which no
+    photo contradicts another. If photos still contradict each other after the last round, its
+    models are returned all the same, and their checks say so. A round that leaves no model to check
+    does not count.
 
     Args:
       database: where to write the pairs that the models were made from.
@@ -107,8 +117,8 @@ def build_checked_models(
     def map_without(refuted: Mapping[Pair, Contradiction]) -> _Round:
         verdicts = _verdicts(given.two_views, refuted, view_graph=config.view_graph)
         trusted = _write_trusted(given, verdicts, database)
-        models, tried = build_models(database, trusted, options, on_image=on_image)
-        attempts.extend(tried)
+        models, starts = build_models(database, trusted, options, on_image=on_image)
+        attempts.extend(starts)
         return _Round(models, verdicts, _check(models, given, refuted, config, options.seed))
 
     refuted: dict[Pair, Contradiction] = {}
@@ -119,13 +129,15 @@ def build_checked_models(
             break
         logger.info("photos contradict each other; mapping without %d pairs", len(against))
         refuted |= against
-        made = map_without(refuted)
-    if (back := refuted.keys() & made.explained()) and not made.against():
+        tried = map_without(refuted)
+        if not tried.num_checked():  # these pairs were all that held photos together
+            break
+        made = tried
+    if (back := refuted.keys() & made.explained()) and not made.contradicted():
         again = map_without({pair: why for pair, why in refuted.items() if pair not in back})
-        if again.against():
-            _write_trusted(given, made.verdicts, database)
-        else:
+        if not again.contradicted() and again.num_checked() >= made.num_checked():
             made = again
+    _write_trusted(given, made.verdicts, database)  # that of another round may lie there
     checks = [each and each.check for each in made.checks]
     return made.models, MappingFigures(verdicts=made.verdicts, attempts=attempts, checks=checks)
 

@@ -27,6 +27,7 @@ from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
+from jaxsfm.sfm.check.check_model import CHECKED_BY
 from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.mapping import MappingFigures, VerifiedPairs, build_checked_models
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
@@ -130,9 +131,10 @@ def reconstruct(
         by_image = [[image.name, image.sha256, image.size] for image in images]
         camera = _plain(intrinsics)
         verifying = [options.seed, options.threads, options.scale, config.view_graph]
-        key = digest(key, by_image, camera, verifying, package_versions())
+        key = digest(key, stage_files.FORMAT, by_image, camera, verifying, package_versions())
         verified = stages.stage("verified", key, verify_matches)
-        checking = config.checked and dataclasses.asdict(config.refinement or Refinement())
+        aligning = config.refinement or Refinement()
+        checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
         key = digest(key, dataclasses.asdict(options), checking)
         mapped = stages.stage("mapped", key, build)
         on_mapped()

@@ -155,9 +155,17 @@ def test_a_check_is_told_which_pairs_were_refuted_before(rounds):
 def test_all_models_of_a_round_are_heard(rounds):
     """There are three models; one is not checked."""
     first = iter([outcome(refuted=[A]), None, outcome(refuted=[B])])
-    found = rounds(lambda pairs: next(first, None), models=3)
+    found = rounds(lambda pairs: next(first, outcome()), models=3)
     assert found.rounds == [set(PAIRS), set(PAIRS) - {A, B}]
-    assert len(found.models) == 3 and found.figures.checks == [None] * 3
+    assert len(found.models) == 3 and found.figures.checks == [outcome().check] * 3
+
+
+def test_a_round_that_leaves_no_model_to_check_does_not_count(rounds):
+    """The pairs that contradict each other are all that holds the photos together."""
+    found = rounds(lambda pairs: outcome(refuted=[A]) if A in pairs else None)
+    assert found.rounds == [set(PAIRS), set(PAIRS) - {A}]
+    assert found.models == [frozenset(PAIRS)] and found.dropped == []
+    assert found.figures.checks == [outcome(refuted=[A]).check]
 
 
 def test_it_ends_after_the_last_round_and_says_what_is_left(rounds):

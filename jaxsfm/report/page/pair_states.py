@@ -27,7 +27,11 @@ STATES = (
     State("no plane", "too few matches, or too few on a common plane", "#8a94a344"),
     State("not chosen", "it has matches, but --best-pairs left it out", GREY),
     State("not verified", "it has matches, but COLMAP found no common geometry", "#c9b458"),
-    State("not trusted", "COLMAP verified it, but stronger pairs contradict it", ORANGE),
+    State(
+        "not trusted",
+        "COLMAP verified it, but stronger pairs or the check of the model contradict it",
+        ORANGE,
+    ),
     State("used", "COLMAP verified it, and it was given to the mapper", BLUE),
 )
 REGISTERED, LOST = GREEN, "#d1435b"

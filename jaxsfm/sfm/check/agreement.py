@@ -144,6 +144,9 @@ def _tested(
                 block.agrees,
             )
         )
+    if not parts:  # no point may be seen in the targets
+        none = np.zeros(0, int)
+        return _Seen(points, shown), _Tests(none, none, np.zeros((0, 2)), np.zeros(0, bool))
     point, view, xy, low, agrees = (np.concatenate(column) for column in zip(*parts, strict=True))
     seen = _Seen(points, shown)
     # A point that only one view shows may be a wrong match: it tests nothing.

@@ -20,7 +20,20 @@ MIN_VIEWS = 3
 MIN_POINTS = 30
 """A model with fewer points is not checked."""
 MIN_CONTRADICTED = 10
-"""Fewer contradictions between two photos do not refute their pair. A block has at least six."""
+"""Fewer contradictions between two photos do not refute their pair."""
+
+
+CHECKED_BY = (
+    "radius",
+    "iterations",
+    "min_score",
+    "max_sigma_px",
+    "max_shift_px",
+    "min_cosine",
+    "max_stretch",
+    "neighbours",
+)
+"""Fields of `Refinement` that a check depends on."""
 
 
 class VerifiedMatches(NamedTuple):

@@ -31,9 +31,10 @@ class OtherPlace:
     pairs: list[str]
     """The other photos of these pairs."""
     agreed: int
-    """Points of the model that the photo shows, seen from there."""
+    """Points of the model that the photo shows, seen from there: a mean over the other photos that
+    see them."""
     contradicted: int
-    """Points of the model instead of which it shows something else, seen from there."""
+    """Points of the model instead of which it shows something else, seen from there; likewise."""
     rotation_deg: float
     """How far the photo is turned there against its place in the model."""
 

@@ -25,6 +25,9 @@ from jaxsfm.sfm.view_graph import rotation_angle_deg
 MIN_INLIERS = 30
 """Fewer matches give no second place: the fewest inliers from which COLMAP's mapper adds a photo.
 """
+MIN_SUPPORT = 15
+"""A pair speaks for a second place if so many of its matches agree with it: the fewest inliers that
+COLMAP verifies."""
 MIN_INLIER_SHARE = 0.25
 """A second place has the support of this share of the matches of the pairs that the model does not
 agree with. Looking for rarer ones took ten of forty seconds on castle-P19."""
@@ -63,7 +66,6 @@ def other_place(
       k: index of the view.
     """
     view = model.views[k]
-    partners = [a if b == view.name else b for a, b in refused.pairs if view.name in (a, b)]
     own = {pair: each for pair, each in refused.pairs.items() if view.name in pair}
     # What the view itself has contributed to the model holds at its first place only.
     others = model.select(model.tracks.view != k)
@@ -80,10 +82,10 @@ def other_place(
     )
     if there is None or not _elsewhere(view, there, points):
         return None
-    at, _ = there.project(points)
-    fits = np.linalg.norm(at - xy, axis=1) < MATCH_ERROR_PX
-    if fits.sum() < MIN_INLIERS:
+    support = {pair: _support(there, others, normal, {pair: each}) for pair, each in own.items()}
+    if sum(support.values()) < MIN_INLIERS:
         return None
+    partners = [a if b == view.name else b for a, b in own if support[a, b] >= MIN_SUPPORT]
     moved = tests.with_views([*model.views[:k], there, *model.views[k + 1 :]])
     tested, contradicted = _shown(agreement(moved, images, refinement, targets=[k]), k)
     if tested - contradicted < MIN_AGREED or contradicted > MAX_CONTRADICTED * tested:
@@ -95,6 +97,15 @@ def other_place(
         contradicted=contradicted,
         rotation_deg=float(rotation_angle_deg(there.rotation, view.rotation)),
     )
+
+
+def _support(
+    there: View, others: Model, normal: np.ndarray, matches: Mapping[Pair, PairResult]
+) -> int:
+    """The number of matches that agree with a place."""
+    xy, points = matched_points(there, others, normal, matches)
+    at, _ = there.project(points)
+    return int((np.linalg.norm(at - xy, axis=1) < MATCH_ERROR_PX).sum())
 
 
 def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
