@@ -28,7 +28,7 @@ def counted(monkeypatch) -> dict[str, int]:
     count(WorkFolder, "save_features", "extract")
     count(WorkFolder, "save_matches", "match")
     count(reconstruction, "verify", "verify")
-    count(reconstruction, "build_models", "map")
+    count(reconstruction, "build_checked_models", "map")
     count(reconstruction, "_refined", "refine")
     return counts
 
