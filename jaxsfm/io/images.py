@@ -253,6 +253,14 @@ def working_size(size: tuple[int, int], max_size: int, enlarge: float = 1.0) -> 
     return width, height
 
 
+def size_and_scale(
+    size: tuple[int, int], max_size: int, enlarge: float = 1.0
+) -> tuple[tuple[int, int], tuple[float, float]]:
+    """`working_size`, and original pixels per working pixel, (x, y)."""
+    width, height = working_size(size, max_size, enlarge)
+    return (width, height), (size[0] / width, size[1] / height)
+
+
 def read_image(image: ImageFile, *, max_size: int, enlarge: float = 1.0) -> WorkingImage:
     """Decode an image and resize it to its working size (`working_size`).
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from jaxsfm.config import Config
-from jaxsfm.io.images import ImageFile, WorkingImage, read_image, working_size
+from jaxsfm.io.images import ImageFile, WorkingImage, read_image, size_and_scale, working_size
 
 Reader = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
 """A photo's name -> the pixels of its working image, and original pixels per working pixel."""
@@ -41,9 +41,7 @@ class Photos:
 
     def working_size(self, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
         """(width, height) of the working image; original pixels per working pixel, (x, y)."""
-        own = self.files[name].size
-        width, height = working_size(own, *self._limits)
-        return (width, height), (own[0] / width, own[1] / height)
+        return size_and_scale(self.files[name].size, *self._limits)
 
     def rgb(self, name: str) -> WorkingImage:
         """Colours uint8 (h, w, 3) of the working image; original pixels per working pixel."""

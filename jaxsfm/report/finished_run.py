@@ -19,7 +19,7 @@ from jaxsfm.io.images import (
     WorkingImage,
     inspect_image,
     read_image,
-    working_size,
+    size_and_scale,
 )
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
@@ -124,8 +124,7 @@ def sizes_within(reconstruction: "pycolmap.Reconstruction", max_size: int, enlar
     sizes = {}
     for image in reconstruction.images.values():
         camera = reconstruction.camera(image.camera_id)
-        width, height = working_size((camera.width, camera.height), max_size, enlarge)
-        sizes[image.name] = (width, height), (camera.width / width, camera.height / height)
+        sizes[image.name] = size_and_scale((camera.width, camera.height), max_size, enlarge)
     return sizes
 
 

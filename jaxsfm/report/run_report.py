@@ -28,14 +28,12 @@ from jaxsfm.report.run_results import (
     ViewGraph,
 )
 from jaxsfm.report.typed_json import OMITTED, Count, Misfit, Number, Range, T, from_json, to_json
-from jaxsfm.sfm.check.model_check import ModelCheck, VerdictColour
+from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck, VerdictColour
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 FILE = "report.json"
 FORMAT = 2
 """The version of the format. Reports of format 1 have no key `format`."""
-MIN_PHOTOS = 3
-"""Models of fewer photos have no verdict: two photos agree with nearly every third."""
 _WORST_FIRST: tuple[VerdictColour, ...] = ("red", "amber", "green")
 
 
@@ -99,11 +97,12 @@ class RunReport:
     def checked(self) -> list[tuple[int, ModelCheck]]:
         """The models that were checked and have enough photos for a verdict: the number N of the
         folder `sparse/N`, and the check."""
-        rows = enumerate(zip(self.models, self.checks, strict=False))  # checks may be empty
+        # Checks may be empty. The refinement may have taken photos out of a model since.
+        rows = enumerate(zip(self.models, self.checks, strict=False))
         return [
             (number, check)
             for number, (model, check) in rows
-            if check is not None and model.registered >= MIN_PHOTOS
+            if check is not None and model.registered >= MIN_VIEWS
         ]
 
     @property

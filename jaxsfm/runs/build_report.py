@@ -101,7 +101,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,
-        checks=made.checks,
+        checks=made.mapping.checks,
         lost=[],
         seconds=stages.seconds,
     )

@@ -12,7 +12,7 @@ from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageFile, shown_name, working_size
+from jaxsfm.io.images import ImageFile, shown_name, size_and_scale
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.options import WeightsChoice
@@ -83,9 +83,8 @@ def camera_prior(
 
 def view_without_pose(image: ImageFile, prior: CameraPrior, config: Config) -> View:
     """The view of a photo that is not localized yet."""
-    width, height = working_size(image.size, config.max_size, config.enlarge)
-    pixels = Pixels((image.size[0] / width, image.size[1] / height))
-    return View.without_pose(image.name, 0, prior.camera, (width, height), pixels)
+    size, scale = size_and_scale(image.size, config.max_size, config.enlarge)
+    return View.without_pose(image.name, 0, prior.camera, size, Pixels(scale))
 
 
 def weights_of_run(run: FinishedRun, choice: WeightsChoice) -> Weights:

@@ -131,13 +131,15 @@ def build_checked_models(
         refuted |= against
         tried = map_without(refuted)
         if not tried.num_checked():  # these pairs were all that held photos together
+            _write_trusted(given, made.verdicts, database)
             break
         made = tried
     if (back := refuted.keys() & made.explained()) and not made.contradicted():
         again = map_without({pair: why for pair, why in refuted.items() if pair not in back})
         if not again.contradicted() and again.num_checked() >= made.num_checked():
             made = again
-    _write_trusted(given, made.verdicts, database)  # that of another round may lie there
+        else:
+            _write_trusted(given, made.verdicts, database)
     checks = [each and each.check for each in made.checks]
     return made.models, MappingFigures(verdicts=made.verdicts, attempts=attempts, checks=checks)
 

@@ -28,7 +28,6 @@ from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.check.check_model import CHECKED_BY
-from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.mapping import MappingFigures, VerifiedPairs, build_checked_models
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
@@ -57,8 +56,6 @@ class Reconstructed:
     mapping: MappingFigures
     models: "list[pycolmap.Reconstruction]"
     """The model with most images first; empty if there is none."""
-    checks: list[ModelCheck | None]
-    """For each model; None where it was not checked."""
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
 
@@ -148,9 +145,8 @@ def reconstruct(
             stages.forget_stage("refined")  # a photo could not be read; perhaps it can next time
         return Reconstructed(
             verification=stage_files.read_verification(verified),
-            mapping=mapping,
+            mapping=dataclasses.replace(mapping, checks=[mapping.checks[k] for k in order]),
             models=models,
-            checks=[mapping.checks[k] for k in order],
             refinement=refinement,
         )
 

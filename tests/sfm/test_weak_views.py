@@ -21,15 +21,14 @@ from room_scene import (
     sizes,
 )
 from scipy.spatial.transform import Rotation
+from wall_scene import matched
 
 from jaxsfm.colmap.mapper import registered
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageError
-from jaxsfm.io.pairs import PairResult, make_pair
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry, weak_views
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, matched_points
@@ -244,20 +243,8 @@ def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
         day = view.project(points)[0]
         night = scene.views[NIGHT].project(points)[0] + rng.normal(0, 3, day.shape)
         night[right:] = rng.uniform((0, 0), SIZE, night[right:].shape)
-        pair = make_pair(view.name, NIGHT_NAME)
-        sides = (day, night) if pair[0] == view.name else (night, day)
-        n = len(points)
-        results[pair] = PairResult(
-            pair=pair,
-            cells=np.zeros((n, 2), np.int32),
-            keypoints0=sides[0].astype(np.float32),
-            keypoints1=sides[1].astype(np.float32),
-            plane=np.zeros(n, np.int32),
-            homographies=np.eye(3)[None],
-            num_tentative=n,
-            num_dropped=0,
-            status=Status.VERIFIED,
-        )
+        result = matched((view.name, NIGHT_NAME), day, night)
+        results[result.pair] = result
     return Evidence(results, [UnmappedImage(NIGHT_NAME, NIGHT + 1, camera())], 0)
 
 

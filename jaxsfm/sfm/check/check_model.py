@@ -8,21 +8,16 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import Agreement, agreement, thinned
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, share
-from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
+from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck
 from jaxsfm.sfm.check.other_places import Refused, other_places
 from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 
-MIN_VIEWS = 3
-"""A model of two photos is not checked: nothing in it can contradict the pair that it is made of.
-"""
 MIN_POINTS = 30
 """A model with fewer points is not checked."""
 MIN_CONTRADICTED = 10
 """Fewer contradictions between two photos do not refute their pair."""
-
-
 CHECKED_BY = (
     "radius",
     "iterations",

@@ -16,7 +16,7 @@ MIN_TESTED = 30
 """Fewer tested points say nothing about two groups."""
 
 
-class Contradiction(NamedTuple):
+class OpposedGroups(NamedTuple):
     """Two groups of views that contradict each other."""
 
     groups: tuple[list[int], list[int]]
@@ -32,7 +32,7 @@ class Grouping(NamedTuple):
 
     groups: list[list[int]]
     """Indices of views, the largest group first."""
-    contradictions: list[Contradiction]
+    contradictions: list[OpposedGroups]
     """Groups between which there is neither agreement nor contradiction are not listed."""
 
 
@@ -81,5 +81,5 @@ def group_views(agreement: Agreement) -> Grouping:
             ratios = [contradicted[a, b] / tested[a, b] for a, b in ((i, j), (j, i))]
             a, b = (i, j) if ratios[0] <= ratios[1] else (j, i)
             both = (members[i], members[j])
-            found.append(Contradiction(both, int(tested[a, b]), int(contradicted[a, b])))
+            found.append(OpposedGroups(both, int(tested[a, b]), int(contradicted[a, b])))
     return Grouping(sorted(members, key=lambda group: (-len(group), group)), found)

@@ -3,6 +3,9 @@
 import dataclasses
 from typing import Literal
 
+MIN_VIEWS = 3
+"""A model of two photos is not checked: nothing in it can contradict the pair that it is made of.
+"""
 VerdictColour = Literal["green", "amber", "red"]
 """Green: nothing speaks against the model. Amber: photos fit into it in a second place, so another
 model explains them as well. Red: groups of its photos contradict each other."""

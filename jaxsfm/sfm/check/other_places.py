@@ -70,7 +70,8 @@ def other_place(
     # What the view itself has contributed to the model holds at its first place only.
     others = model.select(model.tracks.view != k)
     tests = thinned(others, per_view=TESTED_PER_VIEW)
-    xy, points = matched_points(view, others, normal, own)
+    parts = [matched_points(view, others, normal, {pair: each}) for pair, each in own.items()]
+    xy, points = (np.concatenate(column) for column in zip(*parts, strict=True))
     there = find_view(
         view,
         xy,
@@ -82,10 +83,14 @@ def other_place(
     )
     if there is None or not _elsewhere(view, there, points):
         return None
-    support = {pair: _support(there, others, normal, {pair: each}) for pair, each in own.items()}
-    if sum(support.values()) < MIN_INLIERS:
+    support = [_support(there, *part) for part in parts]
+    if sum(support) < MIN_INLIERS:
         return None
-    partners = [a if b == view.name else b for a, b in own if support[a, b] >= MIN_SUPPORT]
+    partners = [
+        a if b == view.name else b
+        for (a, b), count in zip(own, support, strict=True)
+        if count >= MIN_SUPPORT
+    ]
     moved = tests.with_views([*model.views[:k], there, *model.views[k + 1 :]])
     tested, contradicted = _shown(agreement(moved, images, refinement, targets=[k]), k)
     if tested - contradicted < MIN_AGREED or contradicted > MAX_CONTRADICTED * tested:
@@ -99,11 +104,8 @@ def other_place(
     )
 
 
-def _support(
-    there: View, others: Model, normal: np.ndarray, matches: Mapping[Pair, PairResult]
-) -> int:
-    """The number of matches that agree with a place."""
-    xy, points = matched_points(there, others, normal, matches)
+def _support(there: View, xy: np.ndarray, points: np.ndarray) -> int:
+    """How many keypoints (n, 2) agree with a place, from which points (n, 3) are seen."""
     at, _ = there.project(points)
     return int((np.linalg.norm(at - xy, axis=1) < MATCH_ERROR_PX).sum())
 
