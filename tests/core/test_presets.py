@@ -28,6 +28,7 @@ PAPER = {
     "products": "float32",
     "aligned_octaves": 0,
     "view_graph": False,
+    "checked": False,
     "refinement": None,
 }
 PAPER_PAIR = {
@@ -65,6 +66,7 @@ DEFAULT = PAPER | {
     "centred": True,
     "aligned_octaves": 4,
     "view_graph": True,
+    "checked": True,
     "refinement": REFINEMENT,
 }
 DEFAULT_PAIR = PAPER_PAIR | {
