@@ -146,7 +146,8 @@ def report(rng, folder) -> str:
 
 
 def test_a_damaged_report_is_shown_or_refused_by_name(tmp_path, share, least):
-    found = run_cases("test_fuzz_reports", "report", round(300 * share), tmp_path)
+    # Of the larger report about one damaged copy in sixteen can still be read.
+    found = run_cases("test_fuzz_reports", "report", round(500 * share), tmp_path)
     assert found["read"] > 20 * least and found["refused"] > 100 * least
 
 
