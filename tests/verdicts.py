@@ -3,9 +3,17 @@
 import dataclasses
 
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace, VerdictColour
+from jaxsfm.sfm.check.model_check import (
+    Alternative,
+    Contradiction,
+    ModelCheck,
+    OtherPlace,
+    VerdictColour,
+)
 
 NAMES = [f"checked{k}.jpg" for k in range(9)]
+
+OTHER = Alternative(basis="order", images=9, elsewhere=NAMES[2:4], contradicted=0)
 
 
 def check_of(colour: VerdictColour) -> ModelCheck:

@@ -14,13 +14,14 @@ from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.inputs import choose_sets
 from jaxsfm.bench.methods import AMBIGUOUS_METHODS, MAPPERS
 from jaxsfm.bench.model_options import AmbiguousOptions
-from jaxsfm.bench.outcomes import OUTCOMES, Outcome, doubt, extent, judge
+from jaxsfm.bench.outcomes import OUTCOMES, Outcome, doubt, judge
 from jaxsfm.bench.repeated import SCENES, write_repeated
 from jaxsfm.bench.strecha import ModelRow, camera_errors, not_evaluated_lines
 from jaxsfm.bench.strecha_models import MethodRun, set_models, take_matches
 from jaxsfm.bench.strecha_sets import StrechaSet, find_sets, read_set
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import UserError, writing
+from jaxsfm.sfm.check.common_places import extent
 
 SAME_MATCHES = ("default", *MAPPERS)
 """Methods that have the same matches, which are computed once."""

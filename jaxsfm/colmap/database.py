@@ -190,3 +190,43 @@ def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         for a, b in pairs:
             db.delete_two_view_geometry(ids[a], ids[b])
+
+
+def keep_outliers(path: Path, pairs: Iterable[Pair]) -> None:
+    """Of the matches of pairs, keep those only that do not agree with the pair's geometry.
+
+    The geometries of these pairs are deleted. COLMAP's verification then looks for another one.
+    """
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        for names in pairs:
+            a, b = (ids[name] for name in names)
+            matches = np.asarray(db.read_matches(a, b)).reshape(-1, 2)
+            inliers = np.asarray(db.read_two_view_geometry(a, b).inlier_matches).reshape(-1, 2)
+            db.delete_two_view_geometry(a, b)
+            db.delete_matches(a, b)
+            # Each keypoint is in one match of a pair, so its index in the first image names it.
+            left = matches[~np.isin(matches[:, 0], inliers[:, 0])]
+            if len(left):
+                db.write_matches(a, b, left)
+
+
+def copy_geometries(source: Path, target: Path, pairs: Iterable[Pair]) -> None:
+    """Replace the matches and geometries of pairs in a database by those of another one.
+
+    Both have the same images and keypoints. A pair without a geometry in `source` loses its own.
+    """
+    with (
+        pycolmap.Database.open(source) as given,
+        pycolmap.Database.open(target) as db,
+        pycolmap.DatabaseTransaction(db),
+    ):
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        for names in pairs:
+            a, b = (ids[name] for name in names)
+            db.delete_two_view_geometry(a, b)
+            db.delete_matches(a, b)
+            if given.exists_matches(a, b):
+                db.write_matches(a, b, given.read_matches(a, b))
+            if given.exists_two_view_geometry(a, b):
+                db.write_two_view_geometry(a, b, given.read_two_view_geometry(a, b))

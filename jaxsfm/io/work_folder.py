@@ -24,7 +24,7 @@ RECORD = "run.json"
 """The file with the identity of the last run. A folder without it is not a work folder."""
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
-RESULTS = (PAGE, "report.json", "sparse", "database.db")
+RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")
 _MOVES, _KEY = "moves.json", "key"
 
 

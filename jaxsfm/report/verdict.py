@@ -7,7 +7,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from jaxsfm.io.images import named, shown_name
-from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace, VerdictColour
+from jaxsfm.sfm.check.model_check import (
+    Alternative,
+    Basis,
+    Contradiction,
+    ModelCheck,
+    OtherPlace,
+    VerdictColour,
+)
 
 MAX_FINDINGS = 3
 """The number of contradictions, and of second places, that the summary lists for each model."""
@@ -15,6 +22,10 @@ MEANING: dict[VerdictColour, str] = {
     "green": "no photo contradicts the model",
     "amber": "two models explain these photos",
     "red": "photos contradict each other",
+}
+FOLLOWS: dict[Basis, str] = {
+    "pairs": "most of the pairs",
+    "order": "the order of the photos' names",
 }
 _DECISIVE = "neighbours overlap by more than half and something that occurs only once is in view"
 
@@ -38,6 +49,8 @@ class ModelVerdict(NamedTuple):
     """The one with most contradicted points first."""
     places: list[Finding]
     """Second places of photos, the one with most points that agree first."""
+    alternatives: list[Finding]
+    """The other model of the same photos, if one was made."""
     decisive: str
     """Photos that would decide between two places; empty if no photo has two."""
     advice: str
@@ -70,7 +83,7 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
     contradictions = sorted(check.contradictions, key=lambda each: -each.contradicted)
     places = sorted(check.other_places, key=lambda each: -each.agreed)
     headline = in_words(colour)
-    if colour == "amber":
+    if colour == "amber" and places:
         count = len({place.image for place in places})
         fit = "1 photo fits" if count == 1 else f"{count} photos fit"
         headline += f"; {fit} into the model in a second place"
@@ -81,8 +94,9 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
             Finding(_against(each), each.images, each.others) for each in contradictions
         ],
         places=[Finding(_fits(each), [each.image], each.pairs) for each in places],
-        decisive=_decides(places[0]) if places else "",
-        advice=_advice(colour, places),
+        alternatives=[_other_model(check.alternative)] if check.alternative else [],
+        decisive=_decides(check, places),
+        advice=_advice(check, places),
     )
 
 
@@ -99,6 +113,7 @@ def _model_lines(verdict: ModelVerdict) -> list[str]:
     for label, found in (
         ("contradiction    ", verdict.contradictions),
         ("second place     ", verdict.places),
+        ("other model      ", verdict.alternatives),
     ):
         lines += [label + each.text for each in found[:MAX_FINDINGS]]
         if more := len(found[MAX_FINDINGS:]):
@@ -127,22 +142,44 @@ def _fits(place: OtherPlace) -> str:
     )
 
 
-def _decides(place: OtherPlace) -> str:
-    return (
-        f"photos taken on the way from {shown_name(place.image)} to {named(place.pairs)}, if "
-        + _DECISIVE
+def _other_model(other: Alternative) -> Finding:
+    own: Basis = "order" if other.basis == "pairs" else "pairs"
+    moved = "1 photo has" if len(other.elsewhere) == 1 else f"{len(other.elsewhere)} photos have"
+    text = (
+        f"alternative/0 follows {FOLLOWS[other.basis]}, and the model follows {FOLLOWS[own]}: "
+        f"{moved} another place there ({named(other.elsewhere)})"
     )
+    if other.contradicted:
+        text += f"; photos contradict each other at {other.contradicted} of its points"
+    return Finding(text, other.elsewhere, [])
 
 
-def _advice(colour: VerdictColour, places: Sequence[OtherPlace]) -> str:
+def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
+    """Which photos would decide between two places or two models; empty if there is nothing to."""
+    if places:
+        way = f"from {shown_name(places[0].image)} to {named(places[0].pairs)}"
+    elif check.alternative:
+        way = f"from {named(check.alternative.elsewhere)} to the other photos"
+    else:
+        return ""
+    return f"photos taken on the way {way}, if {_DECISIVE}"
+
+
+def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
+    colour, other = check.verdict, check.alternative
     if colour == "red":
+        instead = "look whether alternative/0 is the right one, or " if other else ""
         return (
-            "do not use this model as it is: add photos taken on the way from one group to the "
-            f"other, so that {_DECISIVE}, and run the same command again"
+            f"do not use this model as it is: {instead}add photos taken on the way from one group "
+            f"to the other, so that {_DECISIVE}, and run the same command again"
         )
     if colour == "amber":
+        unsure = places[0].image if places or other is None else other.elsewhere[0]
+        where = (
+            "the model has it, and not where alternative/0 has it" if other else "the model has it"
+        )
         return (
-            f"look whether {shown_name(places[0].image)} stands where the model has it; if you "
-            "cannot tell, add such photos and run the same command again"
+            f"look whether {shown_name(unsure)} stands where {where}; if you cannot tell, add such "
+            "photos and run the same command again"
         )
     return ""

@@ -208,6 +208,7 @@ def _map(
     if passes:
         seconds["refinement"] = time.monotonic() - start - seconds["mapping"]
     write_models(made.models, target / "sparse")
+    write_models(made.alternative, target / "alternative")
     return made, seconds
 
 

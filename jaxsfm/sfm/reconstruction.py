@@ -36,7 +36,7 @@ from jaxsfm.sfm.stage_files import VerificationFigures
 if TYPE_CHECKING:
     import pycolmap
 
-DATABASE, SPARSE = "database.db", "sparse"
+DATABASE, SPARSE, ALTERNATIVE = "database.db", "sparse", "alternative"
 logger = logging.getLogger("jaxsfm")
 
 
@@ -56,6 +56,8 @@ class Reconstructed:
     mapping: MappingFigures
     models: "list[pycolmap.Reconstruction]"
     """The model with most images first; empty if there is none."""
+    alternative: "list[pycolmap.Reconstruction]"
+    """Models that join the photos in another way, not refined; empty if there is no other way."""
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
 
@@ -105,15 +107,16 @@ def reconstruct(
 
     def build(folder: Path) -> None:
         two_views = read_two_views(verified / DATABASE)
-        models, figures = build_checked_models(
+        made = build_checked_models(
             VerifiedPairs(verified / DATABASE, two_views, matches, photos),
             folder / DATABASE,
             config=config,
             options=options,
             on_image=on_image,
         )
-        write_models(models, folder / SPARSE)
-        stage_files.write_mapping(folder, figures)
+        write_models(made.models, folder / SPARSE)
+        write_models(made.alternative, folder / ALTERNATIVE)
+        stage_files.write_mapping(folder, made.figures)
 
     def refine(folder: Path) -> None:
         models = read_models(mapped / SPARSE, mapped / DATABASE)
@@ -147,6 +150,7 @@ def reconstruct(
             verification=stage_files.read_verification(verified),
             mapping=dataclasses.replace(mapping, checks=[mapping.checks[k] for k in order]),
             models=models,
+            alternative=read_models(mapped / ALTERNATIVE, database),
             refinement=refinement,
         )
 

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.io.pairs import Pair
-from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
+from jaxsfm.sfm.check.model_check import Alternative, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import PassFigures, RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 2
+FORMAT = 3
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 
@@ -68,11 +68,12 @@ def read_mapping(folder: Path) -> MappingFigures:
     )
 
 
-def _check(row: dict[str, list]) -> ModelCheck:
+def _check(row: dict) -> ModelCheck:
     return ModelCheck(
         groups=row["groups"],
         contradictions=[Contradiction(**each) for each in row["contradictions"]],
         other_places=[OtherPlace(**each) for each in row["other_places"]],
+        alternative=row["alternative"] and Alternative(**row["alternative"]),
     )
 
 

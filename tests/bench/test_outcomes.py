@@ -6,18 +6,12 @@ from typing import cast
 import numpy as np
 import pytest
 
-from jaxsfm.bench.outcomes import (
-    POSITION_SHARE,
-    ROTATION_DEG,
-    doubt,
-    extent,
-    groups,
-    judge,
-)
+from jaxsfm.bench.outcomes import doubt, judge
 from jaxsfm.bench.synthetic import look_at
 from jaxsfm.bench.walls import turn
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.report.run_report import RunReport
+from jaxsfm.sfm.check.common_places import POSITION_SHARE, ROTATION_DEG, extent, groups
 from jaxsfm.sfm.evaluation import Similarity
 
 RADIUS = 5.0

@@ -542,7 +542,7 @@ def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
         models[0].deregister_frame(image.frame_id)
         return models, attempts
 
-    monkeypatch.setattr("jaxsfm.sfm.mapping.build_models", without_one)
+    monkeypatch.setattr("jaxsfm.sfm.rounds.build_models", without_one)
     report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
     assert report["models"][0]["registered"] == 3
     (placed,) = [p for p in report["refinement"][0]["placed"] if p["name"] == "view2.png"]

@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
-from verdicts import NAMES, check_of, with_verdicts
+from verdicts import NAMES, OTHER, check_of, with_verdicts
 
 from jaxsfm.report.run_report import read_report
 from jaxsfm.report.summary import summary_lines
@@ -52,6 +52,28 @@ def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(repor
     )
     assert "overlap by more than half" in decisive and "occurs only once" in decisive
     assert advice.startswith(f"what next        look whether {NAMES[0]} stands")
+
+
+def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move():
+    verdict = model_verdict(dataclasses.replace(check_of("green"), alternative=OTHER))
+    assert verdict.colour == "amber" and not verdict.places
+    head, other, decisive, advice = verdict_lines([verdict])
+    assert head == "verdict          amber: two models explain these photos"
+    assert other == (
+        "other model      alternative/0 follows the order of the photos' names, and the model "
+        f"follows most of the pairs: 2 photos have another place there ({NAMES[2]}, {NAMES[3]})"
+    )
+    assert f"on the way from {NAMES[2]}, {NAMES[3]} to the other photos" in decisive
+    assert f"look whether {NAMES[2]} stands where the model has it, and not where" in advice
+
+
+def test_a_red_model_points_to_the_other_one_and_to_what_speaks_against_it():
+    other = dataclasses.replace(OTHER, basis="pairs", contradicted=7)
+    verdict = model_verdict(dataclasses.replace(check_of("red"), alternative=other))
+    lines = verdict_lines([verdict])
+    assert "follows most of the pairs, and the model follows the order" in lines[2]
+    assert lines[2].endswith("; photos contradict each other at 7 of its points")
+    assert "look whether alternative/0 is the right one" in lines[-1]
 
 
 def test_red_names_both_groups_and_how_many_points_are_missing(report):

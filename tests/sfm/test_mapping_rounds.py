@@ -1,5 +1,6 @@
 """Laws of the rounds of mapping and checking. The mapper and the check are made up."""
 
+import itertools
 import json
 import re
 from collections.abc import Callable
@@ -9,15 +10,19 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from jaxsfm.bench.synthetic import look_at
 from jaxsfm.colmap.mapper import Attempt, MapOptions
+from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.two_views import PairGeometry, TwoView
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageError
-from jaxsfm.io.pairs import Pair
-from jaxsfm.sfm import mapping as module
+from jaxsfm.io.pairs import Pair, make_pair
+from jaxsfm.sfm import mapping
+from jaxsfm.sfm import rounds as module
 from jaxsfm.sfm.check.check_model import Checked
-from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
-from jaxsfm.sfm.mapping import MAX_ROUNDS, MappingFigures, VerifiedPairs, build_checked_models
+from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
+from jaxsfm.sfm.mapping import MAX_ROUNDS, MappingFigures, build_checked_models
+from jaxsfm.sfm.rounds import VerifiedPairs
 
 A, B, C, D, E = PAIRS = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d"), ("d", "e")]
 OPTIONS = MapOptions(seed=3)
@@ -49,6 +54,7 @@ class FakePhotos:
 
 class Run(NamedTuple):
     models: list
+    alternative: list
     figures: MappingFigures
     rounds: list[set[Pair]]
     """The pairs that each round was given."""
@@ -72,6 +78,8 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         config: Config = ALL,
         two_views: dict[Pair, TwoView] | None = None,
         models: int = 1,
+        seconds: dict[Pair, TwoView] | None = None,
+        places: Callable[[frozenset[Pair]], dict] = lambda pairs: {},
     ) -> Run:
         given: list[set[Pair]] = []
         told: list[set[Pair]] = []
@@ -88,6 +96,22 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
             told.append(set(matches.refuted))
             return check(model)
 
+        def keep_outliers(path: Path, pairs: list[Pair]) -> None:
+            looked_for.extend(pairs)
+
+        def copy(source: Path, target: Path, pairs: list[Pair]) -> None:
+            assert source.exists() and set(pairs) <= (seconds or {}).keys()
+
+        looked_for: list[Pair] = []
+        monkeypatch.setattr(module, "keep_outliers", keep_outliers)
+        monkeypatch.setattr(module, "verify", lambda path, options: None)
+        monkeypatch.setattr(
+            module,
+            "read_two_views",
+            lambda path: {p: v for p, v in (seconds or {}).items() if p in looked_for},
+        )
+        monkeypatch.setattr(module, "copy_geometries", copy)
+        monkeypatch.setattr(mapping, "model_poses", places)
         monkeypatch.setattr(module, "build_models", build)
         monkeypatch.setattr(module, "check_model", checked)
         monkeypatch.setattr(module, "drop_pairs", drop)
@@ -98,10 +122,10 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         verified.write_text(json.dumps(sorted(geometries)))
         photos: module.Photos = FakePhotos()  # pyright: ignore[reportAssignmentType]
         pairs = VerifiedPairs(verified, geometries, {}, photos)
-        made, figures = build_checked_models(pairs, database, config=config, options=OPTIONS)
+        made, figures, other = build_checked_models(pairs, database, config=config, options=OPTIONS)
         left = {tuple(pair) for pair in json.loads(database.read_text())}
         assert {tuple(pair) for pair in json.loads(verified.read_text())} == geometries.keys()
-        return Run(made, figures, given, sorted(geometries.keys() - left), told)
+        return Run(made, other, figures, given, sorted(geometries.keys() - left), told)
 
     return run
 
@@ -170,7 +194,8 @@ def test_a_round_that_leaves_no_model_to_check_does_not_count(rounds):
 
 def test_it_ends_after_the_last_round_and_says_what_is_left(rounds):
     """Two hundred pairs, each of which is refuted in its turn."""
-    many = {(f"{k:03d}", f"{k + 1:03d}"): view() for k in range(200)}
+    # Squares are no numbers of a sequence.
+    many = {(f"{k**2:06d}", f"{(k + 1) ** 2:06d}"): view() for k in range(200)}
 
     def check(pairs):
         return outcome(refuted=[min(pairs)])
@@ -284,3 +309,152 @@ def test_strong_pairs_need_a_right_rotation_once_a_pair_is_refuted(rounds):
     assert found.rounds == [set(turns), turns.keys() - {E, ("a", "d")}]
     verdict = found.figures.verdicts["a", "d"]
     assert not verdict.trusted and not verdict.refuted and "deg" in verdict.reason
+
+
+def test_a_refuted_pair_is_used_with_its_second_geometry_and_dropped_the_second_time(rounds):
+    """The second geometry has another rotation; a third one is not looked for."""
+    seen = []
+
+    def check(pairs):
+        seen.append(pairs)
+        return outcome(refuted=[A] if A in pairs else [])
+
+    found = rounds(check, seconds={A: view(33)})
+    every = set(PAIRS)
+    assert found.rounds == [every, every, every - {A}] and found.dropped == [A]
+    assert found.told == [set(), set(), {A}]
+
+
+def test_suspected_pairs_are_dropped_without_a_second_look(rounds):
+    found = rounds(lambda pairs: outcome(suspected=[A] if A in pairs else []), seconds={A: view()})
+    assert found.rounds == [set(PAIRS), set(PAIRS) - {A}]
+
+
+def test_the_best_round_is_returned_not_the_last(rounds):
+    """The third model has more contradictions than the second."""
+
+    def check(pairs):
+        refuted = [p for p in PAIRS if p in pairs][:1]
+        worse = contradiction(refuted[0], {5: 90, 4: 20}.get(len(pairs), 60))
+        check = ModelCheck(groups=[["a"]], contradictions=[worse], other_places=[])
+        return Checked(check, {refuted[0]: worse}, {}, set())
+
+    found = rounds(check)
+    assert len(found.rounds) == MAX_ROUNDS and found.models == [frozenset(set(PAIRS) - {A})]
+    assert found.dropped == [A]
+
+
+WALK = [f"walk{k}" for k in range(1, 7)]
+LINKS = set(itertools.pairwise(WALK))
+FALSE = (WALK[0], WALK[3])
+TRUE = (WALK[0], WALK[2])
+WALKED = {pair: view() for pair in (*LINKS, FALSE, TRUE)}
+
+
+def walked(pairs, *, against=(), agreeing=(), places=()) -> Checked:
+    """A check of the walk: contradictions at these pairs."""
+    found = outcome(refuted=against, explained=agreeing)
+    check = ModelCheck(
+        groups=[WALK], contradictions=found.check.contradictions, other_places=list(places)
+    )
+    return found._replace(check=check, refuted={})
+
+
+def posed(turned) -> dict[str, CameraPose]:
+    """The walk on an arc; the second half is elsewhere if the false pair was used."""
+    poses = {}
+    for k, name in enumerate(WALK):
+        angle = 0.3 * k + (2.0 if turned and k >= 3 else 0.0)
+        centre = np.asarray([np.sin(angle), 0.1 * (k % 2), -np.cos(angle)])
+        poses[name] = look_at(4 * centre, np.zeros(3))
+    return poses
+
+
+def test_the_order_of_names_joins_photos_that_pairs_join_wrongly(rounds):
+    """All pairs agree with the model but the false one, so these are added to the links."""
+
+    def check(pairs):
+        bad = [FALSE] if FALSE in pairs else []
+        return walked(pairs, against=bad, agreeing=WALKED.keys() - {FALSE})
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    assert found.rounds == [set(WALKED), LINKS, LINKS | {TRUE}]
+    assert found.dropped == [FALSE] and found.models == [frozenset(LINKS | {TRUE})]
+    (told,) = found.figures.checks
+    # Photos contradict the first model, so it is no alternative.
+    assert told is not None and told.verdict == "green" and found.alternative == []
+    assert "order" in found.figures.verdicts[FALSE].reason
+
+
+def test_a_model_in_which_photos_that_follow_each_other_disagree_is_doubted(rounds):
+    """Nothing in the photos decides: both models are returned, and the verdict is amber."""
+
+    def check(pairs):
+        wrong = {FALSE, (WALK[2], WALK[3])}
+        return walked(pairs, agreeing=WALKED.keys() - (wrong if FALSE in pairs else {FALSE}))
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    assert found.rounds == [set(WALKED), LINKS, LINKS | {TRUE}]
+    assert found.models == [frozenset(WALKED)] and found.dropped == []
+    assert found.alternative == [frozenset(LINKS | {TRUE})]
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == "amber" and told.alternative is not None
+    assert told.alternative.basis == "order" and told.alternative.elsewhere == WALK[3:]
+
+
+def test_two_equal_models_are_not_two(rounds):
+    def check(pairs):
+        return walked(
+            pairs, agreeing=WALKED.keys() - ({(WALK[2], WALK[3])} if FALSE in pairs else set())
+        )
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(False))
+    (told,) = found.figures.checks
+    assert len(found.rounds) == 3 and found.alternative == []
+    assert told is not None and told.verdict == "green"
+
+
+def test_a_model_with_which_all_that_follow_agree_is_not_doubted(rounds):
+    found = rounds(lambda pairs: walked(pairs, agreeing=LINKS), two_views=WALKED)
+    assert found.rounds == [set(WALKED)]
+
+
+def test_without_an_order_nothing_else_is_tried(rounds):
+    renamed = {name: f"walk{int(name[4:]) ** 3}" for name in WALK}
+    views = {make_pair(renamed[a], renamed[b]): v for (a, b), v in WALKED.items()}
+    found = rounds(lambda pairs: walked(pairs), two_views=views)
+    assert len(found.rounds) == 1
+
+
+def test_a_link_that_joins_opposed_groups_takes_its_second_geometry(rounds):
+    """The photos contradict each other until the link has its second geometry."""
+    link = (WALK[2], WALK[3])
+    tries = iter([True] * 3 + [False] * 9)
+
+    def check(pairs):
+        return walked(pairs, against=[link] if next(tries) else [], agreeing=LINKS)
+
+    found = rounds(check, two_views=WALKED, seconds={link: view(20)}, places=lambda p: posed(True))
+    assert len(found.rounds) == 5 and found.rounds[3] >= LINKS
+    assert found.models == [frozenset(LINKS)]
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == "green"
+
+
+def test_a_sudden_link_takes_its_second_geometry(rounds):
+    """One link turns by 80 deg and the others by 10, although nothing contradicts it."""
+    link = (WALK[2], WALK[3])
+    views = {pair: view(80 if pair == link else 10) for pair in WALKED}
+    given = []
+
+    def check(pairs):
+        given.append(pairs)
+        return walked(pairs, places=[PLACE])
+
+    found = rounds(check, two_views=views, seconds={link: view(12)}, places=lambda p: posed(False))
+    assert len(found.rounds) == 5  # the votes; the links, with what agrees; the same again
+    again = rounds(check, two_views=views, places=lambda p: posed(False))
+    assert len(again.rounds) == 3  # there is no second geometry
+
+
+PLACE = OtherPlace(image=WALK[0], pairs=[WALK[3]], agreed=99, contradicted=0, rotation_deg=90.0)

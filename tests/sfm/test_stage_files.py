@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from verdicts import check_of
+from verdicts import OTHER, check_of
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.sfm.mapping import MappingFigures
@@ -42,7 +42,8 @@ attempts = st.builds(
     initial_pair=st.none() | st.sampled_from(PAIRS),
     registered=st.lists(st.integers(0, 99), max_size=3),
 )
-checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red")])
+two = dataclasses.replace(check_of("green"), alternative=OTHER)
+checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red"), two])
 mappings = st.builds(
     MappingFigures,
     verdicts=st.dictionaries(st.sampled_from(PAIRS), verdicts),

@@ -93,7 +93,7 @@ def check_model(
             pair: each
             for pair in fitting
             for each in contradictions
-            if _joins(pair, each) and pair not in refuted
+            if each.joined_by(pair) and pair not in refuted
         }
         if refuted or suspected:
             break
@@ -105,14 +105,8 @@ def check_model(
     groups = [sorted(names[k] for k in group) for group in grouping.groups]
     check = ModelCheck(groups=groups, contradictions=contradictions, other_places=places)
     agreeing = [pair for pair, fit in fits.items() if fit >= MIN_FIT]
-    explained = {p for p in agreeing if not any(_joins(p, each) for each in contradictions)}
+    explained = {p for p in agreeing if not any(each.joined_by(p) for each in contradictions)}
     return Checked(check, refuted, suspected, explained)
-
-
-def _joins(pair: Pair, each: Contradiction) -> bool:
-    """Whether a pair has one photo in either group."""
-    one, other = (set(group) & set(pair) for group in (each.images, each.others))
-    return bool(one and other)
 
 
 def _refuted(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pair, Contradiction]:

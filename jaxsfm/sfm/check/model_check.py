@@ -3,12 +3,15 @@
 import dataclasses
 from typing import Literal
 
+from jaxsfm.io.pairs import Pair
+
 MIN_VIEWS = 3
 """A model of two photos is not checked: nothing in it can contradict the pair that it is made of.
 """
 VerdictColour = Literal["green", "amber", "red"]
-"""Green: nothing speaks against the model. Amber: photos fit into it in a second place, so another
-model explains them as well. Red: groups of its photos contradict each other."""
+"""Green: nothing speaks against the model. Amber: another model explains the photos as well: some
+fit into the model in a second place, or another model was made. Red: groups of its photos
+contradict each other."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -21,6 +24,10 @@ class Contradiction:
     """Points of one group that photos of the other one should show."""
     contradicted: int
     """Those of them where these photos show something else."""
+
+    def joined_by(self, pair: Pair) -> bool:
+        """Whether a pair has one photo in either group."""
+        return all(set(group) & set(pair) for group in (self.images, self.others))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,6 +49,25 @@ class OtherPlace:
     """How far the photo is turned there against its place in the model."""
 
 
+Basis = Literal["pairs", "order"]
+"""What a model follows where pairs exclude each other: most of the pairs, or the order of the
+photos' names."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Alternative:
+    """Another model of the same photos, which joins them in another way."""
+
+    basis: Basis
+    """What it follows; the model itself follows the other one."""
+    images: int
+    """The number of its photos."""
+    elsewhere: list[str]
+    """Photos that have other places in it than in the model, as seen from most photos. Sorted."""
+    contradicted: int
+    """Points at which its photos contradict each other."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelCheck:
     """What the photos of a model say of it."""
@@ -52,10 +78,11 @@ class ModelCheck:
     contradictions: list[Contradiction]
     other_places: list[OtherPlace]
     """Sorted by the photo's name."""
+    alternative: Alternative | None = None
 
     @property
     def verdict(self) -> VerdictColour:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        return "amber" if self.other_places else "green"
+        return "amber" if self.other_places or self.alternative else "green"

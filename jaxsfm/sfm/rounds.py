@@ -1,0 +1,233 @@
+"""One round of mapping: the pairs that a hypothesis trusts, COLMAP's mapper and the check.
+
+A hypothesis says which pairs are right. Each of its rounds has fewer pairs than the one before: the
+check has refuted those that joined photos that contradict each other.
+"""
+
+import logging
+import shutil
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
+from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.two_views import (
+    PairGeometry,
+    TwoView,
+    VerificationOptions,
+    read_two_views,
+    verify,
+)
+from jaxsfm.config import Config, Refinement
+from jaxsfm.io.images import ImageError
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photos import Photos
+from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model
+from jaxsfm.sfm.check.model_check import Contradiction
+from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.view_graph import Verdict
+
+if TYPE_CHECKING:
+    import pycolmap
+
+FEWER = 0.1
+"""A model is smaller than another one if it has fewer photos by more than this share of them."""
+
+logger = logging.getLogger("jaxsfm")
+
+Hypothesis = Callable[[Mapping[Pair, PairGeometry], bool], dict[Pair, Verdict]]
+"""The verdicts on pairs, from their geometries. The second argument says whether pairs were refuted
+in earlier rounds. Pairs without a verdict are trusted."""
+
+
+class VerifiedPairs(NamedTuple):
+    """What the mapper starts from."""
+
+    database: Path
+    """With all verified pairs."""
+    two_views: Mapping[Pair, TwoView]
+    """Their geometries."""
+    matches: Mapping[Pair, PairResult]
+    """Their matches, original pixels."""
+    photos: Photos
+
+
+class Refuted(NamedTuple):
+    """What earlier rounds have shown to be false."""
+
+    pairs: Mapping[Pair, Contradiction]
+    """Pairs that are not used any more."""
+    first: frozenset[Pair]
+    """Pairs of which only the first geometry is false. Their second one is used."""
+
+
+NOTHING_REFUTED = Refuted({}, frozenset())
+
+
+@dataclass(frozen=True)
+class Round:
+    """The models of one round, and what their checks say."""
+
+    models: "list[pycolmap.Reconstruction]"
+    verdicts: dict[Pair, Verdict]
+    checks: list[Checked | None]
+    """For each model; None where it was not checked."""
+    database: Path
+    """With the pairs that the models were made from."""
+    refuted: Refuted
+    """What was known before this round."""
+
+    def _done(self) -> list[Checked]:
+        return [each for each in self.checks if each is not None]
+
+    def opposed(self) -> dict[Pair, Contradiction]:
+        """Pairs that agree with the models and whose own two photos contradict each other."""
+        return {pair: why for each in self._done() for pair, why in each.refuted.items()}
+
+    def suspected(self) -> dict[Pair, Contradiction]:
+        """Other pairs that agree with the models and join groups that contradict each other."""
+        return {pair: why for each in self._done() for pair, why in each.suspected.items()}
+
+    def explained(self) -> set[Pair]:
+        """Pairs that agree with the models."""
+        return {pair for each in self._done() for pair in each.explained}
+
+    def joining_opposed_groups(self, pairs: Iterable[Pair]) -> dict[Pair, Contradiction]:
+        """Those of the pairs that join groups of photos that contradict each other."""
+        found = [each for done in self._done() for each in done.check.contradictions]
+        return {pair: each for pair in pairs for each in found if each.joined_by(pair)}
+
+    def contradicted(self) -> int:
+        """The number of points at which photos contradict each other."""
+        return sum(c.contradicted for each in self._done() for c in each.check.contradictions)
+
+    def checked_photos(self) -> set[str]:
+        """The photos in models that were checked."""
+        return {name for each in self._done() for group in each.check.groups for name in group}
+
+    def is_green(self) -> bool:
+        """Whether nothing speaks against any of the models."""
+        return all(each.check.verdict == "green" for each in self._done())
+
+    def at_least_as_good_as(self, other: "Round") -> bool:
+        """Compare the models: first by contradictions, then by size, then by their number."""
+        if bool(self.contradicted()) != bool(other.contradicted()):
+            return not self.contradicted()
+        ours, theirs = len(self.checked_photos()), len(other.checked_photos())
+        if abs(ours - theirs) > FEWER * max(ours, theirs):
+            return ours > theirs
+        return self.contradicted() <= other.contradicted()
+
+
+class Rounds:
+    """Makes rounds from verified pairs. It keeps the databases of all rounds in a folder."""
+
+    def __init__(
+        self,
+        given: VerifiedPairs,
+        folder: Path,
+        *,
+        config: Config,
+        options: MapOptions,
+        on_image: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.given, self._folder = given, folder
+        self._second_database = folder / "second.db"
+        self._config, self._options, self._on_image = config, options, on_image
+        self.attempts: list[Attempt] = []
+        """All runs of the mapper, in all rounds."""
+        self._seconds: dict[Pair, TwoView | None] = {}
+        """The second geometries that were looked for; None: there is none."""
+
+    def make(self, hypothesis: Hypothesis, refuted: Refuted) -> Round:
+        """Map the pairs that a hypothesis trusts, and check the models."""
+        views = {pair: v for pair, v in self.given.two_views.items() if pair not in refuted.pairs}
+        for pair in refuted.first:
+            views[pair] = self._second(pair)
+        known = bool(refuted.pairs or refuted.first)
+        verdicts = hypothesis({pair: view.geometry for pair, view in views.items()}, known)
+        trusted = {p: v for p, v in views.items() if p not in verdicts or verdicts[p].trusted}
+        verdicts |= {pair: _refuted(each) for pair, each in refuted.pairs.items()}
+        database = self._folder / f"round{len(list(self._folder.glob('round*')))}.db"
+        shutil.copyfile(self.given.database, database)
+        if refuted.first:
+            copy_geometries(self._second_database, database, sorted(refuted.first))
+        drop_pairs(database, sorted(self.given.two_views.keys() - trusted.keys()))
+        models, attempts = build_models(database, trusted, self._options, on_image=self._on_image)
+        self.attempts += attempts
+        return Round(models, verdicts, self._check(models, refuted), database, refuted)
+
+    def without(self, before: Refuted, against: Mapping[Pair, Contradiction]) -> Refuted:
+        """Refute pairs: the first geometry of a pair, and the whole pair the second time.
+
+        The matches of a pair may hold two geometries, where its photos show equal walls and a part
+        that is common to both. COLMAP verifies the one with more matches.
+        """
+        again = self.with_seconds(against.keys() - before.first)
+        gone = {pair: why for pair, why in against.items() if pair not in again}
+        return Refuted({**before.pairs, **gone}, (before.first | again) - gone.keys())
+
+    def with_seconds(self, pairs: Collection[Pair]) -> set[Pair]:
+        """Those of the pairs that have a second geometry."""
+        self._find_seconds(set(pairs))
+        return {pair for pair in pairs if self._seconds[pair] is not None}
+
+    def _second(self, pair: Pair) -> TwoView:
+        found = self._seconds[pair]
+        assert found is not None
+        return found
+
+    def _find_seconds(self, pairs: set[Pair]) -> None:
+        """Look for second geometries among the matches that do not agree with the first."""
+        new, path = sorted(pairs - self._seconds.keys()), self._second_database
+        if not new:
+            return
+        if not path.exists():
+            shutil.copyfile(self.given.database, path)
+        keep_outliers(path, new)
+        verify(
+            path,
+            VerificationOptions(
+                seed=self._options.seed, threads=self._options.threads, scale=self._options.scale
+            ),
+        )
+        found = read_two_views(path)
+        self._seconds |= {pair: found.get(pair) for pair in new}
+
+    def _check(
+        self, models: "list[pycolmap.Reconstruction]", refuted: Refuted
+    ) -> list[Checked | None]:
+        """The checks of models; None where one was not checked."""
+        if not self._config.checked:
+            return [None] * len(models)
+        given, checks = self.given, []
+        matches = VerifiedMatches(
+            given.matches, given.two_views.keys(), refuted.pairs, self._options.seed
+        )
+        for each in models:
+            sizes = {name: given.photos.working_size(name) for name in registered(each)}
+            images = DeviceImages(given.photos.gray)
+            try:
+                model = Model.from_colmap(each, sizes)
+                refinement = self._config.refinement or Refinement()
+                checks.append(check_model(model, images, matches, refinement))
+            except ImageError as error:  # a photo was deleted since; the model remains
+                logger.warning("a model was not checked: %s", error)
+                checks.append(None)
+        return checks
+
+
+def _refuted(each: Contradiction) -> Verdict:
+    return Verdict(
+        trusted=False,
+        refuted=True,
+        strength=0.0,
+        rotation_error_deg=None,
+        reason=(
+            f"the photos it joins contradict each other: of {each.tested} points of one group, "
+            f"{each.contradicted} are missing in the other"
+        ),
+    )
