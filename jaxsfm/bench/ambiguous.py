@@ -21,7 +21,7 @@ from jaxsfm.bench.strecha_models import MethodRun, set_models, take_matches
 from jaxsfm.bench.strecha_sets import StrechaSet, find_sets, read_set
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import UserError, writing
-from jaxsfm.sfm.check.common_places import extent
+from jaxsfm.sfm.check.common_places import extent, groups
 
 SAME_MATCHES = ("default", *MAPPERS)
 """Methods that have the same matches, which are computed once."""
@@ -46,6 +46,8 @@ class AmbiguousRow(ModelRow):
     """The number of photos in each model, the largest first."""
     groups: list[list[int]]
     """For each model of three photos and more: the sizes of the groups it is made of."""
+    alternative: list[int]
+    """The sizes of the groups of the other model; empty if there is none."""
     outcome: Outcome
     doubt: str
     """What the run says against its model; empty if it says nothing."""
@@ -92,6 +94,7 @@ def _measure(each: StrechaSet, task: Task, run: MethodRun, work: Path) -> Ambigu
     poses = [model_poses(model) for model in made.models]
     said = doubt(made.report)
     judgement = judge(poses, each.truth, noticed=bool(said))
+    other = [] if made.alternative is None else groups(model_poses(made.alternative), each.truth)
     errors, wide = camera_errors(poses[0] if poses else None, each.truth), extent(each.truth)
     position = errors["position"]
     return {
@@ -102,6 +105,7 @@ def _measure(each: StrechaSet, task: Task, run: MethodRun, work: Path) -> Ambigu
         "images": len(each.truth),
         "models": [len(model) for model in poses],
         "groups": judgement.groups,
+        "alternative": [len(group) for group in other],
         "outcome": judgement.outcome,
         "doubt": said,
         "extent": wide,
@@ -158,7 +162,7 @@ def _sizes(sizes: list[int]) -> str:
 
 
 def cells(row: AmbiguousRow) -> Cells:
-    """A row of the table: the groups of the largest model, mean errors and the outcome."""
+    """A row of the table: the groups of the best model and of the other, errors and the outcome."""
     found = {
         "set": row["set"],
         "method": row["method"],
@@ -168,6 +172,8 @@ def cells(row: AmbiguousRow) -> Cells:
         "models": str(len(row["models"])),
         "groups": _sizes(row["groups"][0]) if row["groups"] else "",
     }
+    if row["alternative"]:
+        found["other model"] = _sizes(row["alternative"])
     if row["position"] is not None and row["rotation_deg"] is not None:
         found["position"] = f"{row['position']['mean']:.4f}"
         found["rotation"] = f"{row['rotation_deg']['mean']:.3f}"

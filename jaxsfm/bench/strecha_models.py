@@ -66,6 +66,8 @@ class SetModels(NamedTuple):
     """The time of each stage."""
     report: RunReport | None
     """What the run says of its models; None for methods that are not runs of ours."""
+    alternative: "pycolmap.Reconstruction | None" = None
+    """The best model that joins the photos in another way."""
 
 
 def set_models(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
@@ -120,7 +122,13 @@ def _run_method(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     photos, config = each.folder / "images", method_config(run.method, max_size=run.max_size)
     report = reconstruct_folder(photos, work, config=config, options=options)
     models = [read_model(work / "sparse" / str(k)) for k in range(len(report.models))]
-    return SetModels(models, report.seconds | _matching_seconds(work, report.seconds), report)
+    other = work / "alternative" / "0"
+    return SetModels(
+        models,
+        report.seconds | _matching_seconds(work, report.seconds),
+        report,
+        read_model(other) if other.is_dir() else None,
+    )
 
 
 def _run_naive(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:

@@ -21,7 +21,8 @@ from jaxsfm.sfm import mapping
 from jaxsfm.sfm import rounds as module
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
-from jaxsfm.sfm.mapping import MAX_ROUNDS, MappingFigures, build_checked_models
+from jaxsfm.sfm.hypotheses import MAX_ROUNDS
+from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
 from jaxsfm.sfm.rounds import VerifiedPairs
 
 A, B, C, D, E = PAIRS = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d"), ("d", "e")]

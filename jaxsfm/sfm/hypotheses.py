@@ -1,0 +1,138 @@
+"""Two hypotheses about which pairs are right, and the best models that follow from each.
+
+The first hypothesis is that the pairs on which most others agree are right
+(`jaxsfm.sfm.view_graph`). The second is that photos that were taken one after the other belong
+together (`jaxsfm.sfm.photo_order`). Pairs that join photos which contradict each other are refuted
+in rounds.
+"""
+
+import logging
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaxsfm.colmap.two_views import PairGeometry
+from jaxsfm.io.pairs import Pair
+from jaxsfm.sfm.photo_order import Order, follow
+from jaxsfm.sfm.rounds import (
+    NOTHING_REFUTED,
+    Hypothesis,
+    Refuted,
+    Round,
+    Rounds,
+    VerifiedPairs,
+)
+from jaxsfm.sfm.view_graph import (
+    TOLERANCE_DEG,
+    Verdict,
+    rotation_angle_deg,
+    strengths,
+    trusted_pairs,
+)
+
+MAX_ROUNDS = 4
+"""At most so many times the pairs are mapped for a hypothesis. A model without contradictions takes
+one round, the courtyard of castle-P19 at 800 px and a rendered room take two. Each takes as long as
+the first."""
+SUDDEN = 3.0
+"""A link turns the camera suddenly if its angle is so many times the median of all links. On the
+corners of rendered boxes, wrong geometries turn it by 70 deg or more, and right ones by 20."""
+
+logger = logging.getLogger("jaxsfm")
+
+
+def by_votes(rounds: Rounds, *, view_graph: bool) -> Round:
+    """The best round of the hypothesis that the pairs on which most others agree are right.
+
+    Pairs that were left out are taken back in one more round, if they agree with models in which no
+    photo contradicts another.
+    """
+
+    def vote(geometries: Mapping[Pair, PairGeometry], refuted: bool) -> dict[Pair, Verdict]:
+        return trusted_pairs(geometries, strict=refuted) if view_graph else {}
+
+    best = made = rounds.make(vote, NOTHING_REFUTED)
+    for _ in range(MAX_ROUNDS - 1):
+        refuted = _outvoted(rounds, made)
+        if refuted == made.refuted:
+            break
+        logger.info("photos contradict each other; mapping again without the pairs that join them")
+        made = rounds.make(vote, refuted)
+        if not made.checked_photos():  # these pairs were all that held photos together
+            break
+        if made.at_least_as_good_as(best):
+            best = made
+    if (back := best.refuted.pairs.keys() & best.explained()) and not best.contradicted():
+        left = {pair: why for pair, why in best.refuted.pairs.items() if pair not in back}
+        again = rounds.make(vote, Refuted(left, best.refuted.first))
+        if not again.contradicted() and again.checked_photos() >= best.checked_photos():
+            best = again
+    return best
+
+
+def _outvoted(rounds: Rounds, made: Round) -> Refuted:
+    """What is refuted after a round of `by_votes`.
+
+    Pairs that are suspected because of their groups are left out only if no pair is refuted by its
+    own two photos: with these gone, the groups may be joined rightly.
+    """
+    if against := made.opposed():
+        return rounds.without(made.refuted, against)
+    return made.refuted._replace(pairs={**made.refuted.pairs, **made.suspected()})
+
+
+def by_order(rounds: Rounds, found: list[Order]) -> Round:
+    """The best round of the hypothesis that photos taken one after the other belong together.
+
+    The fewest pairs that follow the order make a first model. All pairs that agree with it are
+    added for a second one. If its photos contradict each other, both are made again.
+    """
+
+    def following(agreeing: set[Pair]) -> Hypothesis:
+        def verdicts(geometries: Mapping[Pair, PairGeometry], _: bool) -> dict[Pair, Verdict]:
+            strength = strengths(geometries)
+            taken = follow(found, strength) | (agreeing & strength.keys())
+            return {pair: _ordered(strength[pair], pair in taken) for pair in strength}
+
+        return verdicts
+
+    refuted, best = NOTHING_REFUTED, None
+    for _ in range(MAX_ROUNDS // 2):
+        chain = rounds.make(following(set()), refuted)
+        grown = rounds.make(following(chain.explained()), refuted)
+        for made in (chain, grown):
+            if best is None or made.at_least_as_good_as(best):
+                best = made
+        links = [pair for pair, verdict in chain.verdicts.items() if verdict.trusted]
+        against = grown.joining_opposed_groups(links)
+        sudden = rounds.with_seconds(_sudden(links, rounds.given) - refuted.first)
+        if not against and not sudden:
+            break
+        refuted = rounds.without(refuted, against)
+        refuted = refuted._replace(first=refuted.first | (sudden - against.keys()))
+    assert best is not None
+    return best
+
+
+def _sudden(links: list[Pair], given: VerifiedPairs) -> set[Pair]:
+    """Links whose geometry turns the camera much further than the others do.
+
+    Photos that follow each other at the corner of a building with equal walls show both walls. The
+    pair then takes one wall for the other, and its second geometry is the right one.
+    """
+    turns = {
+        pair: float(rotation_angle_deg(rotation, np.eye(3)))
+        for pair in links
+        if (rotation := given.two_views[pair].geometry.rotation) is not None
+    }
+    most = SUDDEN * float(np.median(list(turns.values()))) if turns else 0.0
+    return {pair for pair, turn in turns.items() if turn > max(most, TOLERANCE_DEG)}
+
+
+def _ordered(strength: float, taken: bool) -> Verdict:
+    return Verdict(
+        trusted=taken,
+        strength=strength,
+        rotation_error_deg=None,
+        reason="" if taken else "it does not agree with the order of the photos' names",
+    )
