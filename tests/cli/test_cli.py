@@ -551,6 +551,37 @@ def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
 
 
 @pytest.mark.slow
+def test_another_model_is_written_beside_the_result_and_goes_when_there_is_none(
+    scene, tmp_path, monkeypatch, capsys
+):
+    from jaxsfm.sfm import reconstruction
+    from jaxsfm.sfm.check.model_check import Alternative
+
+    build, out = reconstruction.build_checked_models, tmp_path / "out"
+
+    def two(*arguments, **options):
+        made = build(*arguments, **options)
+        told = Alternative(basis="order", images=3, elsewhere=["view2.png"], contradicted=0)
+        checks = [dataclasses.replace(made.figures.checks[0], alternative=told)]
+        figures = dataclasses.replace(made.figures, checks=checks)
+        return made._replace(figures=figures, alternative=made.models)
+
+    args = ["reconstruct", scene / "images", "--out", out, "--intrinsics", scene / "K.txt"]
+    args = [str(a) for a in args]
+    monkeypatch.setattr(reconstruction, "build_checked_models", two)
+    assert main(args) == 3
+    assert "other model      alternative/0 follows the order" in capsys.readouterr().out
+    assert (out / "alternative" / "0" / "images.bin").is_file()
+    page = (out / "report.html").read_text()
+    assert "<b>Another model</b> of these photos" in page and "Photos that fit" not in page
+    (check,) = json.loads((out / "report.json").read_text())["checks"]
+    assert check["alternative"]["elsewhere"] == ["view2.png"]
+    monkeypatch.undo()
+    assert main([*args, "--seed", "1"]) == 0
+    assert not (out / "alternative").exists()
+
+
+@pytest.mark.slow
 def test_going_on_does_not_try_a_damaged_photo_again(scene, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "photos"
     shutil.copytree(scene / "images", folder)
