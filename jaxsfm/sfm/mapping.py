@@ -81,12 +81,12 @@ def build_checked_models(
         if found and best.checked_photos() and _in_doubt(best, found, given):
             logger.info("something speaks against the model; following the order of the names")
             other = by_order(rounds, found)
-            if not best.is_green() and other.at_least_as_good_as(best):
+            if other.at_least_as_good_as(best):
                 best, other, basis = other, best, "order"
         shutil.copyfile(best.database, database)
     checks = [each and each.check for each in best.checks]
     alternative = []
-    if other is not None and checks[0] is not None and _stands(other, beside=best):
+    if other is not None and checks[0] is not None and _stands(other, beside=best, basis=basis):
         told = _alternative(best, other, "pairs" if basis == "order" else "order")
         if told is not None:
             checks[0] = dataclasses.replace(checks[0], alternative=told)
@@ -104,9 +104,17 @@ def _in_doubt(made: Round, found: list[Order], given: VerifiedPairs) -> bool:
     return bool(following - made.explained())
 
 
-def _stands(other: Round, *, beside: Round) -> bool:
-    """Whether other models are worth showing: not if photos contradict these ones alone."""
-    return bool(other.checked_photos()) and (beside.contradicted() > 0 or not other.contradicted())
+def _stands(other: Round, *, beside: Round, basis: Basis) -> bool:
+    """Whether other models are worth showing beside the best ones, which follow `basis`.
+
+    If photos contradict the other models and not the best ones, the best ones stand alone. There is
+    one exception: a green model that follows the pairs, although photos that follow each other do
+    not agree with it. Nobody should take it for certain.
+    """
+    if not other.checked_photos():
+        return False
+    doubted = basis == "pairs" and beside.is_green()
+    return doubted or not other.contradicted() or beside.contradicted() > 0
 
 
 def _alternative(best: Round, other: Round, basis: Basis) -> Alternative | None:

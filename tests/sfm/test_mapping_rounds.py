@@ -387,7 +387,7 @@ def test_the_order_of_names_joins_photos_that_pairs_join_wrongly(rounds):
     assert "order" in found.figures.verdicts[FALSE].reason
 
 
-def test_a_model_in_which_photos_that_follow_each_other_disagree_is_doubted(rounds):
+def test_a_green_model_in_which_photos_that_follow_each_other_disagree_is_not_the_result(rounds):
     """Nothing in the photos decides: both models are returned, and the verdict is amber."""
 
     def check(pairs):
@@ -396,11 +396,36 @@ def test_a_model_in_which_photos_that_follow_each_other_disagree_is_doubted(roun
 
     found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
     assert found.rounds == [set(WALKED), LINKS, LINKS | {TRUE}]
-    assert found.models == [frozenset(WALKED)] and found.dropped == []
-    assert found.alternative == [frozenset(LINKS | {TRUE})]
+    assert found.models == [frozenset(LINKS | {TRUE})] and found.dropped == [FALSE]
+    assert found.alternative == [frozenset(WALKED)]
     (told,) = found.figures.checks
     assert told is not None and told.verdict == "amber" and told.alternative is not None
-    assert told.alternative.basis == "order" and told.alternative.elsewhere == WALK[3:]
+    assert told.alternative.basis == "pairs" and told.alternative.elsewhere == WALK[3:]
+
+
+def test_it_is_amber_also_if_photos_contradict_the_model_that_follows_the_order(rounds):
+    def check(pairs):
+        if FALSE in pairs:
+            return walked(pairs, agreeing=LINKS - {(WALK[2], WALK[3])})
+        return walked(pairs, against=[FALSE], agreeing=LINKS)
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    assert found.models == [frozenset(WALKED)] and found.alternative == [frozenset(LINKS)]
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == "amber" and told.alternative is not None
+    assert told.alternative.basis == "order" and told.alternative.contradicted == 30
+
+
+def test_an_amber_model_stands_alone_if_photos_contradict_the_other(rounds):
+    def check(pairs):
+        if FALSE in pairs:
+            return walked(pairs, places=[PLACE])
+        return walked(pairs, against=[FALSE], agreeing=LINKS)
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    (told,) = found.figures.checks
+    assert found.models == [frozenset(WALKED)] and found.alternative == []
+    assert told is not None and told.alternative is None
 
 
 def test_two_equal_models_are_not_two(rounds):
