@@ -484,3 +484,75 @@ def test_a_sudden_link_takes_its_second_geometry(rounds):
 
 
 PLACE = OtherPlace(image=WALK[0], pairs=[WALK[3]], agreed=99, contradicted=0, rotation_deg=90.0)
+
+
+def test_links_that_turn_like_the_others_keep_their_geometry(rounds):
+    """All links have a second geometry, and none is needed."""
+    views = {pair: view(10) for pair in WALKED}
+    seconds = dict.fromkeys(LINKS, view(40))
+    found = rounds(
+        lambda pairs: walked(pairs, places=[PLACE]),
+        two_views=views,
+        seconds=seconds,
+        places=lambda p: posed(False),
+    )
+    assert len(found.rounds) == 3
+
+
+def test_of_two_red_models_both_are_shown(rounds):
+    """Less contradicts the model that follows the order."""
+
+    def check(pairs):
+        if FALSE in pairs:
+            return walked(pairs, against=[FALSE, TRUE])
+        return walked(pairs, against=[FALSE], agreeing=LINKS)
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    assert found.models == [frozenset(LINKS)] and found.alternative == [frozenset(WALKED)]
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == "red" and told.alternative is not None
+    assert told.alternative.basis == "pairs" and told.alternative.contradicted == 60
+
+
+def test_photos_that_are_in_no_model_raise_no_doubt(rounds):
+    """The last photo of the walk was not registered, so its pair agrees with nothing."""
+    last = (WALK[4], WALK[5])
+
+    def kept(pairs):
+        found = walked(pairs, agreeing=LINKS - {last})
+        return found._replace(
+            check=ModelCheck(groups=[WALK[:5]], contradictions=[], other_places=[])
+        )
+
+    assert len(rounds(kept, two_views=WALKED).rounds) == 1
+
+
+def test_a_larger_model_is_better_than_a_smaller_one_with_fewer_contradictions(rounds):
+    """Both are red; the second round has lost a third of the photos."""
+
+    def check(pairs):
+        whole = A in pairs
+        worse = contradiction(A if whole else B, 90 if whole else 20)
+        check = ModelCheck(
+            groups=[["a", "b", "c"] if whole else ["a", "b"]],
+            contradictions=[worse],
+            other_places=[],
+        )
+        return Checked(check, {A: worse} if whole else {}, {}, set())
+
+    assert rounds(check).models == [frozenset(PAIRS)]
+
+
+def test_strong_pairs_need_a_right_rotation_also_beside_second_geometries(rounds):
+    """As above, and the refuted pair has a second geometry."""
+    strong = ("a", "d")
+    turns = {A: view(), B: view(), C: view(), D: view(), strong: view(40), ("b", "d"): view()}
+    turns |= {E: view()}
+    tries = iter([[E], []])
+    found = rounds(
+        lambda pairs: outcome(refuted=next(tries)),
+        config=Config(checked=True, view_graph=True),
+        two_views=turns,
+        seconds={E: view()},
+    )
+    assert found.rounds == [set(turns), turns.keys() - {strong}]

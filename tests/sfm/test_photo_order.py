@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsfm.io.pairs import component_of, make_pair
-from jaxsfm.sfm.photo_order import MIN_PHOTOS, follow, neighbours, orders
+from jaxsfm.sfm.photo_order import follow, neighbours, orders
 
 
 def numbered(numbers, pattern="IMG_{:04d}.jpg"):
@@ -34,9 +34,9 @@ def test_identifiers_have_no_order(seed):
     assert orders(numbered(numbers, "{}_large.jpg")) == []
 
 
-def test_names_without_numbers_and_few_photos_have_no_order():
-    assert orders(["dome.jpg", "gate.jpg", *numbered(range(MIN_PHOTOS - 1))]) == []
-    assert orders(numbered(range(MIN_PHOTOS))) == [numbered(range(MIN_PHOTOS))]
+def test_names_without_numbers_and_four_photos_have_no_order():
+    assert orders(["dome.jpg", "gate.jpg", *numbered(range(4))]) == []
+    assert orders(numbered(range(5))) == [numbered(range(5))]
 
 
 @pytest.mark.parametrize("seed", range(5))
