@@ -488,7 +488,7 @@ PLACE = OtherPlace(image=WALK[0], pairs=[WALK[3]], agreed=99, contradicted=0, ro
 
 def test_links_that_turn_like_the_others_keep_their_geometry(rounds):
     """All links have a second geometry, and none is needed."""
-    views = {pair: view(10) for pair in WALKED}
+    views = {pair: view(20) for pair in WALKED}
     seconds = dict.fromkeys(LINKS, view(40))
     found = rounds(
         lambda pairs: walked(pairs, places=[PLACE]),
