@@ -85,6 +85,17 @@ class LazyMatches(Mapping[Pair, PairResult]):
         return len(self._pairs)
 
 
+class ChosenMatches(LazyMatches):
+    """Some of the matches of another mapping."""
+
+    def __init__(self, matches: Mapping[Pair, PairResult], pairs: Iterable[Pair]) -> None:
+        super().__init__(pairs)
+        self._matches = matches
+
+    def _load(self, pair: Pair) -> PairResult:
+        return self._matches[pair]
+
+
 class PairCounts(NamedTuple):
     """The numbers of a `PairResult` without its arrays."""
 

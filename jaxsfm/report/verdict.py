@@ -51,6 +51,8 @@ class ModelVerdict(NamedTuple):
     """Second places of photos, the one with most points that agree first."""
     alternatives: list[Finding]
     """The other model of the same photos, if one was made."""
+    neighbours: list[Finding]
+    """Photos that follow each other and do not agree with the model."""
     decisive: str
     """Photos that would decide between two places; empty if no photo has two."""
     advice: str
@@ -94,6 +96,7 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
             Finding(_against(each), each.images, each.others) for each in contradictions
         ],
         places=[Finding(_fits(each), [each.image], each.pairs) for each in places],
+        neighbours=[Finding(_apart(pair), pair[:1], pair[1:]) for pair in check.apart],
         alternatives=[_other_model(check.alternative)] if check.alternative else [],
         decisive=_decides(check, places),
         advice=_advice(check, places),
@@ -114,6 +117,7 @@ def _model_lines(verdict: ModelVerdict) -> list[str]:
         ("contradiction    ", verdict.contradictions),
         ("second place     ", verdict.places),
         ("other model      ", verdict.alternatives),
+        ("neighbours       ", verdict.neighbours),
     ):
         lines += [label + each.text for each in found[:MAX_FINDINGS]]
         if more := len(found[MAX_FINDINGS:]):
@@ -154,12 +158,19 @@ def _other_model(other: Alternative) -> Finding:
     return Finding(text, other.elsewhere, [])
 
 
+def _apart(pair: Sequence[str]) -> str:
+    first, second = map(shown_name, pair)
+    return f"{first} and {second} follow each other, but their matches do not agree with the model"
+
+
 def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
     """Which photos would decide between two places or two models; empty if there is nothing to."""
     if places:
         way = f"from {shown_name(places[0].image)} to {named(places[0].pairs)}"
     elif check.alternative:
         way = f"from {named(check.alternative.elsewhere)} to the other photos"
+    elif check.apart and check.verdict == "amber":
+        way = f"from {shown_name(check.apart[0][0])} to {shown_name(check.apart[0][1])}"
     else:
         return ""
     return f"photos taken on the way {way}, if {_DECISIVE}"
@@ -174,7 +185,7 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
             f"to the other, so that {_DECISIVE}, and run the same command again"
         )
     if colour == "amber":
-        unsure = places[0].image if places or other is None else other.elsewhere[0]
+        unsure = places[0].image if places else other.elsewhere[0] if other else check.apart[0][1]
         where = (
             "the model has it, and not where alternative/0 has it" if other else "the model has it"
         )

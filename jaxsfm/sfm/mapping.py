@@ -19,6 +19,7 @@ from jaxsfm.colmap.mapper import Attempt, MapOptions
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair
+from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
 from jaxsfm.sfm.check.model_check import Alternative, Basis, ModelCheck
 from jaxsfm.sfm.hypotheses import by_order, by_votes
@@ -43,6 +44,16 @@ class MappingFigures:
     """All runs of the mapper, in all rounds."""
     checks: list[ModelCheck | None]
     """For each model; None where it was not checked."""
+    basis: Basis = "pairs"
+    """What the models follow."""
+
+    def misleading(self) -> set[Pair]:
+        """Pairs that say nothing about where photos stand: they are false by what was found."""
+        return {
+            pair
+            for pair, verdict in self.verdicts.items()
+            if not verdict.trusted and (verdict.refuted or self.basis == "order")
+        }
 
 
 class Mapped(NamedTuple):
@@ -76,45 +87,44 @@ def build_checked_models(
     with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
         rounds = Rounds(given, Path(scratch), config=config, options=options, on_image=on_image)
         best = by_votes(rounds, view_graph=config.view_graph)
-        basis, other = "pairs", None
+        basis: Basis = "pairs"
+        other = None
         found = orders({name for pair in given.two_views for name in pair})
-        if found and best.checked_photos() and _in_doubt(best, found, given):
+        checks = _checks(best, found, given)
+        if found and any(check is not None and check.verdict != "green" for check in checks):
             logger.info("something speaks against the model; following the order of the names")
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
                 best, other, basis = other, best, "order"
+                checks = _checks(best, found, given)
         shutil.copyfile(best.database, database)
-    checks = [each and each.check for each in best.checks]
     alternative = []
-    if other is not None and checks[0] is not None and _stands(other, beside=best, basis=basis):
+    if other is not None and checks[0] is not None and _stands(other, beside=best):
         told = _alternative(best, other, "pairs" if basis == "order" else "order")
         if told is not None:
             checks[0] = dataclasses.replace(checks[0], alternative=told)
             alternative = other.models
-    figures = MappingFigures(verdicts=best.verdicts, attempts=rounds.attempts, checks=checks)
+    figures = MappingFigures(
+        verdicts=best.verdicts, attempts=rounds.attempts, checks=checks, basis=basis
+    )
     return Mapped(best.models, figures, alternative)
 
 
-def _in_doubt(made: Round, found: list[Order], given: VerifiedPairs) -> bool:
-    """Whether something speaks against models, or photos that follow each other do not agree."""
-    if not made.is_green():
-        return True
-    inside, verified = made.checked_photos(), given.two_views.keys()
-    following = {pair for pair in neighbours(found) & verified if inside >= set(pair)}
-    return bool(following - made.explained())
+def _checks(made: Round, found: list[Order], given: VerifiedPairs) -> list[ModelCheck | None]:
+    """The checks of the models, with the neighbours in an order that do not agree with them."""
+    following = neighbours(found) & given.two_views.keys()
+
+    def with_neighbours(each: Checked) -> ModelCheck:
+        inside = {name for group in each.check.groups for name in group}
+        apart = [list(p) for p in sorted(following - each.explained) if inside >= set(p)]
+        return dataclasses.replace(each.check, apart=apart)
+
+    return [each and with_neighbours(each) for each in made.checks]
 
 
-def _stands(other: Round, *, beside: Round, basis: Basis) -> bool:
-    """Whether other models are worth showing beside the best ones, which follow `basis`.
-
-    If photos contradict the other models and not the best ones, the best ones stand alone. There is
-    one exception: a green model that follows the pairs, although photos that follow each other do
-    not agree with it. Nobody should take it for certain.
-    """
-    if not other.checked_photos():
-        return False
-    doubted = basis == "pairs" and beside.is_green()
-    return doubted or not other.contradicted() or beside.contradicted() > 0
+def _stands(other: Round, *, beside: Round) -> bool:
+    """Whether other models are worth showing: not if photos contradict these ones alone."""
+    return bool(other.checked_photos()) and (beside.contradicted() > 0 or not other.contradicted())
 
 
 def _alternative(best: Round, other: Round, basis: Basis) -> Alternative | None:

@@ -21,7 +21,7 @@ from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
-from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.pairs import ChosenMatches, Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
@@ -120,8 +120,10 @@ def reconstruct(
 
     def refine(folder: Path) -> None:
         models = read_models(mapped / SPARSE, mapped / DATABASE)
+        false = stage_files.read_mapping(mapped).misleading()
+        believed = ChosenMatches(matches, [pair for pair in matches if pair not in false])
         models, figures, order = _refined(
-            models, photos, config.refinement, options, matches, mapped / DATABASE, on_pass
+            models, photos, config.refinement, options, believed, mapped / DATABASE, on_pass
         )
         write_models(models, folder / SPARSE)
         stage_files.write_refinement(folder, figures, order)

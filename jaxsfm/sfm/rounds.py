@@ -108,10 +108,6 @@ class Round:
         """The photos in models that were checked."""
         return {name for each in self._done() for group in each.check.groups for name in group}
 
-    def is_green(self) -> bool:
-        """Whether nothing speaks against any of the models."""
-        return all(each.check.verdict == "green" for each in self._done())
-
     def at_least_as_good_as(self, other: "Round") -> bool:
         """Compare the models: first by contradictions, then by size, then by their number."""
         if bool(self.contradicted()) != bool(other.contradicted()):

@@ -14,7 +14,7 @@ from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 3
+FORMAT = 4
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 
@@ -49,6 +49,7 @@ def write_mapping(folder: Path, figures: MappingFigures) -> None:
     plain = {
         "verdicts": [[pair, dataclasses.asdict(v)] for pair, v in figures.verdicts.items()],
         "attempts": [dataclasses.asdict(attempt) for attempt in figures.attempts],
+        "basis": figures.basis,
         "checks": [check and dataclasses.asdict(check) for check in figures.checks],
     }
     (folder / FIGURES).write_text(json.dumps(plain), encoding="utf-8")
@@ -65,6 +66,7 @@ def read_mapping(folder: Path) -> MappingFigures:
         verdicts={(a, b): Verdict(**row) for (a, b), row in plain["verdicts"]},
         attempts=attempts,
         checks=[row and _check(row) for row in plain["checks"]],
+        basis=plain["basis"],
     )
 
 
@@ -74,6 +76,7 @@ def _check(row: dict) -> ModelCheck:
         contradictions=[Contradiction(**each) for each in row["contradictions"]],
         other_places=[OtherPlace(**each) for each in row["other_places"]],
         alternative=row["alternative"] and Alternative(**row["alternative"]),
+        apart=row["apart"],
     )
 
 

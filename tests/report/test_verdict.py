@@ -67,6 +67,18 @@ def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move()
     assert f"look whether {NAMES[2]} stands where the model has it, and not where" in advice
 
 
+def test_neighbours_that_disagree_are_amber_and_named():
+    verdict = model_verdict(dataclasses.replace(check_of("green"), apart=[NAMES[3:5]]))
+    head, neighbours, decisive, advice = verdict_lines([verdict])
+    assert head == "verdict          amber: two models explain these photos"
+    assert neighbours == (
+        f"neighbours       {NAMES[3]} and {NAMES[4]} follow each other, but their matches do not "
+        "agree with the model"
+    )
+    assert f"on the way from {NAMES[3]} to {NAMES[4]}" in decisive
+    assert f"look whether {NAMES[4]} stands where the model has it; if" in advice
+
+
 def test_a_red_model_points_to_the_other_one_and_to_what_speaks_against_it():
     other = dataclasses.replace(OTHER, basis="pairs", contradicted=7)
     verdict = model_verdict(dataclasses.replace(check_of("red"), alternative=other))

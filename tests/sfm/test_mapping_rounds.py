@@ -403,17 +403,48 @@ def test_a_green_model_in_which_photos_that_follow_each_other_disagree_is_not_th
     assert told.alternative.basis == "pairs" and told.alternative.elsewhere == WALK[3:]
 
 
-def test_it_is_amber_also_if_photos_contradict_the_model_that_follows_the_order(rounds):
+def test_photos_that_follow_each_other_and_disagree_make_a_model_amber(rounds):
+    """Photos contradict the model that follows the order, so it is no alternative."""
+    apart = (WALK[2], WALK[3])
+
     def check(pairs):
         if FALSE in pairs:
-            return walked(pairs, agreeing=LINKS - {(WALK[2], WALK[3])})
+            return walked(pairs, agreeing=LINKS - {apart})
         return walked(pairs, against=[FALSE], agreeing=LINKS)
 
     found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
-    assert found.models == [frozenset(WALKED)] and found.alternative == [frozenset(LINKS)]
+    assert found.models == [frozenset(WALKED)] and found.alternative == []
     (told,) = found.figures.checks
-    assert told is not None and told.verdict == "amber" and told.alternative is not None
-    assert told.alternative.basis == "order" and told.alternative.contradicted == 30
+    assert told is not None and told.verdict == "amber" and told.apart == [[*apart]]
+
+
+def test_the_model_that_follows_the_order_is_asked_for_its_neighbours_too(rounds):
+    """A link whose second geometry is wrong agrees with nothing."""
+    apart = (WALK[2], WALK[3])
+
+    def check(pairs):
+        return walked(pairs, against=[FALSE] if FALSE in pairs else [], agreeing=LINKS - {apart})
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    assert found.models == [frozenset(LINKS)] and found.figures.basis == "order"
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == "amber" and told.apart == [[*apart]]
+
+
+def test_pairs_that_were_found_to_be_false_place_no_photos(rounds):
+    """After rounds of votes, these are the refuted ones; with the order, all that are left out."""
+
+    def check(pairs):
+        bad = [FALSE] if FALSE in pairs else []
+        return walked(pairs, against=bad, agreeing=WALKED.keys() - {FALSE})
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    assert found.figures.basis == "order" and found.figures.misleading() == {FALSE}
+    turns = {A: view(), B: view(), C: view(), D: view(), ("a", "d"): view(40, 5), E: view()}
+    config = Config(checked=True, view_graph=True)
+    refuted = iter([[E], []])
+    found = rounds(lambda pairs: outcome(refuted=next(refuted)), config=config, two_views=turns)
+    assert ("a", "d") in found.dropped and found.figures.misleading() == {E}
 
 
 def test_an_amber_model_stands_alone_if_photos_contradict_the_other(rounds):
@@ -430,9 +461,8 @@ def test_an_amber_model_stands_alone_if_photos_contradict_the_other(rounds):
 
 def test_two_equal_models_are_not_two(rounds):
     def check(pairs):
-        return walked(
-            pairs, agreeing=WALKED.keys() - ({(WALK[2], WALK[3])} if FALSE in pairs else set())
-        )
+        wrong = (WALK[2], WALK[3]) if FALSE in pairs else FALSE
+        return walked(pairs, agreeing=WALKED.keys() - {wrong})
 
     found = rounds(check, two_views=WALKED, places=lambda pairs: posed(False))
     (told,) = found.figures.checks

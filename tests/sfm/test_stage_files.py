@@ -42,13 +42,14 @@ attempts = st.builds(
     initial_pair=st.none() | st.sampled_from(PAIRS),
     registered=st.lists(st.integers(0, 99), max_size=3),
 )
-two = dataclasses.replace(check_of("green"), alternative=OTHER)
+two = dataclasses.replace(check_of("green"), alternative=OTHER, apart=[NAMES[:2]])
 checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red"), two])
 mappings = st.builds(
     MappingFigures,
     verdicts=st.dictionaries(st.sampled_from(PAIRS), verdicts),
     attempts=st.lists(attempts, max_size=3),
     checks=st.lists(checks, max_size=3),
+    basis=st.sampled_from(["pairs", "order"]),
 )
 
 

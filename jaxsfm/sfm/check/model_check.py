@@ -10,7 +10,8 @@ MIN_VIEWS = 3
 """
 VerdictColour = Literal["green", "amber", "red"]
 """Green: nothing speaks against the model. Amber: another model explains the photos as well: some
-fit into the model in a second place, or another model was made. Red: groups of its photos
+fit into the model in a second place, another model was made, or photos that follow each other do
+not agree with the model. Red: groups of its photos
 contradict each other."""
 
 
@@ -79,10 +80,13 @@ class ModelCheck:
     other_places: list[OtherPlace]
     """Sorted by the photo's name."""
     alternative: Alternative | None = None
+    apart: list[list[str]] = dataclasses.field(default_factory=list)
+    """Pairs of photos that follow each other by their names and were matched, but whose matches do
+    not agree with the model. Sorted."""
 
     @property
     def verdict(self) -> VerdictColour:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        return "amber" if self.other_places or self.alternative else "green"
+        return "amber" if self.other_places or self.alternative or self.apart else "green"
