@@ -48,6 +48,7 @@ def row(method, outcome, *, position=None, models=(8, 3)):
         "images": 12,
         "models": [*models],
         "groups": [[6, 2], [3]],
+        "alternative": [],
         "outcome": outcome,
         "position": position and {"mean": position},
         "rotation_deg": position and {"mean": 1.5},
@@ -68,7 +69,8 @@ def test_the_table_ends_with_the_number_of_each_outcome_of_each_method():
     assert got["default"]["no model"] == 1
     lines = table_lines({"rows": rows, "summary": got})
     many = row("colmap", "right") | {"groups": [[4, 3, 2, 2, 1]]}
-    assert cells(many)["groups"] == "4+3+2+2+..."
+    assert cells(many)["groups"] == "4+3+2+2+..." and "other model" not in cells(many)
+    assert cells(many | {"alternative": [12]})["other model"] == "12"
     words = "synthetic-box colmap 400 1 8/12 2 6+2 0.5000 1.500 5.00% 2.0 wrong, not noticed"
     assert lines[1].split() == words.split()
     assert "synthetic-box default: no model" in lines
