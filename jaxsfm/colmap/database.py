@@ -150,6 +150,11 @@ def write_database(
                 db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
 
 
+def _ids(db: pycolmap.Database) -> dict[str, int]:
+    """The numbers of the images, by name."""
+    return {image.name: image.image_id for image in db.read_all_images()}
+
+
 def read_matches(
     path: Path, names: tuple[str, str], *, verified: bool
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -164,7 +169,7 @@ def read_matches(
       the top-left one is (0, 0).
     """
     with pycolmap.Database.open(path) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
+        ids = _ids(db)
         a, b = ids[names[0]], ids[names[1]]
         if not verified:
             matches = db.read_matches(a, b)
@@ -187,7 +192,7 @@ def read_images(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:
 def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
     """Delete the verified geometries of pairs from a database. Their matches stay."""
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        ids = {image.name: image.image_id for image in db.read_all_images()}
+        ids = _ids(db)
         for a, b in pairs:
             db.delete_two_view_geometry(ids[a], ids[b])
 
@@ -198,7 +203,7 @@ def keep_outliers(path: Path, pairs: Iterable[Pair]) -> None:
     The geometries of these pairs are deleted. COLMAP's verification then looks for another one.
     """
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        ids = {image.name: image.image_id for image in db.read_all_images()}
+        ids = _ids(db)
         for names in pairs:
             a, b = (ids[name] for name in names)
             matches = np.asarray(db.read_matches(a, b)).reshape(-1, 2)
@@ -212,7 +217,7 @@ def keep_outliers(path: Path, pairs: Iterable[Pair]) -> None:
 
 
 def copy_geometries(source: Path, target: Path, pairs: Iterable[Pair]) -> None:
-    """Replace the matches and geometries of pairs in a database by those of another one.
+    """Replace the verified geometries of pairs by those of another database. Their matches stay.
 
     Both have the same images and keypoints. A pair without a geometry in `source` loses its own.
     """
@@ -221,12 +226,9 @@ def copy_geometries(source: Path, target: Path, pairs: Iterable[Pair]) -> None:
         pycolmap.Database.open(target) as db,
         pycolmap.DatabaseTransaction(db),
     ):
-        ids = {image.name: image.image_id for image in db.read_all_images()}
+        ids = _ids(db)
         for names in pairs:
             a, b = (ids[name] for name in names)
             db.delete_two_view_geometry(a, b)
-            db.delete_matches(a, b)
-            if given.exists_matches(a, b):
-                db.write_matches(a, b, given.read_matches(a, b))
             if given.exists_two_view_geometry(a, b):
                 db.write_two_view_geometry(a, b, given.read_two_view_geometry(a, b))

@@ -64,7 +64,10 @@ def test_geometries_are_copied_for_the_pairs_that_are_named(database, tmp_path):
     first = inliers(database)
     keep_outliers(other, PAIRS[:2])
     verify(other, VerificationOptions(threads=1))
+    every = read_matches(database, PAIRS[0], verified=False)
     copy_geometries(other, database, PAIRS[:1])
+    for kept, before in zip(read_matches(database, PAIRS[0], verified=False), every, strict=True):
+        np.testing.assert_array_equal(kept, before)
     assert inliers(database) == first | {PAIRS[0]: inliers(other)[PAIRS[0]]}
     at = [read_matches(path, PAIRS[0], verified=True)[0] for path in (database, other)]
     np.testing.assert_array_equal(*at)
