@@ -6,14 +6,14 @@ from pathlib import Path
 import pycolmap
 
 from jaxsfm.colmap.mapper import MapOptions, build_models
-from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
+from jaxsfm.colmap.two_views import read_two_views, verify
 
 
 def verified(path: Path, options: MapOptions):
     """Verify a database; returns its verified pairs."""
     verify(
         path,
-        VerificationOptions(seed=options.seed, threads=options.threads, scale=options.scale),
+        options.verification(),
     )
     return read_two_views(path)
 

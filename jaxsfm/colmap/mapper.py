@@ -13,7 +13,7 @@ import pycolmap
 
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.native import native
-from jaxsfm.colmap.two_views import TwoView
+from jaxsfm.colmap.two_views import TwoView, VerificationOptions
 from jaxsfm.io.pairs import Pair, component_of
 from jaxsfm.options import Mapper
 
@@ -36,6 +36,15 @@ class MapOptions:
     is repeatable to the last byte."""
     scale: float = 1.0
     """Original pixels per working pixel. COLMAP's pixel thresholds are multiplied by it."""
+
+    def verification(self, *, relative_poses: bool = True) -> VerificationOptions:
+        """The settings of the two-view verification before this mapping."""
+        return VerificationOptions(
+            seed=self.seed,
+            threads=self.threads,
+            scale=self.scale,
+            relative_poses=relative_poses,
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

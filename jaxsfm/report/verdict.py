@@ -17,7 +17,7 @@ from jaxsfm.sfm.check.model_check import (
 )
 
 MAX_FINDINGS = 3
-"""The number of contradictions, and of second places, that the summary lists for each model."""
+"""The number of findings of each kind that the summary lists for each model."""
 MEANING: dict[VerdictColour, str] = {
     "green": "no photo contradicts the model",
     "amber": "two models explain these photos",
@@ -54,7 +54,7 @@ class ModelVerdict(NamedTuple):
     neighbours: list[Finding]
     """Photos that follow each other and do not agree with the model."""
     decisive: str
-    """Photos that would decide between two places; empty if no photo has two."""
+    """Photos that would decide between two places or two models; empty if there is no choice."""
     advice: str
     """What to do next; empty for a model that nothing speaks against."""
 
@@ -96,8 +96,8 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
             Finding(_against(each), each.images, each.others) for each in contradictions
         ],
         places=[Finding(_fits(each), [each.image], each.pairs) for each in places],
-        neighbours=[Finding(_apart(pair), pair[:1], pair[1:]) for pair in check.apart],
         alternatives=[_other_model(check.alternative)] if check.alternative else [],
+        neighbours=[Finding(_apart(pair), pair[:1], pair[1:]) for pair in check.apart],
         decisive=_decides(check, places),
         advice=_advice(check, places),
     )

@@ -21,6 +21,7 @@ from jaxsfm.sfm.rounds import (
     Round,
     Rounds,
     VerifiedPairs,
+    best_of,
 )
 from jaxsfm.sfm.view_graph import (
     TOLERANCE_DEG,
@@ -48,9 +49,10 @@ def by_votes(rounds: Rounds, *, view_graph: bool) -> Round:
     photo contradicts another.
     """
 
-    def vote(geometries: Mapping[Pair, PairGeometry], refuted: bool) -> dict[Pair, Verdict]:
+    def judge(geometries: Mapping[Pair, PairGeometry], refuted: bool) -> dict[Pair, Verdict]:
         return trusted_pairs(geometries, strict=refuted) if view_graph else {}
 
+    vote = Hypothesis("pairs", judge)
     best = made = rounds.make(vote, NOTHING_REFUTED)
     for _ in range(MAX_ROUNDS - 1):
         refuted = _outvoted(rounds, made)
@@ -60,8 +62,7 @@ def by_votes(rounds: Rounds, *, view_graph: bool) -> Round:
         made = rounds.make(vote, refuted)
         if not made.checked_photos():  # these pairs were all that held photos together
             break
-        if made.at_least_as_good_as(best):
-            best = made
+        best = best_of([best, made])
     if (back := best.refuted.pairs.keys() & best.explained()) and not best.contradicted():
         left = {pair: why for pair, why in best.refuted.pairs.items() if pair not in back}
         again = rounds.make(vote, Refuted(left, best.refuted.first))
@@ -84,37 +85,42 @@ def _outvoted(rounds: Rounds, made: Round) -> Refuted:
 def by_order(rounds: Rounds, found: list[Order]) -> Round:
     """The best round of the hypothesis that photos taken one after the other belong together.
 
-    The fewest pairs that follow the order make a first model. All pairs that agree with it are
-    added for a second one. If its photos contradict each other, both are made again.
+    The fewest pairs that follow the order, the *links*, make a first model. All pairs that agree
+    with it are added for a second one. Both are made again without the geometries of links that
+    join photos which contradict each other, or that turn the camera suddenly.
     """
 
     def following(agreeing: set[Pair]) -> Hypothesis:
-        def verdicts(geometries: Mapping[Pair, PairGeometry], _: bool) -> dict[Pair, Verdict]:
+        def judge(geometries: Mapping[Pair, PairGeometry], _: bool) -> dict[Pair, Verdict]:
             strength = strengths(geometries)
             taken = follow(found, strength) | (agreeing & strength.keys())
             return {pair: _ordered(strength[pair], pair in taken) for pair in strength}
 
-        return verdicts
+        return Hypothesis("order", judge)
 
-    refuted, best = NOTHING_REFUTED, None
-    for _ in range(MAX_ROUNDS // 2):
+    refuted, tried = NOTHING_REFUTED, []
+    while True:
         chain = rounds.make(following(set()), refuted)
         grown = rounds.make(following(chain.explained()), refuted)
-        for made in (chain, grown):
-            if best is None or made.at_least_as_good_as(best):
-                best = made
-        links = [pair for pair, verdict in chain.verdicts.items() if verdict.trusted]
-        against = grown.joining_opposed_groups(links)
-        sudden = rounds.with_seconds(_sudden(links, rounds.given) - refuted.first)
-        if not against and not sudden:
+        tried += [chain, grown]
+        if len(tried) >= MAX_ROUNDS:
             break
-        refuted = rounds.without(refuted, against)
-        refuted = refuted._replace(first=refuted.first | (sudden - against.keys()))
-    assert best is not None
-    return best
+        links = {pair for pair, verdict in chain.verdicts.items() if verdict.trusted}
+        refuted = _without_links(rounds, grown, links)
+        if refuted == grown.refuted:
+            break
+    return best_of(tried)
 
 
-def _sudden(links: list[Pair], given: VerifiedPairs) -> set[Pair]:
+def _without_links(rounds: Rounds, grown: Round, links: set[Pair]) -> Refuted:
+    """What is refuted after two rounds of `by_order`."""
+    against = grown.joining_opposed_groups(links)
+    refuted = rounds.without(grown.refuted, against)
+    sudden = _sudden(links, rounds.given) - against.keys() - refuted.first
+    return refuted._replace(first=refuted.first | rounds.with_seconds(sudden))
+
+
+def _sudden(links: set[Pair], given: VerifiedPairs) -> set[Pair]:
     """Links whose geometry turns the camera much further than the others do.
 
     Photos that follow each other at the corner of a building with equal walls show both walls. The

@@ -9,7 +9,6 @@ stand, both models are returned.
 
 import dataclasses
 import logging
-import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -48,7 +47,7 @@ class MappingFigures:
     """What the models follow."""
 
     def misleading(self) -> set[Pair]:
-        """Pairs that say nothing about where photos stand: they are false by what was found."""
+        """Pairs that do not say where photos stand, because the rounds found them to be false."""
         return {
             pair
             for pair, verdict in self.verdicts.items()
@@ -85,27 +84,27 @@ def build_checked_models(
       on_image: called for every image that the mapper registers.
     """
     with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
-        rounds = Rounds(given, Path(scratch), config=config, options=options, on_image=on_image)
-        best = by_votes(rounds, view_graph=config.view_graph)
-        basis: Basis = "pairs"
-        other = None
+        rounds = Rounds(
+            given, database, Path(scratch), config=config, options=options, on_image=on_image
+        )
+        best, other = by_votes(rounds, view_graph=config.view_graph), None
         found = orders({name for pair in given.two_views for name in pair})
         checks = _checks(best, found, given)
         if found and any(check is not None and check.verdict != "green" for check in checks):
             logger.info("something speaks against the model; following the order of the names")
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
-                best, other, basis = other, best, "order"
+                best, other = other, best
                 checks = _checks(best, found, given)
-        shutil.copyfile(best.database, database)
+        rounds.go_back_to(best)
     alternative = []
     if other is not None and checks[0] is not None and _stands(other, beside=best):
-        told = _alternative(best, other, "pairs" if basis == "order" else "order")
+        told = _alternative(best, other)
         if told is not None:
             checks[0] = dataclasses.replace(checks[0], alternative=told)
             alternative = other.models
     figures = MappingFigures(
-        verdicts=best.verdicts, attempts=rounds.attempts, checks=checks, basis=basis
+        verdicts=best.verdicts, attempts=rounds.attempts, checks=checks, basis=best.basis
     )
     return Mapped(best.models, figures, alternative)
 
@@ -127,7 +126,7 @@ def _stands(other: Round, *, beside: Round) -> bool:
     return bool(other.checked_photos()) and (beside.contradicted() > 0 or not other.contradicted())
 
 
-def _alternative(best: Round, other: Round, basis: Basis) -> Alternative | None:
+def _alternative(best: Round, other: Round) -> Alternative | None:
     """What an alternative says of the best model; None if the two agree."""
     ours, theirs = (model_poses(made.models[0]) for made in (best, other))
     common = {name: pose for name, pose in ours.items() if name in theirs}
@@ -137,7 +136,7 @@ def _alternative(best: Round, other: Round, basis: Basis) -> Alternative | None:
     if len(same) >= SAME_SHARE * len(common):
         return None
     return Alternative(
-        basis=basis,
+        basis=other.basis,
         images=len(theirs),
         elsewhere=sorted(name for group in elsewhere for name in group),
         contradicted=other.contradicted(),

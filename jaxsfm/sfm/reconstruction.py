@@ -17,7 +17,7 @@ from jaxsfm.colmap.database import read_images, write_database
 from jaxsfm.colmap.intrinsics import KnownCameras, check_fits
 from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
-from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
+from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageError, ImageFile
@@ -120,7 +120,7 @@ def reconstruct(
 
     def refine(folder: Path) -> None:
         models = read_models(mapped / SPARSE, mapped / DATABASE)
-        false = stage_files.read_mapping(mapped).misleading()
+        false = mapping.misleading()
         believed = ChosenMatches(matches, [pair for pair in matches if pair not in false])
         models, figures, order = _refined(
             models, photos, config.refinement, options, believed, mapped / DATABASE, on_pass
@@ -139,11 +139,11 @@ def reconstruct(
         checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
         key = digest(key, dataclasses.asdict(options), checking)
         mapped = stages.stage("mapped", key, build)
+        mapping = stage_files.read_mapping(mapped)
         on_mapped()
         key = digest(key, config.refinement and dataclasses.asdict(config.refinement))
         refined = stages.stage("refined", key, refine)
         shutil.copyfile(mapped / DATABASE, database)
-        mapping = stage_files.read_mapping(mapped)
         refinement, order = stage_files.read_refinement(refined)
         models = read_models(refined / SPARSE, database)
         if config.refinement is not None and None in refinement:
@@ -168,12 +168,7 @@ def _verified(database: Path, options: MapOptions, view_graph: bool) -> Verifica
     """Verify the matches of a database."""
     verify(
         database,
-        VerificationOptions(
-            seed=options.seed,
-            threads=options.threads,
-            scale=options.scale,
-            relative_poses=view_graph,
-        ),
+        options.verification(relative_poses=view_graph),
     )
     two_views = read_two_views(database)
     return VerificationFigures(

@@ -1,9 +1,10 @@
-"""One round of mapping: the pairs that a hypothesis trusts, COLMAP's mapper and the check.
+"""Rounds of mapping: the pairs that a hypothesis trusts, COLMAP's mapper and the check.
 
 A hypothesis says which pairs are right. Each of its rounds has fewer pairs than the one before: the
 check has refuted those that joined photos that contradict each other.
 """
 
+import functools
 import logging
 import shutil
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -14,19 +15,13 @@ from typing import TYPE_CHECKING, NamedTuple
 from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
 from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.two_views import (
-    PairGeometry,
-    TwoView,
-    VerificationOptions,
-    read_two_views,
-    verify,
-)
+from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model
-from jaxsfm.sfm.check.model_check import Contradiction
+from jaxsfm.sfm.check.model_check import Basis, Contradiction
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.view_graph import Verdict
 
@@ -38,9 +33,14 @@ FEWER = 0.1
 
 logger = logging.getLogger("jaxsfm")
 
-Hypothesis = Callable[[Mapping[Pair, PairGeometry], bool], dict[Pair, Verdict]]
-"""The verdicts on pairs, from their geometries. The second argument says whether pairs were refuted
-in earlier rounds. Pairs without a verdict are trusted."""
+
+class Hypothesis(NamedTuple):
+    """Which pairs are right."""
+
+    basis: Basis
+    judge: Callable[[Mapping[Pair, PairGeometry], bool], dict[Pair, Verdict]]
+    """The verdicts on pairs, from their geometries. The second argument says whether pairs were
+    refuted in earlier rounds. Pairs without a verdict are trusted."""
 
 
 class VerifiedPairs(NamedTuple):
@@ -71,12 +71,12 @@ NOTHING_REFUTED = Refuted({}, frozenset())
 class Round:
     """The models of one round, and what their checks say."""
 
+    basis: Basis
+    """What they follow."""
     models: "list[pycolmap.Reconstruction]"
     verdicts: dict[Pair, Verdict]
     checks: list[Checked | None]
     """For each model; None where it was not checked."""
-    database: Path
-    """With the pairs that the models were made from."""
     refuted: Refuted
     """What was known before this round."""
 
@@ -118,43 +118,71 @@ class Round:
         return self.contradicted() <= other.contradicted()
 
 
+def best_of(made: Iterable[Round]) -> Round:
+    """The best of some rounds; of rounds that are equally good, the last one."""
+    return functools.reduce(
+        lambda best, each: each if each.at_least_as_good_as(best) else best, made
+    )
+
+
 class Rounds:
-    """Makes rounds from verified pairs. It keeps the databases of all rounds in a folder."""
+    """Makes rounds from verified pairs.
+
+    `database` has the pairs of the round that came last. The second geometries are in the folder
+    `scratch`.
+    """
 
     def __init__(
         self,
         given: VerifiedPairs,
-        folder: Path,
+        database: Path,
+        scratch: Path,
         *,
         config: Config,
         options: MapOptions,
         on_image: Callable[[], None] = lambda: None,
     ) -> None:
-        self.given, self._folder = given, folder
-        self._second_database = folder / "second.db"
+        self.given, self._database = given, database
+        self._second_database = scratch / "second.db"
         self._config, self._options, self._on_image = config, options, on_image
         self.attempts: list[Attempt] = []
         """All runs of the mapper, in all rounds."""
-        self._seconds: dict[Pair, TwoView | None] = {}
-        """The second geometries that were looked for; None: there is none."""
+        self._asked: set[Pair] = set()
+        """Pairs whose second geometry was looked for."""
+        self._seconds: dict[Pair, TwoView] = {}
+        """The second geometries that were found."""
 
     def make(self, hypothesis: Hypothesis, refuted: Refuted) -> Round:
         """Map the pairs that a hypothesis trusts, and check the models."""
         views = {pair: v for pair, v in self.given.two_views.items() if pair not in refuted.pairs}
-        for pair in refuted.first:
-            views[pair] = self._second(pair)
+        views |= {pair: self._seconds[pair] for pair in refuted.first}
         known = bool(refuted.pairs or refuted.first)
-        verdicts = hypothesis({pair: view.geometry for pair, view in views.items()}, known)
-        trusted = {p: v for p, v in views.items() if p not in verdicts or verdicts[p].trusted}
+        verdicts = hypothesis.judge({pair: view.geometry for pair, view in views.items()}, known)
         verdicts |= {pair: _refuted(each) for pair, each in refuted.pairs.items()}
-        database = self._folder / f"round{len(list(self._folder.glob('round*')))}.db"
-        shutil.copyfile(self.given.database, database)
-        if refuted.first:
-            copy_geometries(self._second_database, database, sorted(refuted.first))
-        drop_pairs(database, sorted(self.given.two_views.keys() - trusted.keys()))
-        models, attempts = build_models(database, trusted, self._options, on_image=self._on_image)
+        dropped = self._write_pairs(verdicts, refuted)
+        trusted = {pair: view for pair, view in views.items() if pair not in dropped}
+        models, attempts = build_models(
+            self._database, trusted, self._options, on_image=self._on_image
+        )
         self.attempts += attempts
-        return Round(models, verdicts, self._check(models, refuted), database, refuted)
+        checks = self._check(models, refuted)
+        self._last = Round(hypothesis.basis, models, verdicts, checks, refuted)
+        return self._last
+
+    def go_back_to(self, made: Round) -> None:
+        """Make the database that of a round."""
+        if made is not self._last:
+            self._write_pairs(made.verdicts, made.refuted)
+            self._last = made
+
+    def _write_pairs(self, verdicts: Mapping[Pair, Verdict], refuted: Refuted) -> set[Pair]:
+        """Write the database without the pairs that are not trusted; returns these."""
+        dropped = {pair for pair, verdict in verdicts.items() if not verdict.trusted}
+        shutil.copyfile(self.given.database, self._database)
+        if refuted.first:
+            copy_geometries(self._second_database, self._database, sorted(refuted.first))
+        drop_pairs(self._database, sorted(dropped))
+        return dropped
 
     def without(self, before: Refuted, against: Mapping[Pair, Contradiction]) -> Refuted:
         """Refute pairs: the first geometry of a pair, and the whole pair the second time.
@@ -167,31 +195,20 @@ class Rounds:
         return Refuted({**before.pairs, **gone}, (before.first | again) - gone.keys())
 
     def with_seconds(self, pairs: Collection[Pair]) -> set[Pair]:
-        """Those of the pairs that have a second geometry."""
-        self._find_seconds(set(pairs))
-        return {pair for pair in pairs if self._seconds[pair] is not None}
+        """Those of the pairs that have a second geometry.
 
-    def _second(self, pair: Pair) -> TwoView:
-        found = self._seconds[pair]
-        assert found is not None
-        return found
-
-    def _find_seconds(self, pairs: set[Pair]) -> None:
-        """Look for second geometries among the matches that do not agree with the first."""
-        new, path = sorted(pairs - self._seconds.keys()), self._second_database
-        if not new:
-            return
-        if not path.exists():
-            shutil.copyfile(self.given.database, path)
-        keep_outliers(path, new)
-        verify(
-            path,
-            VerificationOptions(
-                seed=self._options.seed, threads=self._options.threads, scale=self._options.scale
-            ),
-        )
-        found = read_two_views(path)
-        self._seconds |= {pair: found.get(pair) for pair in new}
+        It is looked for among the matches that do not agree with the first one.
+        """
+        new, path = sorted(set(pairs) - self._asked), self._second_database
+        if new:
+            if not path.exists():
+                shutil.copyfile(self.given.database, path)
+            keep_outliers(path, new)
+            verify(path, self._options.verification())
+            found = read_two_views(path)
+            self._seconds |= {pair: found[pair] for pair in new if pair in found}
+            self._asked |= set(new)
+        return set(pairs) & self._seconds.keys()
 
     def _check(
         self, models: "list[pycolmap.Reconstruction]", refuted: Refuted

@@ -9,10 +9,9 @@ MIN_VIEWS = 3
 """A model of two photos is not checked: nothing in it can contradict the pair that it is made of.
 """
 VerdictColour = Literal["green", "amber", "red"]
-"""Green: nothing speaks against the model. Amber: another model explains the photos as well: some
-fit into the model in a second place, another model was made, or photos that follow each other do
-not agree with the model. Red: groups of its photos
-contradict each other."""
+"""Green: nothing speaks against the model. Amber: another model may explain the photos as well.
+Some fit into the model in a second place, another model was made, or photos that follow each other
+do not agree with the model. Red: groups of its photos contradict each other."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
