@@ -127,13 +127,15 @@ def _taken_out(refinement: Sequence[RefinementFigures | None]) -> dict[str, str]
     """Why refinement took photos out of a model, by name."""
     return {
         at.name: (
-            f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
+            f"refinement found a place for it, but {at.doubt}"
+            if at.doubt
+            else f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
             f"{at.candidates} points that it should show, and only {at.held} points hold it in "
             "the model"
         )
         for each in refinement
         for at in (each.placed if each else ())
-        if at.held is not None
+        if at.doubt or at.held is not None
     }
 
 

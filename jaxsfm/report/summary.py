@@ -83,7 +83,7 @@ def refinement_lines(refinement: RefinementFigures) -> list[str]:
     ]
     for at in refinement.placed:
         name, px = shown_name(at.name), at.octave_px
-        if px:
+        if px and not at.doubt:
             lines.append(
                 f"placed           {name}: {at.agreed} points agree at "
                 f"{'full' if px == 1 else f'1/{px}'} size, with a median error of "

@@ -20,7 +20,7 @@ MAX_FINDINGS = 3
 """The number of findings of each kind that the summary lists for each model."""
 MEANING: dict[VerdictColour, str] = {
     "green": "no photo contradicts the model",
-    "amber": "two models explain these photos",
+    "amber": "two models may explain these photos",
     "red": "photos contradict each other",
 }
 FOLLOWS: dict[Basis, str] = {

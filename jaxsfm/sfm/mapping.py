@@ -22,7 +22,7 @@ from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
 from jaxsfm.sfm.check.model_check import Alternative, Basis, ModelCheck
 from jaxsfm.sfm.hypotheses import by_order, by_votes
-from jaxsfm.sfm.photo_order import Order, neighbours, orders
+from jaxsfm.sfm.photo_order import neighbours, orders
 from jaxsfm.sfm.rounds import Round, Rounds, VerifiedPairs
 from jaxsfm.sfm.view_graph import Verdict
 
@@ -89,13 +89,13 @@ def build_checked_models(
         )
         best, other = by_votes(rounds, view_graph=config.view_graph), None
         found = orders({name for pair in given.two_views for name in pair})
-        checks = _checks(best, found, given)
+        checks = _checks(best, given)
         if found and any(check is not None and check.verdict != "green" for check in checks):
             logger.info("something speaks against the model; following the order of the names")
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
                 best, other = other, best
-                checks = _checks(best, found, given)
+                checks = _checks(best, given)
         rounds.go_back_to(best)
     alternative = []
     if other is not None and checks[0] is not None and _stands(other, beside=best):
@@ -109,9 +109,9 @@ def build_checked_models(
     return Mapped(best.models, figures, alternative)
 
 
-def _checks(made: Round, found: list[Order], given: VerifiedPairs) -> list[ModelCheck | None]:
+def _checks(made: Round, given: VerifiedPairs) -> list[ModelCheck | None]:
     """The checks of the models, with the neighbours in an order that do not agree with them."""
-    following = neighbours(found) & given.two_views.keys()
+    following = neighbours(given.two_views.keys())
 
     def with_neighbours(each: Checked) -> ModelCheck:
         inside = {name for group in each.check.groups for name in group}

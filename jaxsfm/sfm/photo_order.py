@@ -8,7 +8,7 @@ structures", use the times of photos in the same way.
 
 import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from statistics import mode
 
 from scipy.cluster.hierarchy import DisjointSet
@@ -18,7 +18,7 @@ from jaxsfm.io.pairs import Pair, make_pair
 EQUAL_STEPS = 0.5
 """Numbers are those of a sequence if so many of their steps are equal: some photos may be missing,
 but the identifiers of a photo site have no equal steps."""
-MIN_PHOTOS = 5
+MIN_NUMBERED = 5
 """Fewer photos have no order worth following."""
 
 Order = list[str]
@@ -39,7 +39,7 @@ def orders(names: Iterable[str]) -> list[Order]:
     for numbered in rows.values():
         numbers = sorted(numbered)
         steps = [after - before for before, after in itertools.pairwise(numbers)]
-        if len(numbers) >= MIN_PHOTOS and steps.count(mode(steps)) >= EQUAL_STEPS * len(steps):
+        if len(numbers) >= MIN_NUMBERED and steps.count(mode(steps)) >= EQUAL_STEPS * len(steps):
             found.append([numbered[number] for number in numbers])
     return found
 
@@ -68,6 +68,7 @@ def follow(found: Iterable[Order], pairs: Mapping[Pair, float]) -> set[Pair]:
     return taken
 
 
-def neighbours(found: Iterable[Order]) -> set[Pair]:
-    """The pairs of photos that follow each other."""
-    return {make_pair(a, b) for order in found for a, b in itertools.pairwise(order)}
+def neighbours(pairs: Collection[Pair]) -> set[Pair]:
+    """Those of the pairs whose photos follow each other in the orders of all their photos."""
+    found = orders({name for pair in pairs for name in pair})
+    return {make_pair(a, b) for order in found for a, b in itertools.pairwise(order)} & {*pairs}

@@ -6,21 +6,20 @@ Each stage reads the files of the one before. So a stage whose files exist from 
 """
 
 import dataclasses
-import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.database import read_images, write_database
+from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.intrinsics import KnownCameras, check_fits
-from jaxsfm.colmap.mapper import MapOptions, registered
-from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
+from jaxsfm.colmap.mapper import MapOptions
+from jaxsfm.colmap.model_folders import read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import ChosenMatches, Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
@@ -29,15 +28,14 @@ from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.check.check_model import CHECKED_BY
 from jaxsfm.sfm.mapping import MappingFigures, VerifiedPairs, build_checked_models
-from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
-from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
+from jaxsfm.sfm.refine.passes import RefinementFigures
+from jaxsfm.sfm.refined_models import Believed, refine_models
 from jaxsfm.sfm.stage_files import VerificationFigures
 
 if TYPE_CHECKING:
     import pycolmap
 
 DATABASE, SPARSE, ALTERNATIVE = "database.db", "sparse", "alternative"
-logger = logging.getLogger("jaxsfm")
 
 
 class StageCache(NamedTuple):
@@ -119,14 +117,18 @@ def reconstruct(
         stage_files.write_mapping(folder, made.figures)
 
     def refine(folder: Path) -> None:
-        models = read_models(mapped / SPARSE, mapped / DATABASE)
         false = mapping.misleading()
         believed = ChosenMatches(matches, [pair for pair in matches if pair not in false])
-        models, figures, order = _refined(
-            models, photos, config.refinement, options, believed, mapped / DATABASE, on_pass
+        made = refine_models(
+            read_models(mapped / SPARSE, mapped / DATABASE),
+            photos,
+            Believed(mapped / DATABASE, believed, verification.verified.keys() - false),
+            config=config,
+            options=options,
+            on_pass=on_pass,
         )
-        write_models(models, folder / SPARSE)
-        stage_files.write_refinement(folder, figures, order)
+        write_models(made.models, folder / SPARSE)
+        stage_files.write_refinement(folder, made.figures, made.order)
 
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         stages, key = kept or (WorkFolder(Path(scratch), {}), "")
@@ -138,6 +140,7 @@ def reconstruct(
         aligning = config.refinement or Refinement()
         checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
         key = digest(key, dataclasses.asdict(options), checking)
+        verification = stage_files.read_verification(verified)
         mapped = stages.stage("mapped", key, build)
         mapping = stage_files.read_mapping(mapped)
         on_mapped()
@@ -149,7 +152,7 @@ def reconstruct(
         if config.refinement is not None and None in refinement:
             stages.forget_stage("refined")  # a photo could not be read; perhaps it can next time
         return Reconstructed(
-            verification=stage_files.read_verification(verified),
+            verification=verification,
             mapping=dataclasses.replace(mapping, checks=[mapping.checks[k] for k in order]),
             models=models,
             alternative=read_models(mapped / ALTERNATIVE, database),
@@ -175,54 +178,3 @@ def _verified(database: Path, options: MapOptions, view_graph: bool) -> Verifica
         verified={pair: view.geometry.num_inliers for pair, view in two_views.items()},
         angles={pair: view.tri_angle_deg for pair, view in two_views.items()},
     )
-
-
-def _refined(
-    models: "list[pycolmap.Reconstruction]",
-    photos: Photos,
-    refinement: Refinement | None,
-    options: MapOptions,
-    matches: Mapping[Pair, PairResult],
-    database: Path,
-    on_pass: Callable[[], None],
-) -> "tuple[list[pycolmap.Reconstruction], list[RefinementFigures | None], list[int]]":
-    """Refine the models, if asked for, and colour their points.
-
-    They are refined one after the other, each with the unmapped images that none before took.
-
-    Args:
-      database: of all images, with those that are in no model.
-
-    Returns:
-      the models, the one with most images first; what was done to each; for each, its index among
-      the given models.
-    """
-    cameras = read_images(database)
-    mapped = {name for model in models for name in registered(model)}
-    unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
-    evidence = Evidence(matches, unmapped, options.seed)
-    refined, figures = [], []
-    for model in models:
-        new, done = model, None
-        try:
-            if refinement is not None:
-                new, done = refine_model(
-                    model,
-                    photos.gray,
-                    refinement=refinement,
-                    refine_intrinsics=options.refine_intrinsics,
-                    evidence=evidence,
-                    threads=options.threads,
-                    on_pass=on_pass,
-                )
-        except ImageError as error:  # a photo was deleted since; the mapper's model remains
-            logger.warning("no refinement: %s", error)
-        left = [image for image in evidence.unmapped if image.name not in registered(new)]
-        evidence = evidence._replace(unmapped=left)
-        refined.append(new)
-        figures.append(done)
-    # Refinement adds and removes images: the first model is again the one with most.
-    order = sorted(range(len(refined)), key=lambda k: -refined[k].num_reg_images())
-    for model in refined:
-        colour_points(model, photos.rgb)
-    return [refined[k] for k in order], [figures[k] for k in order], order

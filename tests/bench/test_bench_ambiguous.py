@@ -127,11 +127,11 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     assert rows[1]["outcome"] == "right"  # the room of the demo does not repeat itself
 
     methods = ["default", "colmap", "colmap-global"]
-    assert main([*args, "--sets", "synthetic-box", "--methods", ",".join(methods)]) == 0
+    assert main([*args, "--sets", "synthetic-street", "--methods", ",".join(methods)]) == 0
     rows = json.loads(out.read_text())["rows"]
     assert [row["method"] for row in rows] == methods
     for row in rows:
-        assert row["images"] == 20 and row["outcome"] in OUTCOMES and row["size"] == 240
+        assert row["images"] == 12 and row["outcome"] in OUTCOMES and row["size"] == 240
         # A group is a part of a model, and COLMAP has nothing to say against its models.
         assert all(
             sum(own) <= count for own, count in zip(row["groups"], row["models"], strict=False)
@@ -140,12 +140,12 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     text = capsys.readouterr().out
     assert "wrong, not noticed" in text
 
-    work = tmp_path / "work" / "synthetic-box" / "240" / "seed0"
-    assert len(list((work / "scene" / "images").glob("*.png"))) == 20
+    work = tmp_path / "work" / "synthetic-street" / "240" / "seed0"
+    assert len(list((work / "scene" / "images").glob("*.png"))) == 12
     own, taken = (_files(work / method / "matches") for method in ("default", "colmap"))
     assert own == taken and own
     before = {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}
-    assert main([*args, "--sets", "synthetic-box", "--methods", "default"]) == 0
+    assert main([*args, "--sets", "synthetic-street", "--methods", "default"]) == 0
     again = json.loads(out.read_text())["rows"]
     assert [each["groups"] for each in again] == [rows[0]["groups"]]
     assert before == {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}

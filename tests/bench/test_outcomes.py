@@ -190,7 +190,7 @@ def test_a_run_doubts_its_model_when_its_verdict_is_amber_or_red():
         return cast(RunReport, SimpleNamespace(refinement=figures, verdict=verdict))
 
     assert doubt(report("green")) == ""
-    for colour, words in (("amber", "two models explain"), ("red", "contradict each other")):
+    for colour, words in (("amber", "two models may explain"), ("red", "contradict each other")):
         assert doubt(report(colour)).startswith(f"{colour}: ") and words in doubt(report(colour))
         assert (
             doubt(report(colour, accepted=False))

@@ -39,8 +39,8 @@ def test_green_is_one_line_for_any_number_of_models(report):
 def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(report):
     head, place, decisive, advice = lines(report, "amber")
     assert head == (
-        "verdict          amber: two models explain these photos; 1 photo fits into the model in a "
-        "second place"
+        "verdict          amber: two models may explain these photos; 1 photo fits into the model "
+        "in a second place"
     )
     others = f"{NAMES[1]}, {NAMES[2]}, {NAMES[3]} and 5 more"
     assert place == (
@@ -58,7 +58,7 @@ def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move()
     verdict = model_verdict(dataclasses.replace(check_of("green"), alternative=OTHER))
     assert verdict.colour == "amber" and not verdict.places
     head, other, decisive, advice = verdict_lines([verdict])
-    assert head == "verdict          amber: two models explain these photos"
+    assert head == "verdict          amber: two models may explain these photos"
     assert other == (
         "other model      alternative/0 follows the order of the photos' names, and the model "
         f"follows most of the pairs: 2 photos have another place there ({NAMES[2]}, {NAMES[3]})"
@@ -70,7 +70,7 @@ def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move()
 def test_neighbours_that_disagree_are_amber_and_named():
     verdict = model_verdict(dataclasses.replace(check_of("green"), apart=[NAMES[3:5]]))
     head, neighbours, decisive, advice = verdict_lines([verdict])
-    assert head == "verdict          amber: two models explain these photos"
+    assert head == "verdict          amber: two models may explain these photos"
     assert neighbours == (
         f"neighbours       {NAMES[3]} and {NAMES[4]} follow each other, but their matches do not "
         "agree with the model"

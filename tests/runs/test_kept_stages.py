@@ -29,7 +29,7 @@ def counted(monkeypatch) -> dict[str, int]:
     count(WorkFolder, "save_matches", "match")
     count(reconstruction, "verify", "verify")
     count(reconstruction, "build_checked_models", "map")
-    count(reconstruction, "_refined", "refine")
+    count(reconstruction, "refine_models", "refine")
     return counts
 
 
@@ -104,11 +104,12 @@ def test_a_refinement_that_a_lost_photo_prevented_is_tried_again(scene, tmp_path
         raise ImageError("gone")
 
     with monkeypatch.context() as patch:
-        patch.setattr("jaxsfm.sfm.reconstruction.refine_model", gone)
+        patch.setattr("jaxsfm.sfm.refined_models.refine_model", gone)
         assert main([*base, "--out", str(out)]) == 0
     made = []
-    original = reconstruction._refined
-    monkeypatch.setattr(reconstruction, "_refined", lambda *a: made.append(1) or original(*a))
+    original = reconstruction.refine_models
+    again = lambda *a, **k: made.append(1) or original(*a, **k)  # noqa: E731
+    monkeypatch.setattr(reconstruction, "refine_models", again)
     assert main([*base, "--out", str(out)]) == 0 and made == [1]
     assert main([*base, "--out", str(out)]) == 0 and made == [1]
 

@@ -70,9 +70,12 @@ def test_photos_outside_the_order_are_joined_last_by_their_strongest_pairs():
     }
 
 
-def test_neighbours_are_pairs_in_the_order_of_their_names():
-    assert neighbours([["b2", "b10"], ["a1", "a2", "a3"]]) == {
-        ("b10", "b2"),
-        ("a1", "a2"),
-        ("a2", "a3"),
+def test_neighbours_are_those_of_the_pairs_whose_photos_follow_each_other():
+    names = [f"b{n}" for n in (2, 10, 18, 26, 34)]
+    ring = [make_pair(a, b) for a, b in itertools.combinations([*names, "guest"], 2)]
+    inside = {("b10", "b2"), ("b10", "b18"), ("b18", "b26"), ("b26", "b34")}
+    assert neighbours(ring) == inside
+    assert neighbours([pair for pair in ring if pair != ("b18", "b26")]) == inside - {
+        ("b18", "b26")
     }
+    assert neighbours([]) == set()

@@ -15,7 +15,7 @@ from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.check.agreement import Agreement, agreement, thinned
+from jaxsfm.sfm.check.agreement import agreement, thinned
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import OtherPlace
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -69,7 +69,6 @@ def other_place(
     own = {pair: each for pair, each in refused.pairs.items() if view.name in pair}
     # What the view itself has contributed to the model holds at its first place only.
     others = model.select(model.tracks.view != k)
-    tests = thinned(others, per_view=TESTED_PER_VIEW)
     parts = [matched_points(view, others, normal, {pair: each}) for pair, each in own.items()]
     xy, points = (np.concatenate(column) for column in zip(*parts, strict=True))
     there = find_view(
@@ -91,8 +90,8 @@ def other_place(
         for (a, b), count in zip(own, support, strict=True)
         if count >= MIN_SUPPORT
     ]
-    moved = tests.with_views([*model.views[:k], there, *model.views[k + 1 :]])
-    tested, contradicted = _shown(agreement(moved, images, refinement, targets=[k]), k)
+    moved = others.with_views([*model.views[:k], there, *model.views[k + 1 :]])
+    tested, contradicted = shown_by(moved, images, refinement, k)
     if tested - contradicted < MIN_AGREED or contradicted > MAX_CONTRADICTED * tested:
         return None
     return OtherPlace(
@@ -118,8 +117,19 @@ def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
     return bool(turned > OTHER_ROTATION_DEG or away > OTHER_DISTANCE * distance)
 
 
-def _shown(found: Agreement, k: int) -> tuple[int, int]:
-    """The points tested in a view, and the contradictions: means over the views that see them."""
+def shown_by(model: Model, images: DeviceImages, refinement: Refinement, k: int) -> tuple[int, int]:
+    """What a view shows of the points that other views have seen.
+
+    Args:
+      images: those of the views, in the model's pixels.
+      k: index of the view.
+
+    Returns:
+      the number of points that it should show and on which something can be said, and the number of
+      contradictions among them (`jaxsfm.sfm.check.agreement`): means over the other views.
+    """
+    others = thinned(model.select(model.tracks.view != k), per_view=TESTED_PER_VIEW)
+    found = agreement(others, images, refinement, targets=[k])
     counts = found.tested[:, k]
     if not counts.any():
         return 0, 0

@@ -40,8 +40,11 @@ class Placement:
     error_px: float | None
     """Median distance of where they agree from where the pose puts them, working pixels."""
     held: int | None = None
-    """None: it was not taken out of the model. A number: it was, because it had no more
-    observations than these."""
+    """None: it was not taken out of the model for this reason. A number: it was, because it had no
+    more observations than these."""
+    doubt: str = ""
+    """What speaks against the place, in words; the image was taken out again. Empty if nothing
+    does."""
 
 
 def _structure(model: Model, weak: Sequence[int]) -> tuple[Model, np.ndarray]:

@@ -1,0 +1,122 @@
+"""The refinement of all models of a run, and of the places that it gives to further photos."""
+
+import dataclasses
+import logging
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jaxsfm.colmap.database import read_images
+from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model_folders import colour_points
+from jaxsfm.config import Config, Refinement
+from jaxsfm.io.images import ImageError
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photos import Photos
+from jaxsfm.sfm.check.placed_views import Placed, doubts
+from jaxsfm.sfm.photo_order import neighbours
+from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
+from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
+
+if TYPE_CHECKING:
+    import pycolmap
+
+logger = logging.getLogger("jaxsfm")
+
+
+class Believed(NamedTuple):
+    """What says where photos stand that the mapper left out."""
+
+    database: Path
+    """Of all photos, with those that are in no model."""
+    matches: Mapping[Pair, PairResult]
+    """The matches that no check has found to be false, original pixels."""
+    verified: Collection[Pair]
+    """Those of these pairs that COLMAP verified."""
+
+
+class RefinedModels(NamedTuple):
+    """The outcome of the refinement."""
+
+    models: "list[pycolmap.Reconstruction]"
+    """The one with most images first."""
+    figures: list[RefinementFigures | None]
+    """For each model, what was done to it; None where it was not refined."""
+    order: list[int]
+    """For each model, its index among the models of the mapper."""
+
+
+def refine_models(
+    models: "list[pycolmap.Reconstruction]",
+    photos: Photos,
+    believed: Believed,
+    *,
+    config: Config,
+    options: MapOptions,
+    on_pass: Callable[[], None] = lambda: None,
+) -> RefinedModels:
+    """Refine the models, if asked for, and colour their points.
+
+    They are refined one after the other, each with the unmapped photos that none before took.
+
+    Args:
+      config: its `refinement` and `checked` switch these parts on.
+    """
+    cameras = read_images(believed.database)
+    mapped = {name for model in models for name in registered(model)}
+    unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
+    evidence = Evidence(believed.matches, unmapped, options.seed)
+    following = neighbours(believed.verified)
+    refined, figures = [], []
+    for model in models:
+        new, done = model, None
+        try:
+            if config.refinement is not None:
+                new, done = refine_model(
+                    model,
+                    photos.gray,
+                    refinement=config.refinement,
+                    refine_intrinsics=options.refine_intrinsics,
+                    evidence=evidence,
+                    threads=options.threads,
+                    on_pass=on_pass,
+                )
+                if config.checked:
+                    new, done = _without_doubtful(
+                        new, done, photos, believed.matches, following, config.refinement
+                    )
+        except ImageError as error:  # a photo was deleted since; the mapper's model remains
+            logger.warning("no refinement: %s", error)
+        left = [image for image in evidence.unmapped if image.name not in registered(new)]
+        evidence = evidence._replace(unmapped=left)
+        refined.append(new)
+        figures.append(done)
+    # Refinement adds and removes images: the first model is again the one with most.
+    order = sorted(range(len(refined)), key=lambda k: -refined[k].num_reg_images())
+    for model in refined:
+        colour_points(model, photos.rgb)
+    return RefinedModels([refined[k] for k in order], [figures[k] for k in order], order)
+
+
+def _without_doubtful(
+    model: "pycolmap.Reconstruction",
+    done: RefinementFigures,
+    photos: Photos,
+    matches: Mapping[Pair, PairResult],
+    following: Collection[Pair],
+    refinement: Refinement,
+) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
+    """A refined model without the new photos whose places are doubtful, and what was done to it."""
+    new = {at.name: at.octave_px == 1 for at in done.placed if at.octave_px and not at.registered}
+    if not new:
+        return model, done
+    sizes = {name: photos.working_size(name) for name in registered(model)}
+    whole, images = Model.from_colmap(model, sizes), DeviceImages(photos.gray)
+    found = doubts(whole, images, refinement, Placed(new, following, matches))
+    if not found:
+        return model, done
+    left = whole.part(set(registered(model)) - found.keys())[0]
+    placed = [dataclasses.replace(at, doubt=found.get(at.name, "")) for at in done.placed]
+    return left.to_colmap(), dataclasses.replace(done, placed=placed)
