@@ -76,7 +76,7 @@ def _lost_photos(
     * `no plane`: no homography had enough inliers;
     * `not connected`: no chain of trusted pairs leads to the model;
     * `no pose`: trusted pairs lead to the model, but COLMAP found no pose;
-    * `not confirmed`: COLMAP found a pose, but refinement took the photo out of the model again;
+    * `not confirmed`: COLMAP or refinement found a pose, but the photo was taken out again;
     * `other model`: trusted pairs lead to the best model, but the photo is in a smaller one.
     """
     best_model = set(models[0]) if models else set()
