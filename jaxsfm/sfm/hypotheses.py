@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.io.pairs import Pair
+from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.photo_order import Order, follow
 from jaxsfm.sfm.rounds import (
     NOTHING_REFUTED,
@@ -20,7 +21,6 @@ from jaxsfm.sfm.rounds import (
     Refuted,
     Round,
     Rounds,
-    VerifiedPairs,
     best_of,
 )
 from jaxsfm.sfm.view_graph import (

@@ -10,7 +10,7 @@ stand, both models are returned.
 import dataclasses
 import logging
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -21,9 +21,10 @@ from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
 from jaxsfm.sfm.check.model_check import Alternative, Basis, ModelCheck
+from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import by_order, by_votes
 from jaxsfm.sfm.photo_order import neighbours, orders
-from jaxsfm.sfm.rounds import Round, Rounds, VerifiedPairs
+from jaxsfm.sfm.rounds import Round, Rounds
 from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
@@ -88,14 +89,18 @@ def build_checked_models(
             given, database, Path(scratch), config=config, options=options, on_image=on_image
         )
         best, other = by_votes(rounds, view_graph=config.view_graph), None
+        checks, complete = _checks(best, given), False
+        if _green(checks):
+            checks, complete = rounds.with_second_places(best, checks), True
         found = orders({name for pair in given.two_views for name in pair})
-        checks = _checks(best, given)
-        if found and any(check is not None and check.verdict != "green" for check in checks):
+        if found and not _green(checks):
             logger.info("something speaks against the model; following the order of the names")
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
                 best, other = other, best
-                checks = _checks(best, given)
+                checks, complete = _checks(best, given), False
+        if not complete:
+            checks = rounds.with_second_places(best, checks)
         rounds.go_back_to(best)
     alternative = []
     if other is not None and checks[0] is not None and _stands(other, beside=best):
@@ -107,6 +112,11 @@ def build_checked_models(
         verdicts=best.verdicts, attempts=rounds.attempts, checks=checks, basis=best.basis
     )
     return Mapped(best.models, figures, alternative)
+
+
+def _green(checks: Sequence[ModelCheck | None]) -> bool:
+    """Whether nothing is known to speak against any of the models."""
+    return all(check is None or check.verdict == "green" for check in checks)
 
 
 def _checks(made: Round, given: VerifiedPairs) -> list[ModelCheck | None]:

@@ -27,7 +27,8 @@ from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.check.check_model import CHECKED_BY
-from jaxsfm.sfm.mapping import MappingFigures, VerifiedPairs, build_checked_models
+from jaxsfm.sfm.checker import VerifiedPairs
+from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refined_models import Believed, refine_models
 from jaxsfm.sfm.stage_files import VerificationFigures

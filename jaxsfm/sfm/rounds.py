@@ -5,24 +5,20 @@ check has refuted those that joined photos that contradict each other.
 """
 
 import functools
-import logging
 import shutil
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
-from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models, registered
-from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.mapper import Attempt, MapOptions, build_models
 from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views, verify
-from jaxsfm.config import Config, Refinement
-from jaxsfm.io.images import ImageError
-from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.io.photos import Photos
-from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model
-from jaxsfm.sfm.check.model_check import Basis, Contradiction
-from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.config import Config
+from jaxsfm.io.pairs import Pair
+from jaxsfm.sfm.check.check_model import Checked
+from jaxsfm.sfm.check.model_check import Basis, Contradiction, ModelCheck
+from jaxsfm.sfm.checker import Checker, VerifiedPairs
 from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
@@ -30,8 +26,6 @@ if TYPE_CHECKING:
 
 FEWER = 0.1
 """A model is smaller than another one if it has fewer photos by more than this share of them."""
-
-logger = logging.getLogger("jaxsfm")
 
 
 class Hypothesis(NamedTuple):
@@ -41,18 +35,6 @@ class Hypothesis(NamedTuple):
     judge: Callable[[Mapping[Pair, PairGeometry], bool], dict[Pair, Verdict]]
     """The verdicts on pairs, from their geometries. The second argument says whether pairs were
     refuted in earlier rounds. Pairs without a verdict are trusted."""
-
-
-class VerifiedPairs(NamedTuple):
-    """What the mapper starts from."""
-
-    database: Path
-    """With all verified pairs."""
-    two_views: Mapping[Pair, TwoView]
-    """Their geometries."""
-    matches: Mapping[Pair, PairResult]
-    """Their matches, original pixels."""
-    photos: Photos
 
 
 class Refuted(NamedTuple):
@@ -144,7 +126,8 @@ class Rounds:
     ) -> None:
         self.given, self._database = given, database
         self._second_database = scratch / "second.db"
-        self._config, self._options, self._on_image = config, options, on_image
+        self._options, self._on_image = options, on_image
+        self._checker = Checker(given, config, options.seed)
         self.attempts: list[Attempt] = []
         """All runs of the mapper, in all rounds."""
         self._asked: set[Pair] = set()
@@ -165,9 +148,18 @@ class Rounds:
             self._database, trusted, self._options, on_image=self._on_image
         )
         self.attempts += attempts
-        checks = self._check(models, refuted)
+        checks = self._checker.check(models, refuted.pairs)
         self._last = Round(hypothesis.basis, models, verdicts, checks, refuted)
         return self._last
+
+    def with_second_places(
+        self, made: Round, checks: Sequence[ModelCheck | None]
+    ) -> list[ModelCheck | None]:
+        """Checks of the models of a round, with the second places of their photos."""
+        return [
+            done and check and self._checker.with_second_places(model, done, check)
+            for model, done, check in zip(made.models, made.checks, checks, strict=True)
+        ]
 
     def go_back_to(self, made: Round) -> None:
         """Make the database that of a round."""
@@ -209,28 +201,6 @@ class Rounds:
             self._seconds |= {pair: found[pair] for pair in new if pair in found}
             self._asked |= set(new)
         return set(pairs) & self._seconds.keys()
-
-    def _check(
-        self, models: "list[pycolmap.Reconstruction]", refuted: Refuted
-    ) -> list[Checked | None]:
-        """The checks of models; None where one was not checked."""
-        if not self._config.checked:
-            return [None] * len(models)
-        given, checks = self.given, []
-        matches = VerifiedMatches(
-            given.matches, given.two_views.keys(), refuted.pairs, self._options.seed
-        )
-        for each in models:
-            sizes = {name: given.photos.working_size(name) for name in registered(each)}
-            images = DeviceImages(given.photos.gray)
-            try:
-                model = Model.from_colmap(each, sizes)
-                refinement = self._config.refinement or Refinement()
-                checks.append(check_model(model, images, matches, refinement))
-            except ImageError as error:  # a photo was deleted since; the model remains
-                logger.warning("a model was not checked: %s", error)
-                checks.append(None)
-        return checks
 
 
 def _refuted(each: Contradiction) -> Verdict:

@@ -25,6 +25,7 @@ from jaxsfm.sfm.check.check_model import (
     Checked,
     VerifiedMatches,
     check_model,
+    second_places,
 )
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
 
@@ -44,6 +45,14 @@ def checked(
     return check_model(model or seen.model, seen.images, given, REFINEMENT)
 
 
+def second(seen: Scene, results: list[PairResult], against: Set[Pair]) -> list[str]:
+    """The photos that have second places."""
+    matches = {result.pair: result for result in results}
+    given = VerifiedMatches(matches, matches.keys(), frozenset(), 0)
+    found = second_places(seen.model, seen.images, given, REFINEMENT, against)
+    return [place.image for place in found]
+
+
 def of_all_pairs(seen: Scene) -> list[PairResult]:
     count = len(seen.model.views)
     return [true_matches(seen.model, a, b) for a in range(count) for b in range(a + 1, count)]
@@ -59,7 +68,7 @@ def test_a_right_model_is_green_and_explains_its_pairs(right):
     found = checked(right, results)
     assert found is not None and found.check.verdict == "green"
     assert found.check.groups == [FIRST + OTHERS] and found.check.other_places == []
-    assert not found.refuted and not found.suspected
+    assert not found.refuted and not found.suspected and not found.against
     assert found.explained == {result.pair for result in results}
 
 
@@ -81,13 +90,12 @@ def test_two_walls_that_are_taken_for_one_are_red_and_the_pairs_that_join_them_a
     assert found.explained == {r.pair for r in results} - across
     for pair, why in found.refuted.items():
         assert ([why.images[0], why.others[0]] == list(pair)) and why.contradicted < why.tested
-    assert found.check.other_places == []
     again = checked(seen, results, refuted=found.refuted.keys())
     assert again is not None and again.check == found.check
     assert not again.refuted and again.suspected == found.suspected
 
 
-def test_a_wall_that_is_like_another_is_amber_and_the_pairs_between_them_are_not_explained():
+def test_a_wall_that_is_like_another_gives_second_places_by_the_pairs_that_do_not_agree():
     wall = big_wall()
     seen = scene(
         [
@@ -98,11 +106,10 @@ def test_a_wall_that_is_like_another_is_amber_and_the_pairs_between_them_are_not
     false = twin_matches(seen.model, 0, 3, TURNED)
     true = [true_matches(seen.model, 0, 1), true_matches(seen.model, 3, 5)]
     found = checked(seen, [false, *true])
-    assert found is not None and found.check.verdict == "amber"
-    assert [place.image for place in found.check.other_places] == ["0.png", "3.png"]
-    assert found.explained == {result.pair for result in true} and not found.refuted
-    without = checked(seen, true)
-    assert without is not None and without.check.verdict == "green"
+    assert found is not None and not found.check.contradictions and not found.refuted
+    assert found.explained == {result.pair for result in true} and found.against == {false.pair}
+    assert second(seen, [false, *true], found.against) == ["0.png", "3.png"]
+    assert second(seen, true, frozenset()) == []
 
 
 def test_small_models_are_not_checked(right):

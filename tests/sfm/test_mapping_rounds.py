@@ -1,5 +1,6 @@
 """Laws of the rounds of mapping and checking. The mapper and the check are made up."""
 
+import dataclasses
 import itertools
 import json
 import re
@@ -17,13 +18,13 @@ from jaxsfm.colmap.two_views import PairGeometry, TwoView
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, make_pair
-from jaxsfm.sfm import mapping
+from jaxsfm.sfm import checker, mapping
 from jaxsfm.sfm import rounds as module
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
+from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import MAX_ROUNDS
 from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
-from jaxsfm.sfm.rounds import VerifiedPairs
 
 A, B, C, D, E = PAIRS = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d"), ("d", "e")]
 OPTIONS = MapOptions(seed=3)
@@ -43,6 +44,7 @@ def outcome(refuted=(), suspected=(), explained=()) -> Checked:
         {pair: contradiction(pair) for pair in refuted},
         {pair: contradiction(pair) for pair in suspected},
         set(explained),
+        set(),
     )
 
 
@@ -63,6 +65,8 @@ class Run(NamedTuple):
     """The pairs that are not in the database at the end."""
     told: list[set[Pair]]
     """The pairs that each check was told to be refuted before."""
+    searched: list
+    """The models in which second places were looked for."""
 
 
 @pytest.fixture
@@ -81,9 +85,12 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         models: int = 1,
         seconds: dict[Pair, TwoView] | None = None,
         places: Callable[[frozenset[Pair]], dict] = lambda pairs: {},
+        gone: bool = False,
     ) -> Run:
         given: list[set[Pair]] = []
         told: list[set[Pair]] = []
+        second: dict[frozenset[Pair], tuple] = {}
+        searched: list[frozenset[Pair]] = []
 
         def build(database, trusted, options, *, on_image):
             assert options is OPTIONS
@@ -95,7 +102,18 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         def checked(model, images, matches, refinement):
             assert matches.pairs == geometries.keys() and matches.seed == OPTIONS.seed
             told.append(set(matches.refuted))
-            return check(model)
+            found = check(model)
+            if found is None:
+                return None
+            second[model] = found.check.other_places, found.against
+            return found._replace(check=dataclasses.replace(found.check, other_places=[]))
+
+        def search(model, images, matches, refinement, against):
+            searched.append(model)
+            if gone:
+                raise ImageError("a.jpg: cannot be read")
+            assert against == second[model][1] and matches.seed == OPTIONS.seed
+            return second[model][0]
 
         def keep_outliers(path: Path, pairs: list[Pair]) -> None:
             looked_for.extend(pairs)
@@ -114,19 +132,20 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         monkeypatch.setattr(module, "copy_geometries", copy)
         monkeypatch.setattr(mapping, "model_poses", places)
         monkeypatch.setattr(module, "build_models", build)
-        monkeypatch.setattr(module, "check_model", checked)
         monkeypatch.setattr(module, "drop_pairs", drop)
-        monkeypatch.setattr(module, "registered", lambda model: {"a", "b"})
-        monkeypatch.setattr(module.Model, "from_colmap", lambda model, sizes: model)
+        monkeypatch.setattr(checker, "check_model", checked)
+        monkeypatch.setattr(checker, "second_places", search)
+        monkeypatch.setattr(checker, "registered", lambda model: {"a", "b"})
+        monkeypatch.setattr(checker.Model, "from_colmap", lambda model, sizes: model)
         geometries = two_views or {pair: view() for pair in PAIRS}
         verified, database = tmp_path / "verified.db", tmp_path / "mapped.db"
         verified.write_text(json.dumps(sorted(geometries)))
-        photos: module.Photos = FakePhotos()  # pyright: ignore[reportAssignmentType]
+        photos: checker.Photos = FakePhotos()  # pyright: ignore[reportAssignmentType]
         pairs = VerifiedPairs(verified, geometries, {}, photos)
         made, figures, other = build_checked_models(pairs, database, config=config, options=OPTIONS)
         left = {tuple(pair) for pair in json.loads(database.read_text())}
         assert {tuple(pair) for pair in json.loads(verified.read_text())} == geometries.keys()
-        return Run(made, other, figures, given, sorted(geometries.keys() - left), told)
+        return Run(made, other, figures, given, sorted(geometries.keys() - left), told, searched)
 
     return run
 
@@ -338,7 +357,7 @@ def test_the_best_round_is_returned_not_the_last(rounds):
         refuted = [p for p in PAIRS if p in pairs][:1]
         worse = contradiction(refuted[0], {5: 90, 4: 20}.get(len(pairs), 60))
         check = ModelCheck(groups=[["a"]], contradictions=[worse], other_places=[])
-        return Checked(check, {refuted[0]: worse}, {}, set())
+        return Checked(check, {refuted[0]: worse}, {}, set(), set())
 
     found = rounds(check)
     assert len(found.rounds) == MAX_ROUNDS and found.models == [frozenset(set(PAIRS) - {A})]
@@ -470,6 +489,28 @@ def test_two_equal_models_are_not_two(rounds):
     assert told is not None and told.verdict == "green"
 
 
+def test_second_places_are_looked_for_in_the_result_and_before_another_model_is_made(rounds):
+    """They take longer than the rest of the check."""
+    found = rounds(lambda pairs: outcome(explained=pairs))
+    assert found.searched == [frozenset(PAIRS)]
+    found = rounds(lambda pairs: outcome(refuted=[A] if A in pairs else []))
+    assert found.searched == [frozenset(set(PAIRS) - {A})]
+    assert rounds(lambda pairs: outcome(refuted=[min(pairs)])).searched == []
+
+    def check(pairs):
+        return walked(pairs, agreeing=WALKED, places=[PLACE] if FALSE in pairs else [])
+
+    found = rounds(check, two_views=WALKED, places=lambda pairs: posed(FALSE in pairs))
+    assert found.searched == [frozenset(WALKED), frozenset(WALKED)]  # the second has all pairs too
+    apart = rounds(lambda pairs: walked(pairs), two_views=WALKED, places=lambda pairs: posed(False))
+    assert apart.searched == apart.models  # neighbours say it already
+
+
+def test_a_photo_that_went_away_leaves_second_places_unsearched(rounds, caplog):
+    (told,) = rounds(lambda pairs: outcome(explained=pairs), gone=True).figures.checks
+    assert told == outcome().check and "a.jpg: cannot be read" in caplog.text
+
+
 def test_a_model_with_which_all_that_follow_agree_is_not_doubted(rounds):
     found = rounds(lambda pairs: walked(pairs, agreeing=LINKS), two_views=WALKED)
     assert found.rounds == [set(WALKED)]
@@ -568,7 +609,7 @@ def test_a_larger_model_is_better_than_a_smaller_one_with_fewer_contradictions(r
             contradictions=[worse],
             other_places=[],
         )
-        return Checked(check, {A: worse} if whole else {}, {}, set())
+        return Checked(check, {A: worse} if whole else {}, {}, set(), set())
 
     assert rounds(check).models == [frozenset(PAIRS)]
 

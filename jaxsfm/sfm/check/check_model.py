@@ -1,4 +1,7 @@
-"""The check of one model after mapping: do its photos agree with it, and with no other model?"""
+"""The check of one model after mapping: do its photos agree with it, and with no other model?
+
+The second question takes longer than the first one, and is asked of models that are kept.
+"""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -8,7 +11,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import Agreement, agreement, thinned
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, share
-from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck
+from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.check.other_places import Refused, other_places
 from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
 from jaxsfm.sfm.refine import plane_geometry
@@ -56,6 +59,8 @@ class Checked(NamedTuple):
     be right: then the groups were joined wrongly elsewhere."""
     explained: set[Pair]
     """Pairs that agree with the model and join no groups that contradict each other."""
+    against: set[Pair]
+    """Pairs that do not agree with the model."""
 
 
 def check_model(
@@ -63,8 +68,8 @@ def check_model(
 ) -> Checked | None:
     """Check a model.
 
-    If groups of its photos contradict each other, the pairs that joined them are refuted. Otherwise
-    second places are looked for, by the pairs that the model does not agree with.
+    If groups of its photos contradict each other, the pairs that joined them are refuted. Second
+    places are not looked for (`second_places`).
 
     Args:
       images: those of the views, in the model's pixels.
@@ -97,16 +102,33 @@ def check_model(
         }
         if refuted or suspected:
             break
-    places = []
-    if not contradictions:
-        against = {pair: given.matches[pair] for pair in fits if fits[pair] < MIN_FIT}
-        refused = Refused(against, given.seed)
-        places = other_places(model, normal, images, refinement, refused)
     groups = [sorted(names[k] for k in group) for group in grouping.groups]
-    check = ModelCheck(groups=groups, contradictions=contradictions, other_places=places)
-    agreeing = [pair for pair, fit in fits.items() if fit >= MIN_FIT]
+    check = ModelCheck(groups=groups, contradictions=contradictions, other_places=[])
+    agreeing = {pair for pair, fit in fits.items() if fit >= MIN_FIT}
     explained = {p for p in agreeing if not any(each.joined_by(p) for each in contradictions)}
-    return Checked(check, refuted, suspected, explained)
+    return Checked(check, refuted, suspected, explained, fits.keys() - agreeing)
+
+
+def second_places(
+    model: Model,
+    images: DeviceImages,
+    given: VerifiedMatches,
+    refinement: Refinement,
+    against: Collection[Pair],
+) -> list[OtherPlace]:
+    """The second places of the photos of a model that has been checked.
+
+    Args:
+      images, given, refinement: as in `check_model`.
+      against: the pairs that do not agree with the model.
+
+    Raises:
+      ImageError: an image of the model cannot be read any more.
+    """
+    model = thinned(model)
+    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
+    refused = Refused({pair: given.matches[pair] for pair in sorted(against)}, given.seed)
+    return other_places(model, normal, images, refinement, refused)
 
 
 def _refuted(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pair, Contradiction]:

@@ -1,0 +1,93 @@
+"""Checks of the models of a run, on its photos at working size."""
+
+import dataclasses
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jaxsfm.colmap.mapper import registered
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.two_views import TwoView
+from jaxsfm.config import Config, Refinement
+from jaxsfm.io.images import ImageError
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photos import Photos
+from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model, second_places
+from jaxsfm.sfm.check.model_check import ModelCheck
+from jaxsfm.sfm.refine.device_images import DeviceImages
+
+if TYPE_CHECKING:
+    import pycolmap
+
+logger = logging.getLogger("jaxsfm")
+
+
+class VerifiedPairs(NamedTuple):
+    """What the mapper starts from."""
+
+    database: Path
+    """With all verified pairs."""
+    two_views: Mapping[Pair, TwoView]
+    """Their geometries."""
+    matches: Mapping[Pair, PairResult]
+    """Their matches, original pixels."""
+    photos: Photos
+
+
+class Checker(NamedTuple):
+    """Checks models that were made from verified pairs."""
+
+    given: VerifiedPairs
+    config: Config
+    """Its `checked` switches all checks on, and its `refinement` says how patches are aligned."""
+    seed: int
+    """For RANSAC."""
+
+    def check(
+        self, models: "Sequence[pycolmap.Reconstruction]", refuted: Collection[Pair]
+    ) -> list[Checked | None]:
+        """The checks of models; None where one was not checked.
+
+        Args:
+          refuted: the pairs that earlier checks have refuted.
+        """
+        if not self.config.checked:
+            return [None] * len(models)
+        matches = self._matches(refuted)
+        checks = []
+        for each in models:
+            try:
+                checks.append(check_model(*self._opened(each), matches, self._refinement()))
+            except ImageError as error:  # a photo was deleted since; the model remains
+                logger.warning("a model was not checked: %s", error)
+                checks.append(None)
+        return checks
+
+    def with_second_places(
+        self, model: "pycolmap.Reconstruction", done: Checked, check: ModelCheck
+    ) -> ModelCheck:
+        """A check with the second places of the photos, unless photos contradict each other."""
+        if check.contradictions:
+            return check
+        try:
+            found = second_places(
+                *self._opened(model), self._matches(()), self._refinement(), done.against
+            )
+        except ImageError as error:
+            logger.warning("no second places were looked for: %s", error)
+            return check
+        return dataclasses.replace(check, other_places=found)
+
+    def _matches(self, refuted: Collection[Pair]) -> VerifiedMatches:
+        given = self.given
+        return VerifiedMatches(given.matches, given.two_views.keys(), refuted, self.seed)
+
+    def _refinement(self) -> Refinement:
+        return self.config.refinement or Refinement()
+
+    def _opened(self, model: "pycolmap.Reconstruction") -> tuple[Model, DeviceImages]:
+        """A model in working pixels, and its photos."""
+        photos = self.given.photos
+        sizes = {name: photos.working_size(name) for name in registered(model)}
+        return Model.from_colmap(model, sizes), DeviceImages(photos.gray)
