@@ -238,6 +238,22 @@ def test_an_image_that_refinement_took_out_says_what_was_missing():
     assert "photos between b - c" in row["help"][-1]["reason"]
 
 
+def test_an_image_that_refinement_placed_and_took_out_says_what_speaks_against_its_place():
+    tried = {
+        ("a", "b"): counts(Status.VERIFIED, 500, 400),
+        ("b", "c"): counts(Status.VERIFIED, 90, 60),
+    }
+    reason = "its matches with its neighbour b do not agree with it"
+    at = Placement(name="c", registered=False, octave_px=1, candidates=9, agreed=8, error_px=0.1)
+    figures = RefinementFigures(passes=[], placed=[replace(at, doubt=reason)])
+    found = explained(
+        "abc", tried, {("a", "b"): 300, ("b", "c"): 42}, [["a", "b"]], refinement=[figures]
+    )
+    (row,) = found["lost"]
+    assert row["stage"] == "not confirmed"
+    assert row["detail"].endswith(f"; refinement found a place for it, but {reason}")
+
+
 # -- groups ----------------------------------------------------------------------------------------
 
 

@@ -74,9 +74,10 @@ def test_second_tries_and_refinement_are_said():
     dusk = night | {"name": "dusk", "agreed": 321, "octave_px": 4, "error_px": 1.26}
     late = dusk | {"name": "late", "registered": False}
     never = night | {"name": "never", "registered": False}
+    doubtful = late | {"name": "doubtful", "doubt": "its neighbour does not agree with it"}
     done = {
         "passes": [figures, figures],
-        "placed": [night, dusk, dusk | {"octave_px": 1}, late, never],
+        "placed": [night, dusk, dusk | {"octave_px": 1}, late, never, doubtful],
     }
     text = "\n".join(summary_lines(report(mapping=attempts, refinement=[done])))
     assert "started 2 times, images registered: 0, 2" in text
@@ -90,7 +91,7 @@ def test_second_tries_and_refinement_are_said():
         "late: 321 points agree at 1/4 size, with a median error of 1.3 px; the mapper had left"
         in text
     )
-    assert "never" not in text and text.count("left it out") == 1
+    assert "never" not in text and text.count("left it out") == 1 and "doubtful" not in text
     back = {"passes": [figures | {"accepted": False}], "placed": []}
     text = "\n".join(summary_lines(report(refinement=[back])))
     assert "too few agreed, so this pass was taken back" in text

@@ -1,0 +1,119 @@
+"""Laws of what is done to all models of a run. The refinement of one model is made up."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from room_scene import noisy_model, read_of
+
+from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.config import Config, Refinement
+from jaxsfm.io.images import ImageError
+from jaxsfm.sfm import refined_models as module
+from jaxsfm.sfm.refine.passes import RefinementFigures
+from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refined_models import Believed, refine_models
+
+NAMES = [f"{k}.png" for k in range(5)]
+NEW = NAMES[4]
+PAIRS = [(NAMES[k], NAMES[k + 1]) for k in range(4)]
+
+
+def placement(*, registered: bool = False, octave_px: int | None = 1) -> Placement:
+    return Placement(
+        name=NEW,
+        registered=registered,
+        octave_px=octave_px,
+        candidates=9,
+        agreed=8,
+        error_px=0.1,
+    )
+
+
+class FakePhotos:
+    def __init__(self, rendered) -> None:
+        self.gray, self.rgb = read_of(rendered), None
+
+    def working_size(self, name):
+        gray, scale = self.gray(name)
+        return (gray.shape[1], gray.shape[0]), scale
+
+
+@pytest.fixture
+def refined(rendered, monkeypatch):
+    """Refines two models of four views; the refinement adds the fifth one to each."""
+    small = noisy_model(rendered, 0.0)
+    small.deregister_frame(small.image(5).frame_id)
+
+    def run(placed: Placement, against: dict, *, checked: bool = True, gone: bool = False):
+        offered, asked = [], []
+
+        def refine_model(model, read, *, evidence, **_):
+            offered.append([image.name for image in evidence.unmapped])
+            if gone:
+                raise ImageError("2.png: cannot be read")
+            added = placed.octave_px and (placed.registered or offered[-1])
+            new = noisy_model(rendered, 0.0) if added else model
+            return new, RefinementFigures(passes=[], placed=[placed] if added else [])
+
+        def doubts(model, images, refinement, given):
+            asked.append(given)
+            return against
+
+        cameras = dict.fromkeys(NAMES, (1, None))
+        monkeypatch.setattr(module, "read_images", lambda path: cameras)
+        monkeypatch.setattr(module, "refine_model", refine_model)
+        monkeypatch.setattr(module, "doubts", doubts)
+        monkeypatch.setattr(module, "colour_points", lambda model, rgb: None)
+        made = refine_models(
+            [small, small],
+            FakePhotos(rendered),  # pyright: ignore[reportArgumentType]
+            Believed(Path(), {}, PAIRS),
+            config=Config(refinement=Refinement(), checked=checked),
+            options=MapOptions(),
+        )
+        return made, offered, asked
+
+    return run
+
+
+def test_a_photo_that_the_refinement_places_is_in_the_model_if_nothing_speaks_against_it(refined):
+    made, offered, asked = refined(placement(), {})
+    assert [len(registered(model)) for model in made.models] == [5, 4]
+    assert offered == [[NEW], []] and made.order == [0, 1]
+    (given,) = asked
+    assert given.full_size == {NEW: True} and set(given.neighbours) == set(PAIRS)
+
+
+def test_a_photo_whose_place_is_doubtful_is_taken_out_and_offered_to_the_next_model(refined):
+    made, offered, asked = refined(placement(), {NEW: "a reason"})
+    assert [sorted(registered(model)) for model in made.models] == [NAMES[:4]] * 2
+    assert offered == [[NEW], [NEW]] and len(asked) == 2
+    for figures in made.figures:
+        assert figures is not None and [at.doubt for at in figures.placed] == ["a reason"]
+    points = made.models[0].points3D.values()
+    assert len(points) > 100 and np.isfinite([point.xyz for point in points]).all()
+
+
+def test_a_dark_photo_is_known_to_be_one(refined):
+    _, _, (given,) = refined(placement(octave_px=2), {})
+    assert given.full_size == {NEW: False}
+
+
+@pytest.mark.parametrize(
+    ("placed", "checked"),
+    [
+        (placement(), False),
+        (placement(registered=True), True),  # the check of the mapper's model has seen it
+        (placement(octave_px=None), True),
+    ],
+)
+def test_other_photos_are_not_asked_about(refined, placed, checked):
+    _, _, asked = refined(placed, {NEW: "a reason"}, checked=checked)
+    assert asked == []
+
+
+def test_a_photo_that_went_away_leaves_the_mappers_models(refined, caplog):
+    made, _, _ = refined(placement(), {}, gone=True)
+    assert made.figures == [None, None] and [len(registered(m)) for m in made.models] == [4, 4]
+    assert "2.png: cannot be read" in caplog.text
