@@ -23,7 +23,7 @@ from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
 from jaxsfm.sfm.check.model_check import Alternative, Basis, ModelCheck
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import by_order, by_votes
-from jaxsfm.sfm.photo_order import neighbours, orders
+from jaxsfm.sfm.photo_order import neighbours, ordered, orders
 from jaxsfm.sfm.rounds import Round, Rounds
 from jaxsfm.sfm.view_graph import Verdict
 
@@ -92,8 +92,9 @@ def build_checked_models(
         checks, complete = _checks(best, given), False
         if _green(checks):
             checks, complete = rounds.with_second_places(best, checks), True
-        found = orders({name for pair in given.two_views for name in pair})
-        if found and not _green(checks):
+        names = {name for pair in given.two_views for name in pair}
+        found = orders(names)
+        if found and ordered(found, names) and not _green(checks):
             logger.info("something speaks against the model; following the order of the names")
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):

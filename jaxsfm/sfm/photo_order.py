@@ -21,6 +21,10 @@ but the identifiers of a photo site have no equal steps."""
 MIN_NUMBERED = 5
 """Fewer photos have no order worth following."""
 
+MOST_NUMBERED = 0.5
+"""The order says how to join all photos if so many of them are numbered. Of the 135 photos of statue,
+8 are frames of a video."""
+
 Order = list[str]
 """Names of photos, one taken after the other."""
 
@@ -42,6 +46,11 @@ def orders(names: Iterable[str]) -> list[Order]:
         if len(numbers) >= MIN_NUMBERED and steps.count(mode(steps)) >= EQUAL_STEPS * len(steps):
             found.append([numbered[number] for number in numbers])
     return found
+
+
+def ordered(found: Iterable[Order], names: Collection[str]) -> bool:
+    """Whether the orders say how to join all photos."""
+    return len({name for order in found for name in order}) >= MOST_NUMBERED * len(names)
 
 
 def follow(found: Iterable[Order], pairs: Mapping[Pair, float]) -> set[Pair]:

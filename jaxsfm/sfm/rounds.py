@@ -91,7 +91,12 @@ class Round:
         return {name for each in self._done() for group in each.check.groups for name in group}
 
     def at_least_as_good_as(self, other: "Round") -> bool:
-        """Compare the models: first by contradictions, then by size, then by their number."""
+        """Compare the models: first by contradictions, then by size, then by their number.
+
+        A round without a model that could be checked is not as good as another one.
+        """
+        if not self.checked_photos():
+            return False
         if bool(self.contradicted()) != bool(other.contradicted()):
             return not self.contradicted()
         ours, theirs = len(self.checked_photos()), len(other.checked_photos())
