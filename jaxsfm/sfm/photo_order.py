@@ -22,8 +22,8 @@ MIN_NUMBERED = 5
 """Fewer photos have no order worth following."""
 
 MOST_NUMBERED = 0.5
-"""The order says how to join all photos if so many of them are numbered. Of the 135 photos of statue,
-8 are frames of a video."""
+"""The order says how to join all photos if so many of them are numbered. Of the 135 photos of
+statue, 8 are: frames of a video."""
 
 Order = list[str]
 """Names of photos, one taken after the other."""

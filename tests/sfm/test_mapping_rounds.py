@@ -516,6 +516,24 @@ def test_a_model_with_which_all_that_follow_agree_is_not_doubted(rounds):
     assert found.rounds == [set(WALKED)]
 
 
+def test_an_order_of_few_photos_is_not_followed(rounds):
+    """But photos that follow each other are asked."""
+    guests = {make_pair(WALK[0], f"guest{k**2}"): view() for k in range(2, 9)}
+    found = rounds(lambda pairs: walked(pairs), two_views=WALKED | guests)
+    assert len(found.rounds) == 1
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == "amber" and len(told.apart) == len(LINKS)
+
+
+def test_an_order_that_gives_no_model_does_not_replace_a_red_one(rounds):
+    def check(pairs):
+        return walked(pairs, against=[FALSE]) if pairs == WALKED.keys() else None
+
+    found = rounds(check, two_views=WALKED)
+    assert len(found.rounds) > 1 and found.models == [frozenset(WALKED)]
+    assert found.figures.basis == "pairs" and found.dropped == []
+
+
 def test_without_an_order_nothing_else_is_tried(rounds):
     renamed = {name: f"walk{int(name[4:]) ** 3}" for name in WALK}
     views = {make_pair(renamed[a], renamed[b]): v for (a, b), v in WALKED.items()}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsfm.io.pairs import component_of, make_pair
-from jaxsfm.sfm.photo_order import follow, neighbours, orders
+from jaxsfm.sfm.photo_order import follow, neighbours, ordered, orders
 
 
 def numbered(numbers, pattern="IMG_{:04d}.jpg"):
@@ -79,3 +79,10 @@ def test_neighbours_are_those_of_the_pairs_whose_photos_follow_each_other():
         ("b18", "b26")
     }
     assert neighbours([]) == set()
+
+
+@pytest.mark.parametrize(("numbered_ones", "others", "enough"), [(6, 6, True), (6, 7, False)])
+def test_an_order_of_few_photos_does_not_say_how_to_join_all(numbered_ones, others, enough):
+    names = numbered(range(numbered_ones))
+    found = [names[:4], names[2:]]  # photos in two orders count once
+    assert ordered(found, [*names, *(f"guest{k}" for k in range(others))]) == enough
