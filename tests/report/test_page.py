@@ -315,7 +315,7 @@ def test_a_long_verdict_says_what_is_left_out(plain):
     check = check_of("red")
     many = dataclasses.replace(check, contradictions=check.contradictions * 40)
     text = page(dataclasses.replace(run, report=dataclasses.replace(run.report, checks=[many])))
-    assert "25 more are in report.json." in text
+    assert "35 more are in report.json." in text
 
 
 # -- never in a run's way -----------------------------------------------------------------------

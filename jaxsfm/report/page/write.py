@@ -29,8 +29,8 @@ from jaxsfm.report.typed_json import to_json
 from jaxsfm.report.verdict import model_verdicts
 
 MAX_FINDINGS = 5
-"""The number of findings of each kind that the page lists for each model. Fifteen second places of a
-rendered box filled the first screen."""
+"""The number of findings of each kind that the page lists for each model. Fifteen second places of
+a rendered box filled the first screen."""
 _ENVIRONMENT = jinja2.Environment(
     loader=jinja2.PackageLoader("jaxsfm.report.page", "."),
     autoescape=True,
