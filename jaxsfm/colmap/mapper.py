@@ -6,7 +6,7 @@ parts of the scene that nothing connects to it.
 
 import dataclasses
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import pycolmap
@@ -112,6 +112,13 @@ def _order(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstructio
 def registered(model: pycolmap.Reconstruction) -> set[str]:
     """Names of the images that have a pose."""
     return {model.image(i).name for i in model.reg_image_ids()}
+
+
+def take_out(model: pycolmap.Reconstruction, names: Collection[str]) -> None:
+    """Take the poses of images away, and the points that fewer than two images still see."""
+    for k in sorted(model.reg_image_ids()):
+        if model.image(k).name in names:
+            model.deregister_frame(model.image(k).frame_id)
 
 
 def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:

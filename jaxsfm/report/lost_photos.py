@@ -25,7 +25,6 @@ from jaxsfm.report.pair_outcomes import (
 )
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, Stage
-from jaxsfm.sfm.refine.passes import RefinementFigures
 
 
 def explained(
@@ -56,7 +55,7 @@ def explained(
     return dataclasses.replace(
         report,
         view_graph=view_graph_report(groups, models[0] if models else (), pairs),
-        lost=_lost_photos(groups, models, pairs, _taken_out(report.refinement)),
+        lost=_lost_photos(groups, models, pairs, _taken_out(report)),
         no_model=None if models else _no_model(pairs),
     )
 
@@ -123,20 +122,28 @@ def _lost_photos(
     return sorted(lost, key=lambda photo: photo.image)
 
 
-def _taken_out(refinement: Sequence[RefinementFigures | None]) -> dict[str, str]:
-    """Why refinement took photos out of a model, by name."""
-    return {
-        at.name: (
-            f"refinement found a place for it, but {at.doubt}"
-            if at.doubt
-            else f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
-            f"{at.candidates} points that it should show, and only {at.held} points hold it in "
-            "the model"
+def _taken_out(report: RunReport) -> dict[str, str]:
+    """Why photos were taken out of a model, by name."""
+    why = {
+        name: (
+            "the mapper gave it a pose, but its matches with the photos before and after it do not "
+            "agree with that pose"
         )
-        for each in refinement
-        for at in (each.placed if each else ())
-        if at.doubt or at.held is not None
+        for check in report.checks
+        if check
+        for name in check.taken_out
     }
+    for each in report.refinement:
+        for at in each.placed if each else ():
+            if at.doubt:
+                why[at.name] = f"refinement found a place for it, but {at.doubt}"
+            elif at.held is not None:
+                why[at.name] = (
+                    f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
+                    f"{at.candidates} points that it should show, and only {at.held} points hold "
+                    "it in the model"
+                )
+    return why
 
 
 def _stage(own: Sequence[PairRow], connected: bool) -> tuple[Stage, str]:

@@ -14,13 +14,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.mapper import Attempt, MapOptions
+from jaxsfm.colmap.mapper import Attempt, MapOptions, take_out
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
-from jaxsfm.sfm.check.model_check import Alternative, Basis, ModelCheck
+from jaxsfm.sfm.check.model_check import MIN_VIEWS, Alternative, Basis, ModelCheck
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import by_order, by_votes
 from jaxsfm.sfm.photo_order import neighbours, ordered, orders
@@ -100,6 +100,7 @@ def build_checked_models(
             if other.at_least_as_good_as(best):
                 best, other = other, best
                 checks, complete = _checks(best, given), False
+        checks = _without_strays(best, checks, given)
         if not complete:
             checks = rounds.with_second_places(best, checks)
         rounds.go_back_to(best)
@@ -130,6 +131,33 @@ def _checks(made: Round, given: VerifiedPairs) -> list[ModelCheck | None]:
         return dataclasses.replace(each.check, apart=apart)
 
     return [each and with_neighbours(each) for each in made.checks]
+
+
+def _without_strays(
+    made: Round, checks: Sequence[ModelCheck | None], given: VerifiedPairs
+) -> list[ModelCheck | None]:
+    """Take photos out of the models with which none of their neighbours there agrees.
+
+    A photo at the end of a model is often one whose pair with the next photo takes one wall for
+    another. Where photos contradict each other, nothing is taken out: neighbours may be the wrong
+    ones.
+
+    Returns:
+      the checks of the models that remain.
+    """
+    following = neighbours(given.two_views.keys())
+    told = list(checks)
+    for k, (model, done, check) in enumerate(zip(made.models, made.checks, checks, strict=True)):
+        if done is None or check is None or check.contradictions:
+            continue
+        inside = {name for group in check.groups for name in group}
+        beside = {name for pair in following & done.explained for name in pair}
+        against = {name for pair in following & done.against if inside >= {*pair} for name in pair}
+        strays = against - beside
+        if strays and len(inside - strays) >= MIN_VIEWS:
+            take_out(model, strays)
+            told[k] = check.without(strays)
+    return told
 
 
 def _stands(other: Round, *, beside: Round) -> bool:

@@ -77,6 +77,7 @@ def _check(row: dict) -> ModelCheck:
         other_places=[OtherPlace(**each) for each in row["other_places"]],
         alternative=row["alternative"] and Alternative(**row["alternative"]),
         apart=row["apart"],
+        taken_out=row["taken_out"],
     )
 
 

@@ -6,11 +6,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mapped import map_database, verified
+from room_scene import noisy_model
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.colmap import mapper
 from jaxsfm.colmap.database import drop_pairs, write_database
-from jaxsfm.colmap.mapper import MapOptions, build_models, initial_pairs
+from jaxsfm.colmap.mapper import (
+    MapOptions,
+    build_models,
+    initial_pairs,
+    registered,
+    take_out,
+)
 from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import PairResult, exhaustive_pairs
@@ -214,3 +221,15 @@ def test_one_missing_image_of_many_is_no_reason_to_try_again(monkeypatch, tmp_pa
     chain = {pair: two_view() for pair in zip(names, names[1:], strict=False)}
     calls = runs(monkeypatch, [[Model(names=names[:-1], points=9)]])
     assert len(build_models(tmp_path / "d.db", chain, ONE)[1]) == 1 == len(calls)
+
+
+def test_images_that_are_taken_out_leave_no_point_with_fewer_than_two_observations(rendered):
+    model = noisy_model(rendered, 0.0)
+    names = registered(model)
+    before = {k: point.track.length() for k, point in model.points3D.items()}
+    take_out(model, {"1.png", "3.png", "of no image"})
+    assert registered(model) == names - {"1.png", "3.png"}
+    left = {k: point.track.length() for k, point in model.points3D.items()}
+    assert min(left.values()) >= 2 and left.keys() < before.keys()
+    seen = {e.image_id for point in model.points3D.values() for e in point.track.elements}
+    assert seen == set(model.reg_image_ids())

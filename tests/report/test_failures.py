@@ -18,6 +18,7 @@ from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, photo_groups
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import ModelRow, PairRow
 from jaxsfm.report.summary import component_lines, help_lines
+from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG, Verdict
@@ -82,6 +83,7 @@ def explanation(
     known_camera=True,
     side=1600,
     refinement=(),
+    checks=(),
 ) -> RunReport:
     """A report for images of 1600 px with a known camera, all of whose pairs were tried."""
     if handed_on is None:
@@ -102,6 +104,7 @@ def explanation(
             for images in models
         ],
         refinement=refinement,
+        checks=list(checks),
     )
     sizes = dict.fromkeys(names, (side, side // 2))
     return explained_report(report, config or preset("default"), sizes, angles or {})
@@ -252,6 +255,19 @@ def test_an_image_that_refinement_placed_and_took_out_says_what_speaks_against_i
     (row,) = found["lost"]
     assert row["stage"] == "not confirmed"
     assert row["detail"].endswith(f"; refinement found a place for it, but {reason}")
+
+
+def test_an_image_that_its_neighbours_do_not_agree_with_says_so():
+    tried = {
+        ("a", "b"): counts(Status.VERIFIED, 500, 400),
+        ("b", "c"): counts(Status.VERIFIED, 90, 60),
+    }
+    check = ModelCheck(groups=[["a", "b"]], contradictions=[], other_places=[], taken_out=["c"])
+    found = explained(
+        "abc", tried, {("a", "b"): 300, ("b", "c"): 42}, [["a", "b"]], checks=[None, check]
+    )
+    (row,) = found["lost"]
+    assert row["stage"] == "not confirmed" and "photos before and after it" in row["detail"]
 
 
 # -- groups ----------------------------------------------------------------------------------------

@@ -67,6 +67,8 @@ class Run(NamedTuple):
     """The pairs that each check was told to be refuted before."""
     searched: list
     """The models in which second places were looked for."""
+    strays: list
+    """The models from which photos were taken, with these photos."""
 
 
 @pytest.fixture
@@ -130,6 +132,8 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
             lambda path: {p: v for p, v in (seconds or {}).items() if p in looked_for},
         )
         monkeypatch.setattr(module, "copy_geometries", copy)
+        strays: list[tuple] = []
+        monkeypatch.setattr(mapping, "take_out", lambda model, names: strays.append((model, names)))
         monkeypatch.setattr(mapping, "model_poses", places)
         monkeypatch.setattr(module, "build_models", build)
         monkeypatch.setattr(module, "drop_pairs", drop)
@@ -145,7 +149,9 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         made, figures, other = build_checked_models(pairs, database, config=config, options=OPTIONS)
         left = {tuple(pair) for pair in json.loads(database.read_text())}
         assert {tuple(pair) for pair in json.loads(verified.read_text())} == geometries.keys()
-        return Run(made, other, figures, given, sorted(geometries.keys() - left), told, searched)
+        return Run(
+            made, other, figures, given, sorted(geometries.keys() - left), told, searched, strays
+        )
 
     return run
 
@@ -601,6 +607,47 @@ def test_of_two_red_models_both_are_shown(rounds):
     (told,) = found.figures.checks
     assert told is not None and told.verdict == "red" and told.alternative is not None
     assert told.alternative.basis == "pairs" and told.alternative.contradicted == 60
+
+
+def strayed(pairs, *, wrong, against=()) -> Checked:
+    """All links agree with the model but those that are wrong."""
+    found = walked(pairs, against=against, agreeing=LINKS - {*wrong})
+    return found._replace(against={*wrong})
+
+
+def test_a_photo_with_which_no_neighbour_agrees_is_taken_out(rounds):
+    """The first photo of the walk, and one in its middle."""
+    wrong = [(WALK[0], WALK[1]), (WALK[3], WALK[4]), (WALK[4], WALK[5])]
+    found = rounds(lambda pairs: strayed(pairs, wrong=wrong), two_views=WALKED)
+    gone = {WALK[0], WALK[4], WALK[5]}
+    assert found.strays == [(found.models[0], gone)]
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == "green" and told.taken_out == sorted(gone)
+    assert told.groups == [WALK[1:4]]
+
+
+def test_a_photo_with_which_one_neighbour_agrees_stays_and_so_does_the_doubt(rounds):
+    apart = (WALK[2], WALK[3])
+    found = rounds(lambda pairs: strayed(pairs, wrong=[apart]), two_views=WALKED)
+    (told,) = found.figures.checks
+    assert found.strays == [] and told is not None
+    assert told.verdict == "amber" and told.apart == [[*apart]] and told.taken_out == []
+
+
+def test_nothing_is_taken_out_where_photos_contradict_each_other_or_few_would_remain(rounds):
+    first = (WALK[0], WALK[1])
+    found = rounds(lambda pairs: strayed(pairs, wrong=[first], against=[FALSE]), two_views=WALKED)
+    assert found.strays == [] and found.models
+    found = rounds(lambda pairs: strayed(pairs, wrong=LINKS - {first}), two_views=WALKED)
+    assert found.strays == []
+
+
+def test_neighbours_of_which_nothing_is_known_take_no_photo_out(rounds):
+    """Too few of their matches lie on the model."""
+    first = (WALK[0], WALK[1])
+    found = rounds(lambda pairs: walked(pairs, agreeing=LINKS - {first}), two_views=WALKED)
+    (told,) = found.figures.checks
+    assert found.strays == [] and told is not None and told.apart == [[*first]]
 
 
 def test_photos_that_are_in_no_model_raise_no_doubt(rounds):

@@ -42,7 +42,9 @@ attempts = st.builds(
     initial_pair=st.none() | st.sampled_from(PAIRS),
     registered=st.lists(st.integers(0, 99), max_size=3),
 )
-two = dataclasses.replace(check_of("green"), alternative=OTHER, apart=[NAMES[:2]])
+two = dataclasses.replace(
+    check_of("green"), alternative=OTHER, apart=[NAMES[:2]], taken_out=NAMES[3:]
+)
 checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red"), two])
 mappings = st.builds(
     MappingFigures,

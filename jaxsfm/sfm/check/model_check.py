@@ -1,6 +1,7 @@
 """The outcome of the check of a model, and the verdict that follows from it."""
 
 import dataclasses
+from collections.abc import Collection
 from typing import Literal
 
 from jaxsfm.io.pairs import Pair
@@ -82,6 +83,9 @@ class ModelCheck:
     apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Pairs of photos that follow each other by their names and were matched, but whose matches do
     not agree with the model. Sorted."""
+    taken_out: list[str] = dataclasses.field(default_factory=list)
+    """Photos that are not in the model any more, because their matches with the photos before and
+    after them did not agree with it. Sorted."""
 
     @property
     def verdict(self) -> VerdictColour:
@@ -89,3 +93,13 @@ class ModelCheck:
         if self.contradictions:
             return "red"
         return "amber" if self.other_places or self.alternative or self.apart else "green"
+
+    def without(self, names: Collection[str]) -> "ModelCheck":
+        """The check of the model from which photos have been taken out."""
+        groups = [[name for name in group if name not in names] for group in self.groups]
+        return dataclasses.replace(
+            self,
+            groups=sorted(filter(None, groups), key=lambda group: (-len(group), group)),
+            apart=[pair for pair in self.apart if not set(pair) & set(names)],
+            taken_out=sorted(names),
+        )
