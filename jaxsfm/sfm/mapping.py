@@ -10,7 +10,7 @@ stand, both models are returned.
 import dataclasses
 import logging
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -84,12 +84,13 @@ def build_checked_models(
       config: its `view_graph` and `checked` switch these parts on.
       on_image: called for every image that the mapper registers.
     """
+    following = neighbours(given.two_views.keys())
     with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
         rounds = Rounds(
             given, database, Path(scratch), config=config, options=options, on_image=on_image
         )
         best, other = by_votes(rounds, view_graph=config.view_graph), None
-        checks, complete = _checks(best, given), False
+        checks, complete = _checks(best, following), False
         if _green(checks):
             checks, complete = rounds.with_second_places(best, checks), True
         names = {name for pair in given.two_views for name in pair}
@@ -99,8 +100,8 @@ def build_checked_models(
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
                 best, other = other, best
-                checks, complete = _checks(best, given), False
-        checks = _without_strays(best, checks, given)
+                checks, complete = _checks(best, following), False
+        checks = _without_strays(best, checks, following)
         if not complete:
             checks = rounds.with_second_places(best, checks)
         rounds.go_back_to(best)
@@ -121,9 +122,8 @@ def _green(checks: Sequence[ModelCheck | None]) -> bool:
     return all(check is None or check.verdict == "green" for check in checks)
 
 
-def _checks(made: Round, given: VerifiedPairs) -> list[ModelCheck | None]:
+def _checks(made: Round, following: Set[Pair]) -> list[ModelCheck | None]:
     """The checks of the models, with the neighbours in an order that do not agree with them."""
-    following = neighbours(given.two_views.keys())
 
     def with_neighbours(each: Checked) -> ModelCheck:
         inside = {name for group in each.check.groups for name in group}
@@ -134,7 +134,7 @@ def _checks(made: Round, given: VerifiedPairs) -> list[ModelCheck | None]:
 
 
 def _without_strays(
-    made: Round, checks: Sequence[ModelCheck | None], given: VerifiedPairs
+    made: Round, checks: Sequence[ModelCheck | None], following: Set[Pair]
 ) -> list[ModelCheck | None]:
     """Take photos out of the models with which none of their neighbours there agrees.
 
@@ -145,7 +145,6 @@ def _without_strays(
     Returns:
       the checks of the models that remain.
     """
-    following = neighbours(given.two_views.keys())
     told = list(checks)
     for k, (model, done, check) in enumerate(zip(made.models, made.checks, checks, strict=True)):
         if done is None or check is None or check.contradictions:
