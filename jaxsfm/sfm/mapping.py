@@ -149,11 +149,9 @@ def _without_strays(
     for k, (model, done, check) in enumerate(zip(made.models, made.checks, checks, strict=True)):
         if done is None or check is None or check.contradictions:
             continue
-        inside = {name for group in check.groups for name in group}
         beside = {name for pair in following & done.explained for name in pair}
-        against = {name for pair in following & done.against if inside >= {*pair} for name in pair}
-        strays = against - beside
-        if strays and len(inside - strays) >= MIN_VIEWS:
+        strays = {name for pair in following & done.against for name in pair} - beside
+        if strays and sum(map(len, check.groups)) - len(strays) >= MIN_VIEWS:
             take_out(model, strays)
             told[k] = check.without(strays)
     return told
