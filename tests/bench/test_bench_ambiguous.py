@@ -131,7 +131,7 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     rows = json.loads(out.read_text())["rows"]
     assert [row["method"] for row in rows] == methods
     for row in rows:
-        assert row["images"] == 12 and row["outcome"] in OUTCOMES and row["size"] == 240
+        assert row["images"] == 15 and row["outcome"] in OUTCOMES and row["size"] == 240
         # A group is a part of a model, and COLMAP has nothing to say against its models.
         assert all(
             sum(own) <= count for own, count in zip(row["groups"], row["models"], strict=False)
@@ -141,7 +141,7 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     assert "wrong, not noticed" in text
 
     work = tmp_path / "work" / "synthetic-street" / "240" / "seed0"
-    assert len(list((work / "scene" / "images").glob("*.png"))) == 12
+    assert len(list((work / "scene" / "images").glob("*.png"))) == 15
     own, taken = (_files(work / method / "matches") for method in ("default", "colmap"))
     assert own == taken and own
     before = {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}
