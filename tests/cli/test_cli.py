@@ -522,7 +522,7 @@ def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(
     def gone(*_, **__):
         raise ImageError("view1.png: cannot be read")
 
-    monkeypatch.setattr("jaxsfm.sfm.reconstruction.refine_model", gone)
+    monkeypatch.setattr("jaxsfm.sfm.refined_models.refine_model", gone)
     report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
     assert report["models"][0]["registered"] == 3 and report["refinement"] == [None]
     assert "no refinement: view1.png" in capfd.readouterr().err
