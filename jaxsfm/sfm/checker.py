@@ -35,6 +35,12 @@ class VerifiedPairs(NamedTuple):
     photos: Photos
 
 
+def opened(model: "pycolmap.Reconstruction", photos: Photos) -> tuple[Model, DeviceImages]:
+    """A model in working pixels, and its photos."""
+    sizes = {name: photos.working_size(name) for name in registered(model)}
+    return Model.from_colmap(model, sizes), DeviceImages(photos.gray)
+
+
 class Checker(NamedTuple):
     """Checks models that were made from verified pairs."""
 
@@ -58,7 +64,9 @@ class Checker(NamedTuple):
         checks = []
         for each in models:
             try:
-                checks.append(check_model(*self._opened(each), matches, self._refinement()))
+                checks.append(
+                    check_model(*opened(each, self.given.photos), matches, self._refinement())
+                )
             except ImageError as error:  # a photo was deleted since; the model remains
                 logger.warning("a model was not checked: %s", error)
                 checks.append(None)
@@ -72,7 +80,10 @@ class Checker(NamedTuple):
             return check
         try:
             found = second_places(
-                *self._opened(model), self._matches(()), self._refinement(), done.against
+                *opened(model, self.given.photos),
+                self._matches(()),
+                self._refinement(),
+                done.against,
             )
         except ImageError as error:
             logger.warning("no second places were looked for: %s", error)
@@ -85,9 +96,3 @@ class Checker(NamedTuple):
 
     def _refinement(self) -> Refinement:
         return self.config.refinement or Refinement()
-
-    def _opened(self, model: "pycolmap.Reconstruction") -> tuple[Model, DeviceImages]:
-        """A model in working pixels, and its photos."""
-        photos = self.given.photos
-        sizes = {name: photos.working_size(name) for name in registered(model)}
-        return Model.from_colmap(model, sizes), DeviceImages(photos.gray)

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.mapper import MapOptions, registered
-from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.model_folders import colour_points
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.placed_views import Placed, doubts
+from jaxsfm.sfm.checker import opened
 from jaxsfm.sfm.photo_order import neighbours
-from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 
@@ -112,8 +111,7 @@ def _without_doubtful(
     new = {at.name: at.octave_px == 1 for at in done.placed if at.octave_px and not at.registered}
     if not new:
         return model, done
-    sizes = {name: photos.working_size(name) for name in registered(model)}
-    whole, images = Model.from_colmap(model, sizes), DeviceImages(photos.gray)
+    whole, images = opened(model, photos)
     found = doubts(whole, images, refinement, Placed(new, following, matches))
     if not found:
         return model, done

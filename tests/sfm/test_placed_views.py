@@ -25,9 +25,9 @@ def placed_before(own: int, others: int) -> Scene:
 
     The new view has observations of the wall alone, as alignment gives them.
     """
-    wall, (first, second) = (
-        big_wall(),
-        (picture(seed, left=-1.0, width=2.0, height=2.0, z=-0.002) for seed in (others, own)),
+    wall = big_wall()
+    first, second = (
+        picture(seed, left=-1.0, width=2.0, height=2.0, z=-0.002) for seed in (others, own)
     )
     seen = scene([([wall, first], cameras([-8.0, 0.0, 7.0])), ([wall, second], cameras([3.0]))])
     tracks = seen.model.tracks
@@ -61,7 +61,7 @@ def test_nothing_speaks_against_a_right_place(right):
     assert doubted(right, true_matches(right.model, 2, NEW)) == {}
 
 
-def test_a_view_that_shows_something_else_is_doubted_by_its_numbers(wrong, monkeypatch):
+def test_a_view_that_shows_something_else_is_doubted_by_its_numbers(wrong):
     (name,), (why,) = zip(*doubted(wrong).items(), strict=True)
     assert name == NAMES[NEW]
     tested, contradicted = placed_views.shown_by(wrong.model, wrong.images, REFINEMENT, NEW)
