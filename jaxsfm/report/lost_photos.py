@@ -133,6 +133,13 @@ def _taken_out(report: RunReport) -> dict[str, str]:
         if check
         for name in check.taken_out
     }
+    why |= {
+        name: "the mapper gave it a pose, but the other photos of its model contradict it"
+        for check in report.checks
+        if check
+        for group in check.told_apart
+        for name in group
+    }
     for each in report.refinement:
         for at in each.placed if each else ():
             if at.doubt:

@@ -53,6 +53,8 @@ class ModelVerdict(NamedTuple):
     """The other model of the same photos, if one was made."""
     neighbours: list[Finding]
     """Photos that follow each other and do not agree with the model."""
+    parts: list[Finding]
+    """Photos that were in one model, contradict each other there, and were told apart."""
     decisive: str
     """Photos that would decide between two places or two models; empty if there is no choice."""
     advice: str
@@ -98,6 +100,7 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
         places=[Finding(_fits(each), [each.image], each.pairs) for each in places],
         alternatives=[_other_model(check.alternative)] if check.alternative else [],
         neighbours=[Finding(_apart(pair), pair[:1], pair[1:]) for pair in check.apart],
+        parts=[_told_apart(check.told_apart)] if check.told_apart else [],
         decisive=_decides(check, places),
         advice=_advice(check, places),
     )
@@ -118,6 +121,7 @@ def _model_lines(verdict: ModelVerdict) -> list[str]:
         ("second place     ", verdict.places),
         ("other model      ", verdict.alternatives),
         ("neighbours       ", verdict.neighbours),
+        ("told apart       ", verdict.parts),
     ):
         lines += [label + each.text for each in found[:MAX_FINDINGS]]
         if more := len(found[MAX_FINDINGS:]):
@@ -163,6 +167,17 @@ def _apart(pair: Sequence[str]) -> str:
     return f"{first} and {second} follow each other, but their matches do not agree with the model"
 
 
+def _told_apart(groups: Sequence[list[str]]) -> Finding:
+    shown = "; ".join(named(group) for group in groups[:MAX_FINDINGS])
+    more = f"; and {len(groups) - MAX_FINDINGS} more" if len(groups) > MAX_FINDINGS else ""
+    return Finding(
+        "photos that contradict each other were in one model, and each group is by itself now: "
+        f"{shown}{more}",
+        groups[0],
+        [name for group in groups[1:] for name in group],
+    )
+
+
 def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
     """Which photos would decide between two places or two models; empty if there is nothing to."""
     if places:
@@ -171,6 +186,8 @@ def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
         way = f"from {named(check.alternative.elsewhere)} to the other photos"
     elif check.apart and check.verdict == "amber":
         way = f"from {shown_name(check.apart[0][0])} to {shown_name(check.apart[0][1])}"
+    elif check.told_apart and check.verdict == "amber":
+        way = f"from {named(check.told_apart[0])} to {named(check.told_apart[1])}"
     else:
         return ""
     return f"photos taken on the way {way}, if {_DECISIVE}"
@@ -183,6 +200,11 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
         return (
             f"do not use this model as it is: {instead}add photos taken on the way from one group "
             f"to the other, so that {_DECISIVE}, and run the same command again"
+        )
+    if colour == "amber" and check.told_apart:
+        return (
+            "look at each model by itself; each may be right, and what is missing is how they "
+            "belong together; add such photos and run the same command again"
         )
     if colour == "amber":
         unsure = places[0].image if places else other.elsewhere[0] if other else check.apart[0][1]

@@ -75,8 +75,12 @@ class Checker(NamedTuple):
     def with_second_places(
         self, model: "pycolmap.Reconstruction", done: Checked, check: ModelCheck
     ) -> ModelCheck:
-        """A check with the second places of the photos, unless photos contradict each other."""
-        if check.contradictions:
+        """A check with the second places of the photos.
+
+        They are not looked for if photos contradict each other, here or in other models: this
+        speaks against the model already.
+        """
+        if check.contradictions or check.told_apart:
             return check
         try:
             found = second_places(

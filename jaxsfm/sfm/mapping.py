@@ -4,7 +4,8 @@ Where photos contradict each other in a model, pairs that joined them are refute
 made again without them. So other ways to join the groups of photos are tried until the photos agree
 with one, or until no pair is left that joins the groups. The two hypotheses are described in
 `jaxsfm.sfm.hypotheses`. The second is tried if something speaks against the first one. If both
-stand, both models are returned.
+stand, both models are returned. Models in which photos contradict each other to the end are taken
+apart (`jaxsfm.sfm.told_apart`).
 """
 
 import dataclasses
@@ -76,8 +77,8 @@ def build_checked_models(
 ) -> Mapped:
     """Map verified pairs until no photo contradicts the others, with two hypotheses.
 
-    If photos still contradict each other after the last round, the best models are returned all the
-    same, and their checks say so. A round that leaves no model to check does not count.
+    If photos still contradict each other after the last round, the parts of the best models are
+    returned, and their checks say so. A round that leaves no model to check does not count.
 
     Args:
       database: where to write the pairs that the models were made from.
@@ -101,12 +102,16 @@ def build_checked_models(
             if other.at_least_as_good_as(best):
                 best, other = other, best
                 checks, complete = _checks(best, following), False
+        rounds.go_back_to(best)
+        red = best.contradicted() > 0
+        if red:
+            best, parts = rounds.told_apart(best)
+            checks = _checks(best, following, parts)
         checks = _without_strays(best, checks, following)
         if not complete:
             checks = rounds.with_second_places(best, checks)
-        rounds.go_back_to(best)
     alternative = []
-    if other is not None and checks[0] is not None and _stands(other, beside=best):
+    if other is not None and checks[0] is not None and _stands(other, red=red):
         told = _alternative(best, other)
         if told is not None:
             checks[0] = dataclasses.replace(checks[0], alternative=told)
@@ -122,13 +127,19 @@ def _green(checks: Sequence[ModelCheck | None]) -> bool:
     return all(check is None or check.verdict == "green" for check in checks)
 
 
-def _checks(made: Round, following: Set[Pair]) -> list[ModelCheck | None]:
-    """The checks of the models, with the neighbours in an order that do not agree with them."""
+def _checks(
+    made: Round, following: Set[Pair], parts: Sequence[list[str]] = ()
+) -> list[ModelCheck | None]:
+    """The checks of the models, with the neighbours in an order that do not agree with them.
+
+    Args:
+      parts: those that were told apart.
+    """
 
     def with_neighbours(each: Checked) -> ModelCheck:
         inside = {name for group in each.check.groups for name in group}
         apart = [list(p) for p in sorted(following - each.explained) if inside >= set(p)]
-        return dataclasses.replace(each.check, apart=apart)
+        return dataclasses.replace(each.check, apart=apart, told_apart=list(parts))
 
     return [each and with_neighbours(each) for each in made.checks]
 
@@ -157,9 +168,13 @@ def _without_strays(
     return told
 
 
-def _stands(other: Round, *, beside: Round) -> bool:
-    """Whether other models are worth showing: not if photos contradict these ones alone."""
-    return bool(other.checked_photos()) and (beside.contradicted() > 0 or not other.contradicted())
+def _stands(other: Round, *, red: bool) -> bool:
+    """Whether other models are worth showing: not if photos contradict these ones alone.
+
+    Args:
+      red: whether photos contradict the best models too.
+    """
+    return bool(other.checked_photos()) and (red or not other.contradicted())
 
 
 def _alternative(best: Round, other: Round) -> Alternative | None:

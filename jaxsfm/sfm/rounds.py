@@ -4,6 +4,7 @@ A hypothesis says which pairs are right. Each of its rounds has fewer pairs than
 check has refuted those that joined photos that contradict each other.
 """
 
+import dataclasses
 import functools
 import shutil
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -19,6 +20,7 @@ from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Basis, Contradiction, ModelCheck
 from jaxsfm.sfm.checker import Checker, VerifiedPairs
+from jaxsfm.sfm.told_apart import told_apart
 from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
@@ -86,19 +88,31 @@ class Round:
         """The number of points at which photos contradict each other."""
         return sum(c.contradicted for each in self._done() for c in each.check.contradictions)
 
+    def consistent_pairs(self) -> int:
+        """The number of pairs of photos, matched or not, whose places nothing contradicts: those in
+        the same part of a model."""
+        sizes = [len(part) for each in self._done() for part in each.parts]
+        return sum(size * (size - 1) // 2 for size in sizes)
+
     def checked_photos(self) -> set[str]:
         """The photos in models that were checked."""
         return {name for each in self._done() for group in each.check.groups for name in group}
 
     def at_least_as_good_as(self, other: "Round") -> bool:
-        """Compare the models: first by contradictions, then by size, then by their number.
+        """Compare the models: those that no photo contradicts first, then those with more photos.
 
-        A round without a model that could be checked is not as good as another one.
+        If photos contradict each other in both, the models can be told apart. What counts then is
+        how many photos are in the same part, and last the number of contradictions. A round without
+        a model that could be checked is not as good as another one.
         """
         if not self.checked_photos():
             return False
         if bool(self.contradicted()) != bool(other.contradicted()):
             return not self.contradicted()
+        if self.contradicted():
+            ours, theirs = self.consistent_pairs(), other.consistent_pairs()
+            if ours != theirs:
+                return ours > theirs
         ours, theirs = len(self.checked_photos()), len(other.checked_photos())
         if abs(ours - theirs) > FEWER * max(ours, theirs):
             return ours > theirs
@@ -156,6 +170,12 @@ class Rounds:
         checks = self._checker.check(models, refuted.pairs)
         self._last = Round(hypothesis.basis, models, verdicts, checks, refuted)
         return self._last
+
+    def told_apart(self, made: Round) -> tuple[Round, list[list[str]]]:
+        """The models of a round, taken apart where photos contradict each other; their parts."""
+        found = told_apart(made.models, made.checks, self._checker, self._options)
+        whole = dataclasses.replace(made, models=found.models, checks=found.checks)
+        return whole, found.told_apart
 
     def with_second_places(
         self, made: Round, checks: Sequence[ModelCheck | None]

@@ -14,7 +14,7 @@ from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 5
+FORMAT = 6
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 
@@ -78,6 +78,7 @@ def _check(row: dict) -> ModelCheck:
         alternative=row["alternative"] and Alternative(**row["alternative"]),
         apart=row["apart"],
         taken_out=row["taken_out"],
+        told_apart=row["told_apart"],
     )
 
 

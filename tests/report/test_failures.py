@@ -270,6 +270,20 @@ def test_an_image_that_its_neighbours_do_not_agree_with_says_so():
     assert row["stage"] == "not confirmed" and "photos before and after it" in row["detail"]
 
 
+def test_an_image_that_contradicts_the_model_it_was_in_says_so():
+    tried = {("a", "b"): counts(Status.VERIFIED, 500, 400)} | {
+        ("b", name): counts(Status.VERIFIED, 90, 60) for name in "cd"
+    }
+    parts = [["a", "b"], ["c"], ["d"]]
+    check = ModelCheck(groups=[["a", "b"]], contradictions=[], other_places=[], told_apart=parts)
+    verified = dict.fromkeys(tried, 42)
+    found = explained("abcd", tried, verified, [["a", "b"], ["d"]], checks=[check, None])
+    first, second = found["lost"]
+    assert first["image"] == "c" and first["stage"] == "not confirmed"
+    assert first["detail"].endswith("but the other photos of its model contradict it")
+    assert second["image"] == "d" and second["stage"] == "other model"  # it is in a model again
+
+
 # -- groups ----------------------------------------------------------------------------------------
 
 

@@ -79,6 +79,23 @@ def test_neighbours_that_disagree_are_amber_and_named():
     assert f"look whether {NAMES[4]} stands where the model has it; if" in advice
 
 
+def test_photos_that_were_told_apart_are_amber_and_each_group_is_named():
+    groups = [NAMES[:3], NAMES[3:5], *([name] for name in NAMES[5:])]
+    verdict = model_verdict(dataclasses.replace(check_of("green"), told_apart=groups))
+    head, parts, decisive, advice = verdict_lines([verdict])
+    assert head == "verdict          amber: two models may explain these photos"
+    assert parts == (
+        "told apart       photos that contradict each other were in one model, and each group is "
+        f"by itself now: {', '.join(NAMES[:3])}; {NAMES[3]}, {NAMES[4]}; {NAMES[5]}; and 3 more"
+    )
+    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in decisive
+    assert "look at each model by itself" in advice
+    (found,) = verdict.parts
+    assert found.images == NAMES[:3] and found.others == NAMES[3:]
+    (found,) = model_verdict(dataclasses.replace(check_of("green"), told_apart=groups[:3])).parts
+    assert found.text.endswith(f"; {NAMES[5]}")
+
+
 def test_a_red_model_points_to_the_other_one_and_to_what_speaks_against_it():
     other = dataclasses.replace(OTHER, basis="pairs", contradicted=7)
     verdict = model_verdict(dataclasses.replace(check_of("red"), alternative=other))

@@ -9,7 +9,16 @@ from oracles import grouped
 from strategies import rng_of, seeds
 
 from jaxsfm.sfm.check.agreement import Agreement
-from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, MIN_TESTED, group_views, share
+from jaxsfm.sfm.check.grouping import (
+    MAX_CONTRADICTED,
+    MIN_SHARED,
+    MIN_TESTED,
+    Grouping,
+    OpposedGroups,
+    group_views,
+    parts,
+    share,
+)
 
 
 def counts(views: int, pairs: dict[tuple[int, int], tuple[int, int]]) -> Agreement:
@@ -135,3 +144,68 @@ def test_what_agrees_most_surely_is_joined_first():
     got = group_views(counts(3, pairs))
     assert got.groups == [[1, 2], [0]]
     assert got.contradictions[0][1:] == (600, 100)
+
+
+def observed(points: dict[tuple[int, ...], int]) -> tuple[np.ndarray, np.ndarray]:
+    """Observations of so many points by these views each."""
+    view, point, count = [], [], 0
+    for views, many in points.items():
+        for _ in range(many):
+            view += views
+            point += [count] * len(views)
+            count += 1
+    return np.asarray(view, int), np.asarray(point, int)
+
+
+def opposing(groups: list[list[int]], *pairs: tuple[int, int]) -> Grouping:
+    return Grouping(groups, [OpposedGroups((groups[a], groups[b]), 100, 50) for a, b in pairs])
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds)
+def test_no_part_holds_groups_that_contradict_each_other_and_none_could_be_joined(seed):
+    """The order of the groups has no effect."""
+    rng = rng_of(seed)
+    sizes = rng.integers(1, 4, int(rng.integers(1, 7)))
+    views = rng.permutation(int(sizes.sum()))
+    groups = [sorted(each.tolist()) for each in np.split(views, np.cumsum(sizes)[:-1])]
+    pairs = list(itertools.combinations(range(len(groups)), 2))
+    against = [pair for pair in pairs if rng.random() < 0.4]
+    # All sums of these are different, so what is joined first is certain.
+    shared = {pair: 2 ** int(k) for pair, k in zip(pairs, rng.permutation(len(pairs)), strict=True)}
+    seen = observed({(groups[a][0], groups[b][-1]): n for (a, b), n in shared.items()})
+    found = parts(opposing(groups, *against), *seen)
+    assert sorted(v for part in found for v in part) == list(range(len(views)))
+    part_of = {v: k for k, part in enumerate(found) for v in part}
+    where = [{part_of[v] for v in group} for group in groups]
+    assert all(len(each) == 1 for each in where)
+    assert all(where[a] != where[b] for a, b in against)
+    at = [min(each) for each in where]
+    for one, other in itertools.combinations(range(len(found)), 2):
+        between = [(a, b) for a, b in pairs if {at[a], at[b]} == {one, other}]
+        opposed = any(pair in against for pair in between)
+        assert opposed or sum(shared[pair] for pair in between) < MIN_SHARED
+    order = rng.permutation(len(groups)).tolist()
+    place = {old: new for new, old in enumerate(order)}
+    turned = opposing([groups[k] for k in order], *((place[a], place[b]) for a, b in against))
+    assert parts(turned, *seen) == found
+    assert [len(part) for part in found] == sorted(map(len, found), reverse=True)
+
+
+@pytest.mark.parametrize(("shared", "count"), [(MIN_SHARED - 1, 3), (MIN_SHARED, 2)])
+def test_a_group_goes_with_the_one_that_it_shares_points_with(shared, count):
+    """Group 2 contradicts nobody; groups 0 and 1 share more, but contradict each other."""
+    groups = [[0, 1], [2, 3], [4]]
+    seen = observed({(0, 2): 500, (3, 4): shared, (1, 4): 10})
+    assert len(parts(opposing(groups, (0, 1)), *seen)) == count
+
+
+def test_points_that_several_views_of_a_group_see_count_once():
+    seen = observed({(0, 1, 2, 3): MIN_SHARED - 1})
+    assert len(parts(opposing([[0, 1], [2, 3]]), *seen)) == 2
+
+
+def test_a_group_joins_no_part_that_holds_what_it_contradicts():
+    """Groups 0 and 1 share most and are joined; group 2 contradicts 1, so it cannot join 0."""
+    seen = observed({(0, 1): 500, (0, 2): 400, (1, 2): 300})
+    assert parts(opposing([[0], [1], [2]], (1, 2)), *seen) == [[0, 1], [2]]

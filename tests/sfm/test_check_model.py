@@ -68,6 +68,7 @@ def test_a_right_model_is_green_and_explains_its_pairs(right):
     found = checked(right, results)
     assert found is not None and found.check.verdict == "green"
     assert found.check.groups == [FIRST + OTHERS] and found.check.other_places == []
+    assert found.parts == found.check.groups
     assert not found.refuted and not found.suspected and not found.against
     assert found.explained == {result.pair for result in results}
 
@@ -80,7 +81,7 @@ def test_two_walls_that_are_taken_for_one_are_red_and_the_pairs_that_join_them_a
     results = of_all_pairs(seen)
     found = checked(seen, results)
     assert found is not None and found.check.verdict == "red"
-    assert found.check.groups == [FIRST, OTHERS]
+    assert found.check.groups == [FIRST, OTHERS] == found.parts
     (told,) = found.check.contradictions
     assert (told.images, told.others) == (FIRST, OTHERS)
     assert MAX_CONTRADICTED * told.tested < told.contradicted < told.tested

@@ -25,6 +25,7 @@ from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import MAX_ROUNDS
 from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
+from jaxsfm.sfm.told_apart import Parts
 
 A, B, C, D, E = PAIRS = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d"), ("d", "e")]
 OPTIONS = MapOptions(seed=3)
@@ -45,6 +46,7 @@ def outcome(refuted=(), suspected=(), explained=()) -> Checked:
         {pair: contradiction(pair) for pair in suspected},
         set(explained),
         set(),
+        [["a"]],
     )
 
 
@@ -363,7 +365,7 @@ def test_the_best_round_is_returned_not_the_last(rounds):
         refuted = [p for p in PAIRS if p in pairs][:1]
         worse = contradiction(refuted[0], {5: 90, 4: 20}.get(len(pairs), 60))
         check = ModelCheck(groups=[["a"]], contradictions=[worse], other_places=[])
-        return Checked(check, {refuted[0]: worse}, {}, set(), set())
+        return Checked(check, {refuted[0]: worse}, {}, set(), set(), [["a"]])
 
     found = rounds(check)
     assert len(found.rounds) == MAX_ROUNDS and found.models == [frozenset(set(PAIRS) - {A})]
@@ -674,9 +676,50 @@ def test_a_larger_model_is_better_than_a_smaller_one_with_fewer_contradictions(r
             contradictions=[worse],
             other_places=[],
         )
-        return Checked(check, {A: worse} if whole else {}, {}, set(), set())
+        return Checked(check, {A: worse} if whole else {}, {}, set(), set(), [["a"]])
 
     assert rounds(check).models == [frozenset(PAIRS)]
+
+
+def test_of_red_rounds_the_one_with_most_photos_in_the_same_part_is_the_result(rounds):
+    """The first round has more photos, in small parts; the second has one large part."""
+    names = [f"photo{k**2}" for k in range(8)]
+
+    def check(pairs):
+        first = A in pairs
+        worse = contradiction(A if first else B)
+        check = ModelCheck(
+            groups=[names if first else names[:6]], contradictions=[worse], other_places=[]
+        )
+        # 4 * 4 / 2 and 5 * 4 / 2 pairs of photos, less those of a photo with itself
+        apart = [names[:4], names[4:]] if first else [[*names[:6]]]
+        return Checked(check, {A: worse} if first else {}, {}, set(), set(), apart)
+
+    assert rounds(check).models == [frozenset(set(PAIRS) - {A})]
+
+
+def test_what_is_red_to_the_end_is_told_apart_and_amber(rounds, monkeypatch):
+    """The other model of the round has no contradictions, but the scene repeats itself."""
+    parts, asked = [["a", "b", "c"], ["d"]], []
+
+    def told_apart(models, checks, checker, options):
+        asked.append((models, [check.check.verdict for check in checks], options))
+        left = [outcome(), outcome()]
+        return Parts([frozenset("abc"), models[1]], left, parts)
+
+    monkeypatch.setattr(module, "told_apart", told_apart)
+    tries = itertools.cycle([outcome(refuted=[A]), outcome()])
+    found = rounds(lambda pairs: next(tries), models=2)
+    (((_, whole), verdicts, options),) = asked
+    assert verdicts == ["red", "green"] and options is OPTIONS
+    assert found.models == [frozenset("abc"), whole] and found.searched == []
+    assert [told and told.verdict for told in found.figures.checks] == ["amber", "amber"]
+    assert [told and told.told_apart for told in found.figures.checks] == [parts, parts]
+
+
+def test_models_that_nothing_contradicts_are_not_told_apart(rounds, monkeypatch):
+    monkeypatch.delattr(module, "told_apart")
+    assert rounds(lambda pairs: outcome(explained=pairs)).rounds == [set(PAIRS)]
 
 
 def test_strong_pairs_need_a_right_rotation_also_beside_second_geometries(rounds):

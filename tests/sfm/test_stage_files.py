@@ -43,7 +43,11 @@ attempts = st.builds(
     registered=st.lists(st.integers(0, 99), max_size=3),
 )
 two = dataclasses.replace(
-    check_of("green"), alternative=OTHER, apart=[NAMES[:2]], taken_out=NAMES[3:]
+    check_of("green"),
+    alternative=OTHER,
+    apart=[NAMES[:2]],
+    taken_out=NAMES[3:],
+    told_apart=[NAMES[:3]],
 )
 checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red"), two])
 mappings = st.builds(

@@ -10,7 +10,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import Agreement, agreement, thinned
-from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, share
+from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, parts, share
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.check.other_places import Refused, other_places
 from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
@@ -61,6 +61,9 @@ class Checked(NamedTuple):
     """Pairs that agree with the model and join no groups that contradict each other."""
     against: set[Pair]
     """Pairs that do not agree with the model."""
+    parts: list[list[str]]
+    """The photos in parts in which no groups contradict each other, the largest first. A model
+    without contradictions is one part."""
 
 
 def check_model(
@@ -83,6 +86,7 @@ def check_model(
     """
     if len(model.views) < MIN_VIEWS or len(model.tracks.points) < MIN_POINTS:
         return None
+    seen = model.tracks
     model = thinned(model)
     names = [view.name for view in model.views]
     found = agreement(model, images, refinement)
@@ -106,7 +110,9 @@ def check_model(
     check = ModelCheck(groups=groups, contradictions=contradictions, other_places=[])
     agreeing = {pair for pair, fit in fits.items() if fit >= MIN_FIT}
     explained = {p for p in agreeing if not any(each.joined_by(p) for each in contradictions)}
-    return Checked(check, refuted, suspected, explained, fits.keys() - agreeing)
+    whole = parts(grouping, seen.view, seen.point) if contradictions else [range(len(names))]
+    apart = [sorted(names[k] for k in part) for part in whole]
+    return Checked(check, refuted, suspected, explained, fits.keys() - agreeing, apart)
 
 
 def second_places(

@@ -11,8 +11,9 @@ MIN_VIEWS = 3
 """
 VerdictColour = Literal["green", "amber", "red"]
 """Green: nothing speaks against the model. Amber: another model may explain the photos as well.
-Some fit into the model in a second place, another model was made, or photos that follow each other
-do not agree with the model. Red: groups of its photos contradict each other."""
+Some fit into the model in a second place, another model was made, photos that follow each other do
+not agree with the model, or photos of the run contradicted each other and were told apart. Red:
+groups of its photos contradict each other."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,13 +87,18 @@ class ModelCheck:
     taken_out: list[str] = dataclasses.field(default_factory=list)
     """Photos that are not in the model any more, because their matches with the photos before and
     after them did not agree with it. Sorted."""
+    told_apart: list[list[str]] = dataclasses.field(default_factory=list)
+    """Groups of photos, the largest first, that were in one model with others which they
+    contradict. Each group of three photos or more is a model of its own now. They are the same for
+    all models of a run: where there are any, the scene repeats itself, also elsewhere."""
 
     @property
     def verdict(self) -> VerdictColour:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        return "amber" if self.other_places or self.alternative or self.apart else "green"
+        doubts = self.other_places or self.alternative or self.apart or self.told_apart
+        return "amber" if doubts else "green"
 
     def without(self, names: Collection[str]) -> "ModelCheck":
         """The check of the model from which photos have been taken out."""
