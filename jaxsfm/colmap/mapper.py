@@ -121,6 +121,13 @@ def take_out(model: pycolmap.Reconstruction, names: Collection[str]) -> None:
             model.deregister_frame(model.image(k).frame_id)
 
 
+def part_of(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap.Reconstruction:
+    """A copy of a model with these images only, and the points that two of them see."""
+    part = pycolmap.Reconstruction(model)
+    take_out(part, registered(model) - set(names))
+    return part
+
+
 def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:
     """Whether the best model has (nearly) all images that a chain of pairs connects to it."""
     if not models:

@@ -1,15 +1,16 @@
 """Models in which photos contradict each other, taken apart into models in which none do."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
-
-import pycolmap
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
-from jaxsfm.colmap.mapper import MapOptions, registered, take_out
+from jaxsfm.colmap.mapper import MapOptions, part_of
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.checker import Checker
+
+if TYPE_CHECKING:
+    import pycolmap
 
 LOSS_PX = 2.0
 """Scale of the loss of the bundle adjustment, working pixels. Keypoints that are not refined are
@@ -19,7 +20,7 @@ one or two pixels off, and false matches of the former model much further."""
 class Parts(NamedTuple):
     """Models and their checks, and what they were made from."""
 
-    models: list[pycolmap.Reconstruction]
+    models: "list[pycolmap.Reconstruction]"
     """The one with most images first."""
     checks: list[Checked | None]
     told_apart: list[list[str]]
@@ -27,7 +28,7 @@ class Parts(NamedTuple):
 
 
 def told_apart(
-    models: Sequence[pycolmap.Reconstruction],
+    models: "Sequence[pycolmap.Reconstruction]",
     checks: Sequence[Checked | None],
     checker: Checker,
     options: MapOptions,
@@ -38,7 +39,7 @@ def told_apart(
     checked again. Photos of parts with fewer than `MIN_VIEWS` are in no model any more. A model
     stays as it is if no part of it would be left.
     """
-    found: list[tuple[pycolmap.Reconstruction, Checked | None]] = []
+    found: "list[tuple[pycolmap.Reconstruction, Checked | None]]" = []
     groups: list[list[str]] = []
     waiting = list(zip(models, checks, strict=True))
     while waiting:
@@ -61,15 +62,14 @@ def told_apart(
 
 
 def _parts(
-    model: pycolmap.Reconstruction, done: Checked, checker: Checker, options: MapOptions
-) -> list[tuple[pycolmap.Reconstruction, Checked]]:
+    model: "pycolmap.Reconstruction", done: Checked, checker: Checker, options: MapOptions
+) -> "list[tuple[pycolmap.Reconstruction, Checked]]":
     """The parts of a model, checked; none if it is whole, or if all are too small."""
     made = []
     for part in done.parts if len(done.parts) > 1 else ():
         if len(part) < MIN_VIEWS:
             continue
-        alone = pycolmap.Reconstruction(model)
-        take_out(alone, registered(model) - set(part))
+        alone = part_of(model, part)
         bundle_adjust(
             alone,
             loss_px=LOSS_PX * options.scale,
