@@ -39,7 +39,7 @@ def told_apart(
     checked again. Photos of parts with fewer than `MIN_VIEWS` are in no model any more. A model
     stays as it is if no part of it would be left.
     """
-    found: "list[tuple[pycolmap.Reconstruction, Checked | None]]" = []
+    found: list[tuple[pycolmap.Reconstruction, Checked | None]] = []
     groups: list[list[str]] = []
     waiting = list(zip(models, checks, strict=True))
     while waiting:
