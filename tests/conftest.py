@@ -16,11 +16,6 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="jaxsfm-compiled-")
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
-elif hasattr(os, "sched_setaffinity"):
-    # Each worker has a processor of its own: threads that wait for each other's processor spin.
-    _all = sorted(os.sched_getaffinity(0))
-    _worker = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
-    os.sched_setaffinity(0, {_all[_worker % len(_all)]})
 
 import jax
 import numpy as np
