@@ -12,6 +12,8 @@ from jaxsfm.sfm.checker import Checker
 if TYPE_CHECKING:
     import pycolmap
 
+CheckedModel = tuple["pycolmap.Reconstruction", Checked | None]
+"""A model and its check; None where it was not checked."""
 LOSS_PX = 2.0
 """Scale of the loss of the bundle adjustment, working pixels. Keypoints that are not refined are
 one or two pixels off, and false matches of the former model much further."""
@@ -39,44 +41,44 @@ def told_apart(
     checked again. Photos of parts with fewer than `MIN_VIEWS` are in no model any more. A model
     stays as it is if no part of it would be left.
     """
-    found: list[tuple[pycolmap.Reconstruction, Checked | None]] = []
+    made: list[CheckedModel] = []
     groups: list[list[str]] = []
-    waiting = list(zip(models, checks, strict=True))
-    while waiting:
-        model, done = waiting.pop(0)
-        made = [] if done is None else _parts(model, done, checker, options)
-        if done is None or not made:
-            found.append((model, done))
-        else:
-            groups += done.parts
-            waiting += made
+    for each in zip(models, checks, strict=True):
+        parts, names = _parts(each, checker, options)
+        made += parts
+        groups += names
     if groups:
-        found.sort(key=lambda each: -each[0].num_reg_images())
-    # A part that was taken apart again is not a group.
-    last = [group for group in groups if not any(set(g) < set(group) for g in groups)]
+        made.sort(key=lambda each: -each[0].num_reg_images())
     return Parts(
-        [model for model, _ in found],
-        [done for _, done in found],
-        sorted(last, key=lambda group: (-len(group), group)),
+        [model for model, _ in made],
+        [done for _, done in made],
+        sorted(groups, key=lambda group: (-len(group), group)),
     )
 
 
 def _parts(
-    model: "pycolmap.Reconstruction", done: Checked, checker: Checker, options: MapOptions
-) -> "list[tuple[pycolmap.Reconstruction, Checked]]":
-    """The parts of a model, checked; none if it is whole, or if all are too small."""
-    made = []
-    for part in done.parts if len(done.parts) > 1 else ():
-        if len(part) < MIN_VIEWS:
-            continue
-        alone = part_of(model, part)
-        bundle_adjust(
-            alone,
-            loss_px=LOSS_PX * options.scale,
-            refine_intrinsics=options.refine_intrinsics,
-            threads=options.threads,
-        )
-        (again,) = checker.check([alone], ())
-        if again is not None:
-            made.append((alone, again))
-    return made
+    whole: CheckedModel, checker: Checker, options: MapOptions
+) -> tuple[list[CheckedModel], list[list[str]]]:
+    """The parts of a model, and the photos of each part, also of those that are too small.
+
+    If the model stays whole, it is the only part, and no photos are told apart.
+    """
+    model, done = whole
+    made: list[CheckedModel] = []
+    groups: list[list[str]] = []
+    for part in done.parts if done is not None and len(done.parts) > 1 else ():
+        names: list[list[str]] = []
+        if len(part) >= MIN_VIEWS:
+            alone = part_of(model, part)
+            bundle_adjust(
+                alone,
+                loss_px=LOSS_PX * options.scale,
+                refine_intrinsics=options.refine_intrinsics,
+                threads=options.threads,
+            )
+            (again,) = checker.check([alone], ())
+            if again is not None:
+                parts, names = _parts((alone, again), checker, options)
+                made += parts
+        groups += names or [part]
+    return (made, groups) if made else ([whole], [])

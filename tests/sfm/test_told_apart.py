@@ -113,3 +113,14 @@ def test_a_model_of_which_nothing_would_be_left_stays_whole(rendered, unchecked)
     assert found.models == [model] and found.told_apart == []
     (done,) = found.checks
     assert done is not None and done.check.verdict == "red"
+
+
+def test_a_part_is_named_also_if_another_model_has_some_of_its_photos_in_a_smaller_part(
+    rendered, monkeypatch
+):
+    """COLMAP's models may share photos."""
+    monkeypatch.setattr(module, "MIN_VIEWS", 2)
+    first, second = [NAMES[:3], NAMES[3:]], [NAMES[:2], NAMES[2:]]
+    model = noisy_model(rendered, 0.0)
+    found = taken_apart([model, model], [outcome(*first), outcome(*second)], FakeChecker())
+    assert sorted(found.told_apart) == sorted([*first, *second])
