@@ -383,3 +383,48 @@ def grouped(tested, contradicted, most: float, least: int) -> tuple[list[set], d
         if directions(one, other)
     }
     return [set(g) for g in sorted(groups, key=lambda g: (-len(g), sorted(g)))], against
+
+
+def mapper_matches(keypoints: dict, matches: dict, grid: int, per_pair: int) -> dict[tuple, set]:
+    """The matches (pairs of indices) that the mapper is given, by loops.
+
+    Args:
+      keypoints: by image, its keypoints (n, 2) and its size.
+      matches: by pair of images, the indices (m, 2).
+    """
+    partners: dict = {}
+    for (a, b), rows in matches.items():
+        for i, j in rows.tolist():
+            partners.setdefault((a, i), set()).add((b, j))
+            partners.setdefault((b, j), set()).add((a, i))
+    first, count = {}, 0
+    for name in sorted(keypoints):
+        first[name], count = count, count + len(keypoints[name][0])
+
+    def cell(name, index):
+        (x, y), (width, height) = keypoints[name][0][index], keypoints[name][1]
+        column, row = int((x + 0.5) / width * grid), int((y + 0.5) / height * grid)
+        return min(max(column, 0), grid - 1), min(max(row, 0), grid - 1)
+
+    def place(end):
+        return (first[end[0]] + end[1]) * 2654435761 % 2**32
+
+    def worth(ends):
+        one, other = (partners[end] for end in ends)
+        return -len(one & other), -len(one) - len(other), *map(place, ends)
+
+    chosen = set()
+    for (a, b), rows in matches.items():
+        ends = sorted((((a, i), (b, j)) for i, j in rows.tolist()), key=worth)
+        turn = {}
+        for match in ends:
+            before = ends[: ends.index(match)]
+            turn[match] = max(
+                sum(cell(*other[side]) == cell(*match[side]) for other in before) for side in (0, 1)
+            )
+        for match in sorted(ends, key=lambda match: (turn[match], worth(match)))[:per_pair]:
+            chosen |= {*match}
+    return {
+        (a, b): {(i, j) for i, j in rows.tolist() if {(a, i), (b, j)} <= chosen}
+        for (a, b), rows in matches.items()
+    }

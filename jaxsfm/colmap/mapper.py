@@ -8,6 +8,7 @@ import dataclasses
 import tempfile
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import pycolmap
 
@@ -58,7 +59,8 @@ class Attempt:
     """Number of images of every model, the largest first."""
 
 
-def _incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOptions:
+def incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOptions:
+    """The options as the incremental mapper takes them."""
     p = pycolmap.IncrementalPipelineOptions()
     p.ba_refine_focal_length = p.ba_refine_extra_params = options.refine_intrinsics
     p.ba_refine_principal_point = False
@@ -137,33 +139,66 @@ def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:
     return len(connected - names) <= MISSING * len(connected)
 
 
+class Mapped(NamedTuple):
+    """Models, and how they came about."""
+
+    models: list[pycolmap.Reconstruction]
+    """The one with most registered images first."""
+    attempts: list[Attempt]
+    """All runs of the mapper."""
+
+
 def build_models(
     database: Path,
     two_views: Mapping[Pair, TwoView],
     options: MapOptions,
     *,
     on_image: Callable[[], None] = lambda: None,
-) -> tuple[list[pycolmap.Reconstruction], list[Attempt]]:
-    """Map a verified database.
-
-    The incremental mapper may find no model, or leave out more than `MISSING` of the images that
-    verified pairs connect to its best model. It is then started again from other initial pairs
-    (`initial_pairs`, each image once, with lower demands). If there is still no model, the global
-    mapper is tried. An attempt that registers more images replaces the former ones, except for
-    models of other images.
+) -> Mapped:
+    """Map a verified database, again and again if images are left out.
 
     Args:
       on_image: called for every image that the incremental mapper registers.
 
+    Raises:
+      UserError: COLMAP failed.
+    """
+    first = first_models(database, options, on_image=on_image)
+    return with_left_out_images(first, database, two_views, options, on_image=on_image)
+
+
+def first_models(
+    database: Path, options: MapOptions, *, on_image: Callable[[], None] = lambda: None
+) -> Mapped:
+    """Run the mapper once; see `build_models`."""
+    models = _run(database, options, None, on_image)
+    return Mapped(models, [_attempt(options.mapper, None, models)])
+
+
+def with_left_out_images(
+    first: Mapped,
+    database: Path,
+    two_views: Mapping[Pair, TwoView],
+    options: MapOptions,
+    *,
+    on_image: Callable[[], None] = lambda: None,
+) -> Mapped:
+    """Start the mapper again if its first run found no model or left out connected images.
+
+    Images are connected if verified pairs join them to the best model, and at most `MISSING` of
+    them may be left out. The incremental mapper is started from other initial pairs
+    (`initial_pairs`, each image once, with lower demands). If there is still no model, the global
+    mapper is tried. An attempt that registers more images replaces the former ones, except for
+    models of other images.
+
     Returns:
-      the models, the one with most registered images first; all runs of the mapper.
+      `first` itself if nothing was tried.
 
     Raises:
       UserError: COLMAP failed.
     """
+    models, attempts = first.models, list(first.attempts)
     pairs = sorted(two_views)
-    models = _run(database, options, None, on_image)
-    attempts = [_attempt(options.mapper, None, models)]
     if options.mapper == "incremental":
         used: set[str] = set()
         for pair in initial_pairs(two_views):
@@ -181,7 +216,7 @@ def build_models(
             other = _run(database, dataclasses.replace(options, mapper="global"), None, on_image)
             attempts.append(_attempt("global", None, other))
             models = other
-    return models, attempts
+    return Mapped(models, attempts) if len(attempts) > len(first.attempts) else first
 
 
 def _attempt(mapper: Mapper, pair: Pair | None, models: list[pycolmap.Reconstruction]) -> Attempt:
@@ -203,7 +238,7 @@ def _run(
                 grace_s=1,  # it cannot be cancelled
             )
             return _order(list(found.values()))
-        p = _incremental_options(options)
+        p = incremental_options(options)
         if initial is not None:
             images = read_images(database)
             p.init_image_id1, p.init_image_id2 = (images[name][0] for name in initial)

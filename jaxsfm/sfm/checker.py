@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +14,7 @@ from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model, second_places
-from jaxsfm.sfm.check.model_check import ModelCheck
+from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck
 from jaxsfm.sfm.refine.device_images import DeviceImages
 
 if TYPE_CHECKING:
@@ -49,6 +49,9 @@ class Checker(NamedTuple):
     """Its `checked` switches all checks on, and its `refinement` says how patches are aligned."""
     seed: int
     """For RANSAC."""
+    with_all_points: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction]"
+    """Gives a model the points of all matches. The mapper's own points are few, and do not show
+    small differences."""
 
     def check(
         self, models: "Sequence[pycolmap.Reconstruction]", refuted: Collection[Pair]
@@ -63,10 +66,11 @@ class Checker(NamedTuple):
         matches = self._matches(refuted)
         checks = []
         for each in models:
+            if each.num_reg_images() < MIN_VIEWS:
+                checks.append(None)
+                continue
             try:
-                checks.append(
-                    check_model(*opened(each, self.given.photos), matches, self._refinement())
-                )
+                checks.append(check_model(*self._opened(each), matches, self._refinement()))
             except ImageError as error:  # a photo was deleted since; the model remains
                 logger.warning("a model was not checked: %s", error)
                 checks.append(None)
@@ -84,7 +88,7 @@ class Checker(NamedTuple):
             return check
         try:
             found = second_places(
-                *opened(model, self.given.photos),
+                *self._opened(model),
                 self._matches(()),
                 self._refinement(),
                 done.against,
@@ -93,6 +97,9 @@ class Checker(NamedTuple):
             logger.warning("no second places were looked for: %s", error)
             return check
         return dataclasses.replace(check, other_places=found)
+
+    def _opened(self, model: "pycolmap.Reconstruction") -> tuple[Model, DeviceImages]:
+        return opened(self.with_all_points(model), self.given.photos)
 
     def _matches(self, refuted: Collection[Pair]) -> VerifiedMatches:
         given = self.given

@@ -15,14 +15,8 @@ from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.photo_order import Order, follow
-from jaxsfm.sfm.rounds import (
-    NOTHING_REFUTED,
-    Hypothesis,
-    Refuted,
-    Round,
-    Rounds,
-    best_of,
-)
+from jaxsfm.sfm.round import NOTHING_REFUTED, Hypothesis, Refuted, Round, best_of
+from jaxsfm.sfm.rounds import Rounds
 from jaxsfm.sfm.view_graph import (
     TOLERANCE_DEG,
     Verdict,

@@ -25,7 +25,8 @@ from jaxsfm.sfm.check.model_check import MIN_VIEWS, Alternative, Basis, ModelChe
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import by_order, by_votes
 from jaxsfm.sfm.photo_order import neighbours, ordered, orders
-from jaxsfm.sfm.rounds import Round, Rounds
+from jaxsfm.sfm.round import Round
+from jaxsfm.sfm.rounds import Rounds
 from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ class Mapped(NamedTuple):
     """The outcome of mapping."""
 
     models: "list[pycolmap.Reconstruction]"
-    """The one with most images first; empty if there is none."""
+    """The one with most images first; empty if there is none. If they are to be refined, they have
+    the points of the matches that the mapper was given."""
     figures: MappingFigures
     alternative: "list[pycolmap.Reconstruction]"
     """Models that join the photos in another way; empty if there is no other way."""
@@ -110,12 +112,12 @@ def build_checked_models(
         checks = _without_strays(best, checks, following)
         if not complete:
             checks = rounds.with_second_places(best, checks)
-    alternative = []
-    if other is not None and checks[0] is not None and _stands(other, red=red):
-        told = _alternative(best, other)
-        if told is not None:
-            checks[0] = dataclasses.replace(checks[0], alternative=told)
-            alternative = other.models
+        alternative = []
+        if other is not None and checks[0] is not None and _stands(other, red=red):
+            told = _alternative(best, other)
+            if told is not None:
+                checks[0] = dataclasses.replace(checks[0], alternative=told)
+                alternative = rounds.with_all_points(other)
     figures = MappingFigures(
         verdicts=best.verdicts, attempts=rounds.attempts, checks=checks, basis=best.basis
     )

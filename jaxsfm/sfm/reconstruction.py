@@ -140,7 +140,8 @@ def reconstruct(
         verified = stages.stage("verified", key, verify_matches)
         aligning = config.refinement or Refinement()
         checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
-        key = digest(key, dataclasses.asdict(options), checking)
+        refines = config.refinement is not None
+        key = digest(key, dataclasses.asdict(options), checking, refines)
         verification = stage_files.read_verification(verified)
         mapped = stages.stage("mapped", key, build)
         mapping = stage_files.read_mapping(mapped)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model_folders import colour_points
+from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
@@ -29,7 +30,7 @@ class Believed(NamedTuple):
     """What says where photos stand that the mapper left out."""
 
     database: Path
-    """Of all photos, with those that are in no model."""
+    """Of all photos, with those that are in no model. Its verified matches become points."""
     matches: Mapping[Pair, PairResult]
     """The matches that no check has found to be false, original pixels."""
     verified: Collection[Pair]
@@ -58,6 +59,8 @@ def refine_models(
 ) -> RefinedModels:
     """Refine the models, if asked for, and colour their points.
 
+    Models that are refined have the points of a share of the matches; they get those of all.
+
     They are refined one after the other, each with the unmapped photos that none before took.
 
     Args:
@@ -68,6 +71,10 @@ def refine_models(
     unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
     evidence = Evidence(believed.matches, unmapped, options.seed)
     following = neighbours(believed.verified)
+
+    def whole(model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+        return with_all_points(model, believed.database, options)
+
     refined, figures = [], []
     for model in models:
         new, done = model, None
@@ -79,6 +86,7 @@ def refine_models(
                     refinement=config.refinement,
                     refine_intrinsics=options.refine_intrinsics,
                     evidence=evidence,
+                    with_all_points=whole,
                     threads=options.threads,
                     on_pass=on_pass,
                 )
@@ -88,6 +96,7 @@ def refine_models(
                     )
         except ImageError as error:  # a photo was deleted since; the mapper's model remains
             logger.warning("no refinement: %s", error)
+            new = whole(model)
         left = [image for image in evidence.unmapped if image.name not in registered(new)]
         evidence = evidence._replace(unmapped=left)
         refined.append(new)

@@ -9,12 +9,13 @@ from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.model_check import Alternative, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.mapping import MappingFigures
-from jaxsfm.sfm.refine.passes import PassFigures, RefinementFigures
+from jaxsfm.sfm.refine.one_pass import PassFigures
+from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 6
+FORMAT = 7
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 

@@ -128,10 +128,10 @@ def test_seed_threads_and_scale_reach_all_of_colmaps_options():
     """A scene without outliers comes back the same whatever they are."""
     options = MapOptions(seed=7, threads=1, scale=2.0)
     plain = pycolmap.IncrementalPipelineOptions().mapper
-    for got in (mapping._incremental_options(options), mapping._global_options(options)):
+    for got in (mapping.incremental_options(options), mapping._global_options(options)):
         assert (got.random_seed, got.mapper.random_seed) == (7, 7)
         assert (got.num_threads, got.mapper.num_threads) == (1, 1)
-    mapper = mapping._incremental_options(options).mapper
+    mapper = mapping.incremental_options(options).mapper
     for name in ("init_max_error", "abs_pose_max_error", "filter_max_reproj_error"):
         assert getattr(mapper, name) == 2 * getattr(plain, name)
 

@@ -132,14 +132,14 @@ def test_a_real_signal_ends_the_process_cleanly(scene, tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_during_refinement_keeps_features_and_matches(scene, tmp_path, monkeypatch, capsys):
-    import jaxsfm.sfm.refine.passes
+    import jaxsfm.sfm.refine.one_pass
 
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     args = ["reconstruct", str(scene / "images"), "--threads", "1", "--out", str(tmp_path / "out")]
     with monkeypatch.context() as patch:
-        patch.setattr(jaxsfm.sfm.refine.passes, "bundle_adjust", interrupted)
+        patch.setattr(jaxsfm.sfm.refine.one_pass, "bundle_adjust", interrupted)
         assert main(args) == 130
     assert len(list((tmp_path / "out" / "matches").glob("*/*.npz"))) == 3
     assert not (tmp_path / "out" / "sparse").exists()

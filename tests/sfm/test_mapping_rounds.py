@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench.synthetic import look_at
-from jaxsfm.colmap.mapper import Attempt, MapOptions
+from jaxsfm.colmap.mapper import Attempt, MapOptions, Mapped
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.two_views import PairGeometry, TwoView
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, make_pair
-from jaxsfm.sfm import checker, mapping
+from jaxsfm.sfm import checker, mapper_runs, mapping
 from jaxsfm.sfm import rounds as module
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
@@ -50,6 +50,13 @@ def outcome(refuted=(), suspected=(), explained=()) -> Checked:
     )
 
 
+class FakeModel(frozenset[Pair]):
+    """The pairs that a model was made from."""
+
+    def num_reg_images(self) -> int:
+        return 3
+
+
 class FakePhotos:
     gray = None
 
@@ -71,6 +78,8 @@ class Run(NamedTuple):
     """The models in which second places were looked for."""
     strays: list
     """The models from which photos were taken, with these photos."""
+    started: list
+    """The models for which the mapper was started again."""
 
 
 @pytest.fixture
@@ -90,18 +99,29 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         seconds: dict[Pair, TwoView] | None = None,
         places: Callable[[frozenset[Pair]], dict] = lambda pairs: {},
         gone: bool = False,
+        left_out: Callable[[frozenset[Pair]], bool] = lambda pairs: False,
     ) -> Run:
         given: list[set[Pair]] = []
+        started: list[frozenset[Pair]] = []
         told: list[set[Pair]] = []
         second: dict[frozenset[Pair], tuple] = {}
         searched: list[frozenset[Pair]] = []
 
-        def build(database, trusted, options, *, on_image):
+        def first(database, options, *, on_image):
             assert options is OPTIONS
-            given.append(set(trusted))
-            assert {tuple(pair) for pair in json.loads(database.read_text())} == given[-1]
+            pairs = frozenset(tuple(pair) for pair in json.loads(database.read_text()))
+            given.append(set(pairs))
             tried = Attempt(mapper="incremental", initial_pair=None, registered=[len(given)])
-            return [frozenset(trusted)] * models, [tried]
+            return Mapped([FakeModel(pairs)] * models, [tried])
+
+        def again(made, database, trusted, options, *, on_image):
+            assert options is OPTIONS and set(trusted) == given[-1]
+            if not left_out(made.models[0]):
+                return made
+            started.append(made.models[0])
+            tried = Attempt(mapper="incremental", initial_pair=A, registered=[-len(given)])
+            whole = FakeModel(made.models[0] | {("z", "z")})
+            return Mapped([whole] * models, [*made.attempts, tried])
 
         def checked(model, images, matches, refinement):
             assert matches.pairs == geometries.keys() and matches.seed == OPTIONS.seed
@@ -137,7 +157,8 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         strays: list[tuple] = []
         monkeypatch.setattr(mapping, "take_out", lambda model, names: strays.append((model, names)))
         monkeypatch.setattr(mapping, "model_poses", places)
-        monkeypatch.setattr(module, "build_models", build)
+        monkeypatch.setattr(mapper_runs, "first_models", first)
+        monkeypatch.setattr(mapper_runs, "with_left_out_images", again)
         monkeypatch.setattr(module, "drop_pairs", drop)
         monkeypatch.setattr(checker, "check_model", checked)
         monkeypatch.setattr(checker, "second_places", search)
@@ -152,7 +173,15 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         left = {tuple(pair) for pair in json.loads(database.read_text())}
         assert {tuple(pair) for pair in json.loads(verified.read_text())} == geometries.keys()
         return Run(
-            made, other, figures, given, sorted(geometries.keys() - left), told, searched, strays
+            made,
+            other,
+            figures,
+            given,
+            sorted(geometries.keys() - left),
+            told,
+            searched,
+            strays,
+            started,
         )
 
     return run
@@ -170,6 +199,20 @@ def test_a_model_without_contradictions_takes_one_round(rounds):
     assert found.figures.verdicts == {} and len(found.figures.attempts) == 1
     assert found.figures.checks == [outcome().check]
     assert found.models == [frozenset(PAIRS)]
+
+
+def test_the_mapper_is_started_again_only_if_no_photos_contradict_each_other(rounds):
+    """It leaves out photos in both rounds. What it finds then is checked."""
+
+    def check(pairs):
+        return outcome(refuted=[A] if A in pairs else [])
+
+    found = rounds(check, left_out=lambda pairs: True)
+    second = frozenset(set(PAIRS) - {A})
+    assert found.rounds == [set(PAIRS), set(PAIRS) - {A}]
+    assert found.started == [second] and len(found.told) == 3
+    assert found.models == [second | {("z", "z")}]
+    assert [a.registered for a in found.figures.attempts] == [[1], [2], [-2]]
 
 
 def test_pairs_that_are_refuted_are_not_given_to_the_next_rounds(rounds):

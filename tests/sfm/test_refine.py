@@ -14,11 +14,14 @@ from room_scene import (
     hidden,
     noisy_model,
     other_scene,
+    read_of,
     refine,
     view_of,
 )
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, room
+from jaxsfm.colmap.mapper import part_of, registered
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
@@ -26,6 +29,7 @@ from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import plane_affines
+from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.track_alignment import neighbourhoods
 
 # -- the whole refinement --------------------------------------------------------------------------
@@ -109,7 +113,7 @@ def test_a_view_that_agrees_with_nothing_keeps_its_observations_and_its_pose(ren
 
 def test_a_view_that_is_weak_in_one_pass_is_placed(rendered, monkeypatch):
     """The few observations that agree in the first are most of what it has in the second."""
-    import jaxsfm.sfm.refine.passes as module
+    import jaxsfm.sfm.refine.one_pass as module
 
     gather, calls = module._gather, []
 
@@ -131,22 +135,68 @@ def test_photos_that_agree_in_nothing_leave_the_model_as_it_was(rendered):
 
 
 def test_a_pass_that_loses_most_points_is_taken_back(rendered, monkeypatch):
-    from jaxsfm.sfm.refine import passes
+    from jaxsfm.sfm.refine import one_pass
 
-    adjust = passes._adjust
+    adjust = one_pass._adjust
 
     def loses(*arguments):
         reconstruction, model = adjust(*arguments)
         for point in list(reconstruction.point3D_ids())[25:]:
             reconstruction.delete_point3D(point)
-        return reconstruction, model
+        return one_pass.Refined(reconstruction, model)
 
-    monkeypatch.setattr(passes, "_adjust", loses)
+    monkeypatch.setattr(one_pass, "_adjust", loses)
     before = noisy_model(rendered, 1.0)
     after, figures = refine(before, rendered)
     assert [f.accepted for f in figures.passes] == [False]
     assert after.num_points3D() == before.num_points3D() > 50
     assert errors(after, rendered) == errors(before, rendered)
+
+
+def test_all_points_return_before_the_last_pass(rendered):
+    """The mapper's model has a sixth of the points."""
+    whole = noisy_model(rendered, 0.7)
+    use = rendered.visible & (np.arange(len(rendered.points)) % 6 == 0)[:, None]
+    few = noisy_model(rendered, 0.7, use=use)
+    asked = []
+
+    def with_all_points(model):
+        asked.append(model)
+        moved = dict(model_poses(model))
+        tracks = arrays(whole, rendered).tracks
+        views = [
+            dataclasses.replace(v, rotation=moved[v.name].rotation, centre=moved[v.name].centre)
+            for v in rendered.views
+        ]
+        return Model(views, tracks).to_colmap()
+
+    after, figures = refine_model(
+        few,
+        read_of(rendered),
+        refinement=Refinement(),
+        refine_intrinsics=False,
+        with_all_points=with_all_points,
+        threads=1,
+    )
+    (between,) = asked
+    assert between.num_points3D() < 0.3 * whole.num_points3D() < 0.35 * after.num_points3D()
+    assert [f.points for f in figures.passes] == [between.num_points3D(), after.num_points3D()]
+    assert max(errors(between, rendered)) < 0.5 * max(errors(few, rendered))
+    assert max(errors(after, rendered)) < 0.5 * max(errors(few, rendered))
+
+
+def test_all_points_return_if_the_passes_end_early(rendered):
+    few = noisy_model(rendered, 1.0)
+    images = {name: other_scene(k) for k, name in enumerate(rendered.images)}
+    after, figures = refine_model(
+        few,
+        read_of(rendered._replace(images=images)),
+        refinement=Refinement(),
+        refine_intrinsics=False,
+        with_all_points=lambda model: part_of(model, ["0.png", "1.png", "2.png"]),
+        threads=1,
+    )
+    assert len(figures.passes) == 1 and len(registered(after)) == 3 < len(registered(few))
 
 
 def test_working_sizes_are_widths_and_heights(rendered):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from room_scene import noisy_model, read_of
 
-from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.colmap.mapper import MapOptions, part_of, registered
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.sfm import refined_models as module
@@ -17,6 +17,7 @@ from jaxsfm.sfm.refined_models import Believed, refine_models
 NAMES = [f"{k}.png" for k in range(5)]
 NEW = NAMES[4]
 PAIRS = [(NAMES[k], NAMES[k + 1]) for k in range(4)]
+DATABASE, OPTIONS = Path("d.db"), MapOptions()
 
 
 def placement(*, registered: bool = False, octave_px: int | None = 1) -> Placement:
@@ -48,13 +49,18 @@ def refined(rendered, monkeypatch):
     def run(placed: Placement, against: dict, *, checked: bool = True, gone: bool = False):
         offered, asked = [], []
 
-        def refine_model(model, read, *, evidence, **_):
+        def refine_model(model, read, *, evidence, with_all_points, **_):
+            assert with_all_points("a model") == "whole"
             offered.append([image.name for image in evidence.unmapped])
             if gone:
                 raise ImageError("2.png: cannot be read")
             added = placed.octave_px and (placed.registered or offered[-1])
             new = noisy_model(rendered, 0.0) if added else model
             return new, RefinementFigures(passes=[], placed=[placed] if added else [])
+
+        def whole(model, database, options):
+            assert (database, options) == (DATABASE, OPTIONS)
+            return "whole" if model == "a model" else part_of(model, NAMES[:3])
 
         def doubts(model, images, refinement, given):
             asked.append(given)
@@ -64,13 +70,14 @@ def refined(rendered, monkeypatch):
         monkeypatch.setattr(module, "read_images", lambda path: cameras)
         monkeypatch.setattr(module, "refine_model", refine_model)
         monkeypatch.setattr(module, "doubts", doubts)
+        monkeypatch.setattr(module, "with_all_points", whole)
         monkeypatch.setattr(module, "colour_points", lambda model, rgb: None)
         made = refine_models(
             [small, small],
             FakePhotos(rendered),  # pyright: ignore[reportArgumentType]
-            Believed(Path(), {}, PAIRS),
+            Believed(DATABASE, {}, PAIRS),
             config=Config(refinement=Refinement(), checked=checked),
-            options=MapOptions(),
+            options=OPTIONS,
         )
         return made, offered, asked
 
@@ -113,7 +120,8 @@ def test_other_photos_are_not_asked_about(refined, placed, checked):
     assert asked == []
 
 
-def test_a_photo_that_went_away_leaves_the_mappers_models(refined, caplog):
+def test_a_photo_that_went_away_leaves_the_mappers_models_with_all_points(refined, caplog):
+    """Models with all points are those of three photos."""
     made, _, _ = refined(placement(), {}, gone=True)
-    assert made.figures == [None, None] and [len(registered(m)) for m in made.models] == [4, 4]
+    assert made.figures == [None, None] and [len(registered(m)) for m in made.models] == [3, 3]
     assert "2.png: cannot be read" in caplog.text

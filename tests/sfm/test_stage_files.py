@@ -9,7 +9,8 @@ from verdicts import OTHER, check_of
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.sfm.mapping import MappingFigures
-from jaxsfm.sfm.refine.passes import PassFigures, RefinementFigures
+from jaxsfm.sfm.refine.one_pass import PassFigures
+from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.stage_files import (
     VerificationFigures,

@@ -8,56 +8,28 @@ The reference keypoint stays where it is, because it defines the point. So the s
 keypoints over the views (1-2 px) goes, and a track reaches every view that shows its surface. Views
 that show too little to be aligned in this way are placed at the end, on the structure of the others
 (`jaxsfm.sfm.refine.weak_views`).
+
+A few hundred points for each view make the poses good, so all passes but the last one are done with
+the points of the matches that the mapper was given. Then all others return.
 """
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model, Sizes
-from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
+from jaxsfm.sfm.refine.one_pass import MIN_POINTS, PassFigures, PassSettings, Refined, run_pass
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
-from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
 from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views, remove_unconfirmed
 
 if TYPE_CHECKING:
     import pycolmap
-
-MIN_POINTS = 10
-"""A model with fewer points is not refined."""
-MIN_POINT_SHARE = 0.25
-"""A pass that keeps less of the points is taken back: the images do not agree well enough."""
-WEAK_COUNT, WEAK_SHARE = 30, 0.25
-"""A view is weak if fewer of its observations agree (in number, or as a share of those it had). It
-keeps its old observations in the pass: otherwise a night photo would hang on a handful."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PassFigures:
-    """The result of one pass."""
-
-    accepted: bool
-    """False: too little agreed, and the model before the pass stays."""
-    candidates: int
-    kept: int
-    """Observations of the tracks before the pass that agreed with their reference patch."""
-    dropped: int
-    added: int
-    weak_views: list[str]
-    """Images that kept their old observations in this pass, because too few agreed."""
-    points: int
-    """After the pass."""
-    reprojection_error_px: float
-    """Mean over the points, original pixels."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,28 +41,8 @@ class RefinementFigures:
     """One for each view that was weak in any pass, and for each image that the mapper left out."""
 
 
-def _gather(model: Model, blocks: Sequence[AlignedBlock]) -> tuple[Model, np.ndarray]:
-    """The model with its new tracks, and the indices of the weak views."""
-    tracks, count = model.tracks, len(model.views)
-    had = np.bincount(tracks.view, minlength=count)
-    agreed = np.zeros(count, int)
-    points = tracks.points.copy()
-    parts: list[Observations] = []
-    alive = np.zeros(len(points), bool)
-    for block in blocks:
-        points[block.rows] = block.patches.points
-        own = block.confirmed
-        alive[block.rows[own]] = True
-        parts += block.observations()
-        agreed += np.bincount(block.found.view[block.agrees & block.tracked], minlength=count)
-        agreed += np.bincount(block.patches.reference[own], minlength=count)
-    weak = np.flatnonzero(agreed < np.maximum(np.minimum(WEAK_COUNT, had), WEAK_SHARE * had))
-    # Weak views keep old observations of points that remain, where no new one took their place.
-    old = np.flatnonzero(np.isin(tracks.view, weak) & alive[tracks.point])
-    taken = np.concatenate([part.point * count + part.view for part in parts])
-    old = old[~np.isin(tracks.point[old] * count + tracks.view[old], taken)]
-    parts.append(tracks.select(old).observations)
-    return model.with_tracks(Tracks.from_parts(points, parts, ordered=True)), weak
+def _as_arrays(reconstruction: "pycolmap.Reconstruction", sizes: Sizes) -> Refined:
+    return Refined(reconstruction, Model.from_colmap(reconstruction, sizes))
 
 
 def _working_sizes(
@@ -121,6 +73,7 @@ def refine_model(
     refinement: Refinement,
     refine_intrinsics: bool,
     evidence: Evidence = NO_EVIDENCE,
+    with_all_points: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction] | None" = None,
     threads: int = -1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
@@ -136,46 +89,34 @@ def refine_model(
       read: intensities by image name; may be called several times per image.
       refine_intrinsics: whether bundle adjustment moves focal lengths and distortion.
       evidence: images that the mapper left out, and matches to place them and weak views by.
+      with_all_points: gives a model the points of all matches, before the last pass. None: it has
+        them already.
       threads: of bundle adjustment. With one thread the model is repeatable to the last byte.
 
     Raises:
       ImageError: an image of the model cannot be read any more.
     """
     sizes, evidence = _working_sizes(reconstruction, read, evidence)
-    model = Model.from_colmap(reconstruction, sizes)
-    images = DeviceImages(read)
+    images, settings = DeviceImages(read), PassSettings(refinement, refine_intrinsics, threads)
+    now = Refined(reconstruction, Model.from_colmap(reconstruction, sizes))
     figures: list[PassFigures] = []
     limits = AlignmentLimits.of(refinement)
     for number in range(refinement.passes):
-        if len(model.tracks.points) < MIN_POINTS or len(model.views) < 2:
+        if number > 0:
+            limits = limits._replace(max_shift_px=refinement.max_shift_px / 2)
+        if with_all_points is not None and number == refinement.passes - 1:
+            now, with_all_points = _as_arrays(with_all_points(now.reconstruction), sizes), None
+            limits = AlignmentLimits.of(refinement)  # the keypoints of new points are not aligned
+        if len(now.model.tracks.points) < MIN_POINTS or len(now.model.views) < 2:
             break
-        if number == 1:
-            limits = limits._replace(max_shift_px=limits.max_shift_px / 2)
-        blocks = list(align_blocks(model, images, refinement, limits))
-        aligned, weak = _gather(model, blocks)
-        weak_names = sorted(model.views[k].name for k in weak)
-        adjusted = _adjust(aligned, weak, sizes, refinement, refine_intrinsics, threads)
-        enough = max(MIN_POINTS, MIN_POINT_SHARE * len(model.tracks.points))
-        accepted = adjusted is not None and adjusted[0].num_points3D() >= enough
-        if adjusted is not None and accepted:
-            reconstruction, model = adjusted
-        agrees = np.concatenate([block.agrees for block in blocks])
-        tracked = np.concatenate([block.tracked for block in blocks])
-        figures.append(
-            PassFigures(
-                accepted=accepted,
-                candidates=len(agrees),
-                kept=int((agrees & tracked).sum()),
-                dropped=int((~agrees & tracked).sum()),
-                added=int((agrees & ~tracked).sum()),
-                weak_views=weak_names,
-                points=reconstruction.num_points3D(),
-                reprojection_error_px=reconstruction.compute_mean_reprojection_error(),
-            )
-        )
+        now, done = run_pass(now, images, sizes, limits, settings)
+        figures.append(done)
         on_pass()
-        if not accepted:
+        if not done.accepted:
             break
+    if with_all_points is not None:  # the passes ended early
+        now = _as_arrays(with_all_points(now.reconstruction), sizes)
+    reconstruction, model = now
     placed: list[Placement] = []
     # A view that was weak in any pass is placed: what little agreed in the first pass looks like
     # much in the next (58 of 153 observations after 22 of 393, and the camera 0.4 m off).
@@ -201,37 +142,3 @@ def refine_model(
             if model is not before:
                 reconstruction = model.to_colmap()
     return reconstruction, RefinementFigures(passes=figures, placed=placed)
-
-
-def _adjust(
-    model: Model,
-    weak: np.ndarray,
-    sizes: Sizes,
-    refinement: Refinement,
-    refine_intrinsics: bool,
-    threads: int,
-) -> "tuple[pycolmap.Reconstruction, Model] | None":
-    """Filter the observations and adjust the bundle, twice; None if (nearly) nothing is left.
-
-    Args:
-      weak: views whose observations were not aligned; they may have four times the error.
-    """
-    loss_px = float(np.median([view.mean_scale for view in model.views]))
-    weak_view = np.isin(np.arange(len(model.views)), weak)
-    limit = refinement.max_error_px * np.where(weak_view, 4.0, 1.0)
-    adjusted = None
-    # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
-    for slack in (4.0, 1.0):
-        good = model.errors_px() < slack * limit[model.tracks.view]
-        reconstruction = model.select(good).to_colmap()
-        if reconstruction.num_points3D() < MIN_POINTS:
-            return None
-        bundle_adjust(
-            reconstruction,
-            loss_px=loss_px,
-            refine_intrinsics=refine_intrinsics,
-            threads=threads,
-        )
-        model = Model.from_colmap(reconstruction, sizes)
-        adjusted = reconstruction, model
-    return adjusted

@@ -1,0 +1,39 @@
+"""Points for all verified matches of a model whose poses are known."""
+
+import tempfile
+from pathlib import Path
+
+import pycolmap
+
+from jaxsfm.colmap.mapper import MapOptions, incremental_options
+from jaxsfm.colmap.native import native
+
+
+def with_all_points(
+    model: pycolmap.Reconstruction, database: Path, options: MapOptions
+) -> pycolmap.Reconstruction:
+    """A copy of a model with the points of all verified matches of its images.
+
+    COLMAP triangulates the points, joins them to tracks, adjusts them, and drops observations that
+    are too far off. Poses and cameras stay.
+
+    Args:
+      database: with the images and keypoints of the model.
+
+    Raises:
+      UserError: COLMAP failed.
+    """
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        return native(
+            lambda token: pycolmap.triangulate_points(
+                pycolmap.Reconstruction(model),  # it is changed in place
+                database,
+                scratch,
+                scratch,
+                clear_points=True,
+                options=incremental_options(options),
+                refine_intrinsics=False,
+                cancellation_token=token,
+            ),
+            database,
+        )

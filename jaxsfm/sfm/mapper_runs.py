@@ -1,0 +1,78 @@
+"""Runs of the mapper on a share of the matches, and the points of all matches afterwards."""
+
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaxsfm.colmap.inliers import keep_inliers, read_inliers
+from jaxsfm.colmap.mapper import (
+    Attempt,
+    MapOptions,
+    Mapped,
+    first_models,
+    with_left_out_images,
+)
+from jaxsfm.colmap.triangulation import with_all_points
+from jaxsfm.colmap.two_views import TwoView
+from jaxsfm.io.pairs import Pair
+from jaxsfm.sfm.mapper_matches import mapper_matches
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+class MapperRuns:
+    """Maps the pairs of a database, which may change between two runs.
+
+    If the models are refined afterwards, the mapper is given a share of the matches
+    (`jaxsfm.sfm.mapper_matches`).
+    """
+
+    def __init__(
+        self,
+        database: Path,
+        scratch: Path,
+        options: MapOptions,
+        *,
+        share: bool,
+        on_image: Callable[[], None] = lambda: None,
+    ) -> None:
+        """
+        Args:
+          database: with the pairs to map.
+          scratch: a folder for the database that the mapper is given.
+          share: give the mapper a share of the matches; otherwise all of them.
+          on_image: called for every image that the mapper registers.
+        """
+        self._database, self._options, self._on_image = database, options, on_image
+        self._share = share
+        self._given = scratch / "mapper.db" if share else database
+        self.attempts: list[Attempt] = []
+        """All runs so far."""
+
+    def first(self) -> Mapped:
+        """The models of one run of the mapper."""
+        if self._share:
+            shutil.copyfile(self._database, self._given)
+            keep_inliers(self._given, mapper_matches(read_inliers(self._given)))
+        made = first_models(self._given, self._options, on_image=self._on_image)
+        self.attempts += made.attempts
+        return made
+
+    def with_left_out_images(self, made: Mapped, two_views: Mapping[Pair, TwoView]) -> Mapped:
+        """The models of further runs, if the first run since the database changed left out images.
+
+        Args:
+          made: the models of that run. They are returned if nothing was tried.
+          two_views: the pairs in the database.
+        """
+        more = with_left_out_images(
+            made, self._given, two_views, self._options, on_image=self._on_image
+        )
+        self.attempts += more.attempts[len(made.attempts) :]
+        return more
+
+    def with_all_points(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+        """A model with the points of all matches of the pairs that are in the database now."""
+        return with_all_points(model, self._database, self._options) if self._share else model

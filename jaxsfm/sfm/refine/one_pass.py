@@ -1,0 +1,157 @@
+"""One pass of the refinement: observations are aligned, and the bundle is adjusted."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.model import Model, Sizes
+from jaxsfm.colmap.tracks import Observations, Tracks
+from jaxsfm.config import Refinement
+from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
+from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MIN_POINTS = 10
+"""A model with fewer points is not refined."""
+MIN_POINT_SHARE = 0.25
+"""A pass that keeps less of the points is taken back: the images do not agree well enough."""
+WEAK_COUNT, WEAK_SHARE = 30, 0.25
+"""A view is weak if fewer of its observations agree (in number, or as a share of those it had). It
+keeps its old observations in the pass: otherwise a night photo would hang on a handful."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PassFigures:
+    """The result of one pass."""
+
+    accepted: bool
+    """False: too little agreed, and the model before the pass stays."""
+    candidates: int
+    kept: int
+    """Observations of the tracks before the pass that agreed with their reference patch."""
+    dropped: int
+    added: int
+    weak_views: list[str]
+    """Images that kept their old observations in this pass, because too few agreed."""
+    points: int
+    """After the pass."""
+    reprojection_error_px: float
+    """Mean over the points, original pixels."""
+
+
+class PassSettings(NamedTuple):
+    """How a pass is done."""
+
+    refinement: Refinement
+    refine_intrinsics: bool
+    """Whether bundle adjustment moves focal lengths and distortion."""
+    threads: int
+    """Of bundle adjustment."""
+
+
+class Refined(NamedTuple):
+    """A model, as COLMAP's and as arrays."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    model: Model
+
+
+def run_pass(
+    before: Refined,
+    images: DeviceImages,
+    sizes: Sizes,
+    limits: AlignmentLimits,
+    settings: PassSettings,
+) -> tuple[Refined, PassFigures]:
+    """Align the observations of a model and adjust it.
+
+    Args:
+      images, sizes: those of its views.
+      limits: what an aligned keypoint must fulfil to count.
+
+    Returns:
+      the model after the pass, which is the one before if too little agreed; what was done.
+
+    Raises:
+      ImageError: an image of the model cannot be read any more.
+    """
+    blocks = list(align_blocks(before.model, images, settings.refinement, limits))
+    aligned, weak = _gather(before.model, blocks)
+    adjusted = _adjust(aligned, weak, sizes, settings)
+    enough = max(MIN_POINTS, MIN_POINT_SHARE * len(before.model.tracks.points))
+    accepted = adjusted is not None and adjusted.reconstruction.num_points3D() >= enough
+    after = adjusted if adjusted is not None and accepted else before
+    agrees = np.concatenate([block.agrees for block in blocks])
+    tracked = np.concatenate([block.tracked for block in blocks])
+    return after, PassFigures(
+        accepted=accepted,
+        candidates=len(agrees),
+        kept=int((agrees & tracked).sum()),
+        dropped=int((~agrees & tracked).sum()),
+        added=int((agrees & ~tracked).sum()),
+        weak_views=sorted(before.model.views[k].name for k in weak),
+        points=after.reconstruction.num_points3D(),
+        reprojection_error_px=after.reconstruction.compute_mean_reprojection_error(),
+    )
+
+
+def _gather(model: Model, blocks: Sequence[AlignedBlock]) -> tuple[Model, np.ndarray]:
+    """The model with its new tracks, and the indices of the weak views."""
+    tracks, count = model.tracks, len(model.views)
+    had = np.bincount(tracks.view, minlength=count)
+    agreed = np.zeros(count, int)
+    points = tracks.points.copy()
+    parts: list[Observations] = []
+    alive = np.zeros(len(points), bool)
+    for block in blocks:
+        points[block.rows] = block.patches.points
+        own = block.confirmed
+        alive[block.rows[own]] = True
+        parts += block.observations()
+        agreed += np.bincount(block.found.view[block.agrees & block.tracked], minlength=count)
+        agreed += np.bincount(block.patches.reference[own], minlength=count)
+    weak = np.flatnonzero(agreed < np.maximum(np.minimum(WEAK_COUNT, had), WEAK_SHARE * had))
+    # Weak views keep old observations of points that remain, where no new one took their place.
+    old = np.flatnonzero(np.isin(tracks.view, weak) & alive[tracks.point])
+    taken = np.concatenate([part.point * count + part.view for part in parts])
+    old = old[~np.isin(tracks.point[old] * count + tracks.view[old], taken)]
+    parts.append(tracks.select(old).observations)
+    return model.with_tracks(Tracks.from_parts(points, parts, ordered=True)), weak
+
+
+def _adjust(
+    model: Model,
+    weak: np.ndarray,
+    sizes: Sizes,
+    settings: PassSettings,
+) -> Refined | None:
+    """Filter the observations and adjust the bundle, twice; None if (nearly) nothing is left.
+
+    Args:
+      weak: views whose observations were not aligned; they may have four times the error.
+    """
+    loss_px = float(np.median([view.mean_scale for view in model.views]))
+    weak_view = np.isin(np.arange(len(model.views)), weak)
+    limit = settings.refinement.max_error_px * np.where(weak_view, 4.0, 1.0)
+    adjusted = None
+    # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
+    for slack in (4.0, 1.0):
+        good = model.errors_px() < slack * limit[model.tracks.view]
+        reconstruction = model.select(good).to_colmap()
+        if reconstruction.num_points3D() < MIN_POINTS:
+            return None
+        bundle_adjust(
+            reconstruction,
+            loss_px=loss_px,
+            refine_intrinsics=settings.refine_intrinsics,
+            threads=settings.threads,
+        )
+        model = Model.from_colmap(reconstruction, sizes)
+        adjusted = Refined(reconstruction, model)
+    return adjusted
