@@ -14,6 +14,8 @@ def bundle_adjust(
 ) -> None:
     """Adjust all poses and points of a model, in place.
 
+    Observations of points that end behind a camera are taken out.
+
     Args:
       loss_px: scale of the Cauchy loss, original pixels. If it is well above the noise (0.1 px
         after refinement), sound observations count as in least squares, and others count little.
@@ -35,4 +37,7 @@ def bundle_adjust(
     # Not pycolmap.bundle_adjustment: it switches COLMAP's log messages on for the whole process.
     adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
     native(lambda _: adjuster.solve(), "bundle adjustment", grace_s=1)
+    # The solver moves points behind cameras. COLMAP gives them an error of 1e154, and a model file
+    # with it is refused.
+    pycolmap.ObservationManager(reconstruction).filter_observations_with_negative_depth()
     reconstruction.update_point_3d_errors()  # the solver does not update them

@@ -112,6 +112,16 @@ def test_without_any_model_the_global_mapper_is_the_last_try(monkeypatch, tmp_pa
     assert build_models(tmp_path / "d.db", {}, ONE)[0] == [] and len(calls) == 1
 
 
+def test_a_model_of_images_that_a_larger_one_has_is_left_out(monkeypatch, tmp_path):
+    """Of two models of the same images, the one with more points stays."""
+    found = [model("abc"), model("abcde"), model("fgh", 5), model("fgh", 9), model("xa")]
+    monkeypatch.setattr(
+        mapper.pycolmap, "incremental_mapping", lambda *_, **__: dict(enumerate(found))
+    )
+    models = mapper.first_models(tmp_path / "d.db", ONE).models
+    assert models == [found[1], found[3], found[4]]
+
+
 def planar_results(count=5, points=200):
     """Views of one plane, exact."""
     rng = np.random.default_rng(0)

@@ -114,6 +114,26 @@ def test_of_patches_that_agree_a_little_nothing_is_said():
         assert (found.tested[0, k] > 250) == blank
 
 
+def test_a_change_of_light_contradicts_little_and_another_photo_much(halves):
+    """Noise takes most correlations below what agrees, as shadows do that have moved. A photo of
+    something else has few correlations just below what agrees."""
+    seen = scene([([big_wall()], cameras(ANGLES))])
+    name, k = seen.names[4], 4
+    photo = seen.photos[name]
+    noise = np.random.default_rng(0).normal(0, 1.3 * photo.std(), photo.shape)
+    shares = {}
+    for label, taken in (("light", photo + noise), ("other", other_scene(0))):
+        changed = seen._replace(photos=seen.photos | {name: taken.astype(np.float32)})
+        found = agreement_of(changed, targets=[k])
+        tested, contradicted, beyond = (
+            each[:, k].sum() for each in (found.tested, found.contradicted, found.beyond_light())
+        )
+        assert contradicted > 0.3 * tested > 100
+        assert (found.beyond_light() == np.maximum(found.contradicted - found.undecided, 0)).all()
+        shares[label] = beyond / contradicted
+    assert shares["light"] < 0.4 and shares["other"] > 0.8
+
+
 def test_points_that_something_in_front_hides_are_no_contradictions(monkeypatch):
     """A pillar hides another part of the wall from every view."""
     pillar = picture(5, left=-0.4, width=0.8, height=2.0, z=-1.5)

@@ -23,7 +23,7 @@ from jaxsfm.sfm.check.grouping import (
 
 def counts(views: int, pairs: dict[tuple[int, int], tuple[int, int]]) -> Agreement:
     """Tested points and contradictions, by the view that sees them and the one that should."""
-    found = Agreement(np.zeros((views, views), int), np.zeros((views, views), int))
+    found = Agreement(*(np.zeros((views, views), int) for _ in range(3)))
     for pair, (tested, contradicted) in pairs.items():
         found.tested[pair], found.contradicted[pair] = tested, contradicted
     return found
@@ -40,7 +40,7 @@ def blocks(rng: np.random.Generator, sizes: list[int], contradicted: float) -> A
     tested = rng.integers(200, 5000, (len(block), len(block)))
     np.fill_diagonal(tested, 0)
     ratio = np.where(block[:, None] == block, 0.005, contradicted)
-    return Agreement(tested, rng.binomial(tested, ratio))
+    return Agreement(tested, rng.binomial(tested, ratio), np.zeros_like(tested))
 
 
 @settings(max_examples=40, deadline=None)
@@ -49,11 +49,12 @@ def test_views_are_grouped_as_by_a_slow_search_among_sets(seed):
     rng = rng_of(seed)
     views = int(rng.integers(2, 8))
     tested = rng.integers(0, 3000, (views, views)) * (rng.random((views, views)) < 0.7)
-    found = Agreement(
-        tested, rng.binomial(tested, rng.choice([0.0, 0.02, 0.05, 0.3], tested.shape))
-    )
+    contradicted = rng.binomial(tested, rng.choice([0.0, 0.02, 0.05, 0.3], tested.shape))
+    undecided = rng.integers(0, 40, tested.shape)
+    found = Agreement(tested, contradicted, undecided)
     got = group_views(found)
-    want = grouped(found.tested, found.contradicted, MAX_CONTRADICTED, MIN_TESTED)
+    beyond = np.maximum(contradicted - undecided, 0)
+    want = grouped(found.tested, beyond, MAX_CONTRADICTED, MIN_TESTED)
     assert [set(group) for group in got.groups] == want[0]
     said = {
         frozenset(map(frozenset, c.groups)): (c.tested, c.contradicted) for c in got.contradictions
@@ -96,7 +97,8 @@ def test_groups_are_joined_by_what_all_their_views_say_together():
     """One pair of views has more than the limit by bad luck; the others outvote it."""
     pairs = both_ways({p: (1000, 2) for p in ((0, 1), (2, 3), (0, 2), (1, 3), (0, 3))})
     pairs |= both_ways({(1, 2): (100, 8)})
-    assert share(*counts(4, pairs))[1, 2] > MAX_CONTRADICTED
+    found = counts(4, pairs)
+    assert share(found.tested, found.beyond_light())[1, 2] > MAX_CONTRADICTED
     assert group_views(counts(4, pairs)).groups == [[0, 1, 2, 3]]
 
 
@@ -116,7 +118,7 @@ def test_too_few_tests_say_nothing(tested, said):
     """Neither that two views contradict each other, nor that they agree."""
     against = counts(2, {(0, 1): (tested, tested), (1, 0): (1000, 1000)})
     assert len(group_views(against).contradictions) == said
-    assert np.isfinite(share(*against)).sum() == 2 * said
+    assert np.isfinite(share(against.tested, against.beyond_light())).sum() == 2 * said
     agreeing = counts(2, {(0, 1): (tested, 0), (1, 0): (1000, 0)})
     assert len(group_views(agreeing).groups) == 2 - said
 

@@ -153,28 +153,6 @@ def test_a_pass_that_loses_most_points_is_taken_back(rendered, monkeypatch):
     assert errors(after, rendered) == errors(before, rendered)
 
 
-def test_points_that_the_adjustment_moves_behind_a_camera_are_left_out(rendered, monkeypatch):
-    """COLMAP gives such a point an error of 1e154, and our reader refuses the model."""
-    from jaxsfm.sfm.refine import one_pass
-
-    adjust, moved = one_pass.bundle_adjust, []
-
-    def behind(reconstruction, **options):
-        adjust(reconstruction, **options)
-        point_id = min(reconstruction.point3D_ids())
-        image = reconstruction.image(reconstruction.point3D(point_id).track.elements[0].image_id)
-        inverse = image.cam_from_world().inverse()
-        reconstruction.point3D(point_id).xyz = inverse * np.asarray([0.0, 0.0, -1.0])
-        reconstruction.update_point_3d_errors()
-        moved.append(reconstruction.num_points3D())
-
-    monkeypatch.setattr(one_pass, "bundle_adjust", behind)
-    after, figures = refine(noisy_model(rendered, 0.0), rendered, passes=1)
-    assert figures.passes[0].accepted and after.num_points3D() == moved[-1] - 1
-    assert max(point.error for point in after.points3D.values()) < 5
-    assert np.isfinite(arrays(after, rendered).errors_px()).all()
-
-
 def test_all_points_return_before_the_last_pass(rendered):
     """The mapper's model has a sixth of the points."""
     whole = noisy_model(rendered, 0.7)

@@ -10,6 +10,11 @@ Single contradictions say little: alignment fails on leaves, in reflections, or 
 driven away. They count only in blocks, if most of the tested points around them are contradictions
 too. Only views that see a point from nearly the same side are compared.
 
+Where the sun has moved between two photos, the same surface gives blocks of low correlations, too.
+But then as many correlations lie between those that agree and those that contradict, and of another
+surface few do. So the number of these *undecided* points is what the light explains, and only the
+contradictions beyond it count.
+
 Source: Zach, Irschara and Bischof 2008, "What can missing correspondences tell us about 3D
 structure and motion?", and Heinly, Dunn and Frahm 2014, "Correcting for duplicate scene structure
 in sparse 3D reconstruction", test models by points that views should see and do not. Both use
@@ -34,7 +39,7 @@ POINTS_PER_VIEW, MAX_POINTS = 1000, 100_000
 so every view has more than these to show."""
 OTHER_SCORE = 0.5
 """A patch shows something else if its normalised cross-correlation is lower. Patches that agree
-have at least 0.8. Between the two, nothing is said."""
+have at least `Refinement.min_score`. Between the two, a point is undecided."""
 MAX_ANGLE_DEG = 30.0
 """Views are compared on points that both see from directions that are this near."""
 MAX_DISTANCE_RATIO = 1.5
@@ -66,6 +71,17 @@ class Agreement(NamedTuple):
     """int (v, v): points on which something can be said."""
     contradicted: np.ndarray
     """int (v, v): those of them that are contradictions in blocks."""
+    undecided: np.ndarray
+    """int (v, v): other points in these blocks, where a patch neither agrees nor contradicts."""
+
+    def beyond_light(self) -> np.ndarray:
+        """int (v, v): the contradictions that a difference in light does not explain."""
+        return np.maximum(self.contradicted - self.undecided, 0)
+
+
+AGREES, CONTRADICTS, UNDECIDED, UNKNOWN = range(4)
+"""A view shows a point; it shows something else there; its patch is neither like that of the point
+nor quite unlike it; or alignment failed in another way."""
 
 
 class _Tests(NamedTuple):
@@ -75,8 +91,8 @@ class _Tests(NamedTuple):
     view: np.ndarray
     xy: np.ndarray
     """float64 (m, 2): where the model puts the point, working pixels."""
-    other: np.ndarray
-    """bool (m,): the view shows something else there; False: it shows the point."""
+    outcome: np.ndarray
+    """int (m,): AGREES, CONTRADICTS or UNDECIDED."""
 
 
 class _Seen(NamedTuple):
@@ -140,25 +156,29 @@ def _tested(
                 block.rows[found.point],
                 found.view,
                 found.start,
-                ~block.agrees & (block.score < OTHER_SCORE),
-                block.agrees,
+                np.select(
+                    [block.agrees, block.score < OTHER_SCORE, block.score < refinement.min_score],
+                    [AGREES, CONTRADICTS, UNDECIDED],
+                    UNKNOWN,
+                ),
             )
         )
     if not parts:  # no point may be seen in the targets
         none = np.zeros(0, int)
-        return _Seen(points, shown), _Tests(none, none, np.zeros((0, 2)), np.zeros(0, bool))
-    point, view, xy, low, agrees = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return _Seen(points, shown), _Tests(none, none, np.zeros((0, 2)), none)
+    point, view, xy, outcome = (np.concatenate(column) for column in zip(*parts, strict=True))
     seen = _Seen(points, shown)
     # A point that only one view shows may be a wrong match: it tests nothing.
-    low &= (shown.sum(1) >= 2)[point]
+    missing = (outcome == CONTRADICTS) | (outcome == UNDECIDED)
+    missing &= (shown.sum(1) >= 2)[point]
     for k in np.unique(view):
-        rows = np.flatnonzero(low & (view == k))
+        rows = np.flatnonzero(missing & (view == k))
         # A view itself says at which depth it shows surfaces. A target does not, because its own
         # points have been left out; there the surfaces are those of the other views.
         around = np.ones(len(points), bool) if targets is not None else shown[:, k]
-        low[rows] = _not_hidden(views[k], points[around], points[point[rows]])
-    keep = agrees | low
-    return seen, _Tests(point[keep], view[keep], xy[keep], low[keep])
+        missing[rows] = _not_hidden(views[k], points[around], points[point[rows]])
+    keep = (outcome == AGREES) | missing
+    return seen, _Tests(point[keep], view[keep], xy[keep], outcome[keep])
 
 
 def _not_hidden(view: View, surface: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -186,7 +206,7 @@ def _not_hidden(view: View, surface: np.ndarray, points: np.ndarray) -> np.ndarr
 def _compare(views: Sequence[View], seen: _Seen, tests: _Tests) -> Agreement:
     """Count tests and contradictions for every two views."""
     count = len(views)
-    found = Agreement(np.zeros((count, count), int), np.zeros((count, count), int))
+    found = Agreement(*(np.zeros((count, count), int) for _ in Agreement._fields))
     centres = np.asarray([view.centre for view in views])
     for b in np.unique(tests.view):
         own = np.flatnonzero(tests.view == b)
@@ -204,10 +224,13 @@ def _compare(views: Sequence[View], seen: _Seen, tests: _Tests) -> Agreement:
                 ratio < np.log(MAX_DISTANCE_RATIO)
             )
             rows = own[np.asarray(both)[alike]]
-            if len(rows) < MIN_COMPARED:
+            decided = rows[tests.outcome[rows] != UNDECIDED]
+            if len(decided) < MIN_COMPARED:
                 continue
-            wrong = tests.other[rows]
-            _, nearest = KDTree(tests.xy[rows]).query(tests.xy[rows], k=BLOCK_OF)
-            found.tested[a, b] = len(rows)
-            found.contradicted[a, b] = (wrong & (wrong[nearest].sum(1) >= BLOCK)).sum()
+            wrong = tests.outcome[decided] == CONTRADICTS
+            _, nearest = KDTree(tests.xy[decided]).query(tests.xy[rows], k=BLOCK_OF)
+            in_block = wrong[nearest].sum(1) >= BLOCK
+            found.tested[a, b] = len(decided)
+            found.contradicted[a, b] = (in_block & (tests.outcome[rows] == CONTRADICTS)).sum()
+            found.undecided[a, b] = (in_block & (tests.outcome[rows] == UNDECIDED)).sum()
     return found

@@ -140,11 +140,12 @@ def second_places(
 def _refuted(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pair, Contradiction]:
     """The pairs whose two photos contradict each other."""
     index = {name: k for k, name in enumerate(names)}
-    shares = share(*found)
+    against = found.beyond_light()
+    shares = share(found.tested, against)
     refuted = {}
     for pair in fitting:
         a, b = (index[name] for name in pair)
-        counts = [(found.contradicted[i, j], found.tested[i, j]) for i, j in ((a, b), (b, a))]
+        counts = [(against[i, j], found.tested[i, j]) for i, j in ((a, b), (b, a))]
         least, tested = min(counts)
         if shares[a, b] > MAX_CONTRADICTED and least >= MIN_CONTRADICTED:
             refuted[pair] = Contradiction(

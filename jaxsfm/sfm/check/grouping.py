@@ -60,7 +60,8 @@ def group_views(agreement: Agreement) -> Grouping:
     of groups are sums over their views. It ends when only groups are left that contradict each
     other, or about which nothing can be said. The order of views has an effect only among equals.
     """
-    tested, contradicted = (np.array(each, float) for each in agreement)
+    tested = agreement.tested.astype(float)
+    contradicted = agreement.beyond_light().astype(float)
     members = [[k] for k in range(len(tested))]
     while len(members) > 1:
         shares = share(tested, contradicted)

@@ -154,11 +154,4 @@ def _adjust(
         )
         model = Model.from_colmap(reconstruction, sizes)
         adjusted = Refined(reconstruction, model)
-    seen = np.isfinite(model.errors_px())
-    if adjusted is None or seen.all():
-        return adjusted
-    # The last adjustment has moved points behind cameras. COLMAP gives them an error of 1e154, and
-    # refuses to read a model with it.
-    reconstruction = model.select(seen).to_colmap()
-    reconstruction.update_point_3d_errors()
-    return Refined(reconstruction, Model.from_colmap(reconstruction, sizes))
+    return adjusted
