@@ -134,6 +134,6 @@ def _photos(best: PairRow | None, pairs: PairOutcomes, *, alone: bool) -> Advice
     if best is None:
         where = "that show it together with the others"
     else:
-        lack = pairs.missed(best) or f"{best.colmap_inliers} inliers, too few for the mapper"
+        lack = pairs.missed(best) or f"{best.colmap_inliers} inliers, which did not join them"
         where = f"between {describe(best.pair)}, the pair that came closest ({lack})"
     return Advice(option=None, reason=f"{_NO_OPTION * alone}take photos {where}")
