@@ -23,6 +23,10 @@ GRID = 16
 in turn."""
 
 
+BLOCK = 50_000
+"""So many keypoints are looked at together. Each takes about a kilobyte, where 50 photos show it."""
+
+
 class _Rows:
     """All matches as rows of arrays, with keypoints numbered over all images."""
 
@@ -79,8 +83,12 @@ def _best_first(rows: _Rows) -> np.ndarray:
     both = np.concatenate([rows.ends, rows.ends[:, ::-1]]).T
     shape = (rows.keypoints, rows.keypoints)
     joined = csr_array((np.ones(both.shape[1], np.int32), both), shape=shape)
-    confirmed = cast(csr_array, joined @ joined).multiply(joined).tocsr()
-    triangles = np.asarray(confirmed[a, b]).ravel() if len(a) else a
+    triangles = np.zeros(len(a), np.int64)
+    for start in range(0, rows.keypoints, BLOCK):
+        own = joined[start : start + BLOCK]
+        confirmed = cast(csr_array, own @ joined).multiply(own).tocsr()
+        here = np.flatnonzero((a >= start) & (a < start + BLOCK))
+        triangles[here] = np.asarray(confirmed[a[here] - start, b[here]]).ravel()
     degree = np.diff(joined.indptr)
     return np.lexsort((_mixed(b), _mixed(a), -(degree[a] + degree[b]), -triangles))
 

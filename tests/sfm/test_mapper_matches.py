@@ -6,6 +6,7 @@ from oracles import mapper_matches as oracle
 from strategies import rng_of
 
 from jaxsfm.colmap.inliers import ImageKeypoints, Inliers
+from jaxsfm.sfm import mapper_matches as module
 from jaxsfm.sfm.mapper_matches import GRID, PER_PAIR, mapper_matches
 
 SIZE = (640, 480)
@@ -41,7 +42,8 @@ def as_sets(matches: dict) -> dict:
 
 
 @pytest.mark.parametrize(("seed", "per_pair"), [(0, 10), (1, 40), (2, 0), (3, 1), (4, 1000)])
-def test_the_matches_are_those_that_loops_choose(seed, per_pair):
+def test_the_matches_are_those_that_loops_choose(seed, per_pair, monkeypatch):
+    monkeypatch.setattr(module, "BLOCK", 150)  # of 800 keypoints
     inliers = drawn(seed, 200)
     assert as_sets(mapper_matches(inliers, per_pair=per_pair)) == oracle(
         inliers.keypoints, inliers.matches, GRID, per_pair
