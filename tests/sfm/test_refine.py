@@ -185,6 +185,30 @@ def test_all_points_return_before_the_last_pass(rendered):
     assert max(errors(after, rendered)) < 0.5 * max(errors(few, rendered))
 
 
+@pytest.mark.parametrize("returned", [False, True])
+def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(
+    rendered, monkeypatch, returned
+):
+    from jaxsfm.sfm.refine import passes
+
+    run, seen = passes.run_pass, []
+
+    def recorded(before, images, sizes, limits, settings):
+        seen.append(limits.max_shift_px)
+        return run(before, images, sizes, limits, settings)
+
+    monkeypatch.setattr(passes, "run_pass", recorded)
+    refine_model(
+        noisy_model(rendered, 0.7),
+        read_of(rendered),
+        refinement=Refinement(passes=3, max_shift_px=4.0),
+        refine_intrinsics=False,
+        with_all_points=(lambda model: model) if returned else None,
+        threads=1,
+    )
+    assert seen == [4.0, 2.0, 4.0 if returned else 2.0]
+
+
 def test_all_points_return_if_the_passes_end_early(rendered):
     few = noisy_model(rendered, 1.0)
     images = {name: other_scene(k) for k, name in enumerate(rendered.images)}
