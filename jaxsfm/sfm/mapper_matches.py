@@ -24,7 +24,7 @@ in turn."""
 
 
 BLOCK = 50_000
-"""So many keypoints are looked at together. Where 50 photos show a keypoint, it takes about 1 kB."""
+"""So many keypoints are looked at together. A keypoint that 50 photos show takes about 1 kB."""
 
 
 class _Rows:
