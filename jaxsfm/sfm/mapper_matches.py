@@ -8,6 +8,8 @@ A pair's matches are taken from all parts of both images, the best ones first. A
 other images confirm it: if both keypoints are matched with the same keypoint of a third image.
 """
 
+from collections import Counter
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -16,8 +18,12 @@ from scipy.sparse import csr_array
 from jaxsfm.colmap.inliers import ImageKeypoints, Inliers
 from jaxsfm.io.pairs import Pair
 
-PER_PAIR = 400
-"""At least so many matches of a pair are kept, if it has them."""
+PER_PAIR, LEAST_PER_PAIR = 400, 100
+"""At least so many matches of a pair are kept, if it has them: the first number, or fewer if both
+images are in many pairs, but not fewer than the second number. COLMAP starts from a pair with 100
+inliers."""
+PER_IMAGE = 4000
+"""The pairs of an image share so many matches."""
 GRID = 16
 """Each image is divided into so many cells in either direction, and all cells of a pair are served
 in turn."""
@@ -52,12 +58,19 @@ def _cells(image: ImageKeypoints) -> np.ndarray:
     return (at @ [1, GRID]).astype(np.int64)
 
 
-def mapper_matches(inliers: Inliers, *, per_pair: int = PER_PAIR) -> dict[Pair, np.ndarray]:
+def quotas(pairs: Sequence[Pair]) -> np.ndarray:
+    """int (pairs,): how many matches of each pair are kept at least. An image with few pairs needs
+    more of each."""
+    partners = Counter(name for pair in pairs for name in pair)
+    fewest = np.asarray([min(partners[name] for name in pair) for pair in pairs], np.int64)
+    return np.clip(PER_IMAGE // np.maximum(fewest, 1), LEAST_PER_PAIR, PER_PAIR)
+
+
+def mapper_matches(inliers: Inliers) -> dict[Pair, np.ndarray]:
     """Choose the matches for the mapper. The order of images, pairs and matches has no effect.
 
-    Args:
-      per_pair: at least so many matches of each pair are chosen, if it has them. There are more
-        where matches of other pairs join the same keypoints.
+    As many matches of each pair are chosen as `quotas` says, and those of other pairs that join the
+    same keypoints.
 
     Returns:
       for each pair, int64 (k, 2), the rows of `Inliers.matches` that were chosen, in their order.
@@ -69,7 +82,7 @@ def mapper_matches(inliers: Inliers, *, per_pair: int = PER_PAIR) -> dict[Pair, 
         for side in (0, 1)
     ]
     in_turn = best_first[np.argsort(np.maximum(*in_cell)[best_first], kind="stable")]
-    chosen = _rank_within(rows.pair, in_turn) < per_pair
+    chosen = _rank_within(rows.pair, in_turn) < quotas(rows.pairs)[rows.pair]
     kept = np.zeros(rows.keypoints, bool)
     kept[rows.ends[chosen]] = True
     whole = kept[rows.ends[:, 0]] & kept[rows.ends[:, 1]]

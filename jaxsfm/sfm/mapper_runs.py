@@ -48,8 +48,14 @@ class MapperRuns:
         self._database, self._options, self._on_image = database, options, on_image
         self._share = share
         self._given = scratch / "mapper.db" if share else database
+        self._whole: list[tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]] = []
+        """Models, and what `with_all_points` gave for them."""
         self.attempts: list[Attempt] = []
         """All runs so far."""
+
+    def database_changed(self) -> None:
+        """Say that the database has other pairs than before."""
+        self._whole.clear()
 
     def first(self) -> Mapped:
         """The models of one run of the mapper."""
@@ -74,5 +80,15 @@ class MapperRuns:
         return more
 
     def with_all_points(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
-        """A model with the points of all matches of the pairs that are in the database now."""
-        return with_all_points(model, self._database, self._options) if self._share else model
+        """A model with the points of all matches of the pairs that are in the database now.
+
+        It is kept, because a model that is checked is often asked for again.
+        """
+        if not self._share:
+            return model
+        for one, whole in self._whole:
+            if one is model and one.num_reg_images() == whole.num_reg_images():
+                return whole
+        whole = with_all_points(model, self._database, self._options)
+        self._whole.append((model, whole))
+        return whole

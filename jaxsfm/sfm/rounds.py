@@ -160,6 +160,7 @@ class Rounds:
         if refuted.first:
             copy_geometries(self._second_database, self._database, sorted(refuted.first))
         drop_pairs(self._database, sorted(dropped))
+        self._mapper.database_changed()
         return dropped
 
     def without(self, before: Refuted, against: Mapping[Pair, Contradiction]) -> Refuted:

@@ -215,5 +215,8 @@ def test_a_thinned_model_has_few_points_per_view_taken_evenly_with_their_observa
     few = Model(views, random_tracks(20, 2))
     assert thinned(few, per_view=10) is few
     assert thinned(model) is model
+    monkeypatch.setattr(module, "OBSERVED_PER_VIEW", 20)
+    per_point = len(model.tracks.point) / 70
+    assert len(thinned(model).tracks.points) == int(20 * 2 / per_point) < 70
     monkeypatch.setattr(module, "MAX_POINTS", 5)
     assert len(thinned(model).tracks.points) == 5

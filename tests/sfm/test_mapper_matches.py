@@ -6,8 +6,16 @@ from oracles import mapper_matches as oracle
 from strategies import rng_of
 
 from jaxsfm.colmap.inliers import ImageKeypoints, Inliers
+from jaxsfm.io.pairs import exhaustive_pairs
 from jaxsfm.sfm import mapper_matches as module
-from jaxsfm.sfm.mapper_matches import GRID, PER_PAIR, mapper_matches
+from jaxsfm.sfm.mapper_matches import (
+    GRID,
+    LEAST_PER_PAIR,
+    PER_IMAGE,
+    PER_PAIR,
+    mapper_matches,
+    quotas,
+)
 
 SIZE = (640, 480)
 
@@ -41,20 +49,43 @@ def as_sets(matches: dict) -> dict:
     return {pair: set(map(tuple, rows.tolist())) for pair, rows in matches.items()}
 
 
+@pytest.fixture
+def quota(monkeypatch):
+    """Sets how many matches each pair keeps at least."""
+
+    def to(count: int) -> None:
+        monkeypatch.setattr(module, "PER_PAIR", count)
+        monkeypatch.setattr(module, "LEAST_PER_PAIR", count)
+
+    return to
+
+
 @pytest.mark.parametrize(("seed", "per_pair"), [(0, 10), (1, 40), (2, 0), (3, 1), (4, 1000)])
-def test_the_matches_are_those_that_loops_choose(seed, per_pair, monkeypatch):
+def test_the_matches_are_those_that_loops_choose(seed, per_pair, monkeypatch, quota):
     monkeypatch.setattr(module, "BLOCK", 150)  # of 800 keypoints
+    quota(per_pair)
     inliers = drawn(seed, 200)
-    assert as_sets(mapper_matches(inliers, per_pair=per_pair)) == oracle(
-        inliers.keypoints, inliers.matches, GRID, per_pair
-    )
+    want = oracle(inliers.keypoints, inliers.matches, GRID, per_pair)
+    assert as_sets(mapper_matches(inliers)) == want
 
 
-def test_every_pair_keeps_what_it_was_promised_or_all_that_it_has():
+def test_images_with_many_pairs_keep_fewer_matches_of_each():
+    """A pair keeps what the image with fewer pairs needs."""
+    star = [("a", name) for name in "bcdef"]
+    assert quotas(star).tolist() == [PER_PAIR] * 5
+    crowd = exhaustive_pairs([str(k) for k in range(26)])
+    assert set(quotas(crowd)) == {PER_IMAGE // 25} and LEAST_PER_PAIR < PER_IMAGE // 25 < PER_PAIR
+    assert quotas([*crowd, ("0", "z")])[-1] == PER_PAIR
+    large = exhaustive_pairs([str(k) for k in range(200)])
+    assert set(quotas(large)) == {LEAST_PER_PAIR} and len(quotas([])) == 0
+
+
+def test_every_pair_keeps_what_it_was_promised_or_all_that_it_has(quota):
+    quota(60)
     inliers = drawn(5, 900, seen=0.5)
     weak = ("0.jpg", "1.jpg")
     inliers.matches[weak] = inliers.matches[weak][:37]
-    found = mapper_matches(inliers, per_pair=60)
+    found = mapper_matches(inliers)
     for pair, rows in inliers.matches.items():
         assert len(found[pair]) >= min(60, len(rows))
         assert set(map(tuple, found[pair].tolist())) <= set(map(tuple, rows.tolist()))
@@ -66,7 +97,7 @@ def test_pairs_with_few_matches_keep_all_of_them():
     assert as_sets(mapper_matches(inliers)) == as_sets(inliers.matches)
 
 
-def test_matches_are_taken_from_all_parts_of_both_images():
+def test_matches_are_taken_from_all_parts_of_both_images(quota):
     """Most matches lie in one corner of the first image, or of the second one."""
     rng = rng_of(7)
     crowd, sparse = 2000, 60
@@ -81,29 +112,32 @@ def test_matches_are_taken_from_all_parts_of_both_images():
     other = np.concatenate([spread(crowd), corner(crowd), spread(sparse)])
     keypoints = {n: ImageKeypoints(xy, SIZE) for n, xy in (("a", one), ("b", other))}
     rows = np.tile(np.arange(2 * crowd + sparse)[:, None], (1, 2))
-    found = mapper_matches(Inliers(keypoints, {("a", "b"): rows}), per_pair=200)["a", "b"]
+    quota(200)
+    found = mapper_matches(Inliers(keypoints, {("a", "b"): rows}))["a", "b"]
     assert len(found) == 200
     assert (found[:, 0] >= 2 * crowd).sum() > 0.9 * sparse
 
 
-def test_matches_that_third_images_confirm_come_first():
+def test_matches_that_third_images_confirm_come_first(quota):
     """Of the matches of two images, a fifth is confirmed by a third image."""
     xy = np.tile([320.0, 240.0], (500, 1))
     keypoints = {name: ImageKeypoints(xy, SIZE) for name in "abc"}
     same = np.tile(np.arange(500)[:, None], (1, 2))
     matches = {("a", "b"): same, ("a", "c"): same[:100], ("b", "c"): same[:100]}
-    found = mapper_matches(Inliers(keypoints, matches), per_pair=100)
+    quota(100)
+    found = mapper_matches(Inliers(keypoints, matches))
     assert all(set(rows[:, 0]) == set(range(100)) for rows in found.values())
 
 
-def test_the_order_of_images_pairs_and_matches_has_no_effect():
+def test_the_order_of_images_pairs_and_matches_has_no_effect(quota):
+    quota(30)
     inliers = drawn(8, 300)
     rng = rng_of(9)
     turned = Inliers(
         dict(reversed(inliers.keypoints.items())),
         {pair: rng.permutation(rows) for pair, rows in reversed(inliers.matches.items())},
     )
-    found, again = (mapper_matches(each, per_pair=30) for each in (inliers, turned))
+    found, again = (mapper_matches(each) for each in (inliers, turned))
     assert as_sets(found) == as_sets(again)
 
 
