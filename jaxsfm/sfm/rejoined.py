@@ -1,9 +1,10 @@
 """Models of parts of a scene, joined again where matches put them together and no photo objects.
 
 Rounds of mapping only take pairs away. Some of these are right, and so are parts that no pair joins
-any more. For every two models, the matches between them say how one lies in the other: a
-similarity. There may be several, where parts repeat. Each is tried. The joined model is adjusted
-and checked. It stays if photos of both models agree in it and none contradict each other.
+any more. For every two models, the matches between them say which of their points are the same, and
+so how one lies in the other: a similarity. There may be several, where parts repeat. Each is tried.
+The joined model is adjusted and checked. It stays if photos of both models agree in it and none
+contradict each other.
 
 Source: Heinly, Dunn and Frahm 2014, "Correcting for duplicate scene structure in sparse 3D
 reconstruction", merge parts in this way. They compare keypoints.
@@ -15,6 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.mapper import MapOptions
@@ -28,7 +30,6 @@ from jaxsfm.sfm.check.pair_fit import MIN_FIT, pair_fits
 from jaxsfm.sfm.checker import Checker, opened
 from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.evidence import REACH_PX
 from jaxsfm.sfm.robust_similarity import robust_similarity
 from jaxsfm.sfm.told_apart import LOSS_PX
 
@@ -41,9 +42,14 @@ MIN_MATCHES = 30
 """A similarity needs so many matches. COLMAP asks for as many before it registers an image."""
 MAX_SIMILARITIES = 3
 """So many similarities of two models are tried."""
-TOLERANCE = 0.03
+TOLERANCE = 0.05
 """Largest distance of the two points of a match, as a share of their median distance from the
-cameras. Points are not refined yet, and their depths are off by a few percent."""
+cameras. Points are not refined yet, and where focal lengths were guessed, models are bent."""
+SAME_PX = 0.5
+"""A matched keypoint is that of an observation this near, working pixels. All pairs of a photo have
+the same keypoints, so it is exactly there."""
+FIRST_LOSS_PX = 20.0
+"""Scale of the loss of the first adjustment, working pixels: what was joined is far off."""
 
 WithPoints = Callable[["pycolmap.Reconstruction", Collection[Pair]], "pycolmap.Reconstruction"]
 """Gives a model the points of the matches of some pairs."""
@@ -57,14 +63,23 @@ class Part(NamedTuple):
 
 
 class _Opened(NamedTuple):
-    """A model as arrays, with the normals of its points."""
+    """A model with the points of all matches, as arrays."""
 
     model: Model
-    normal: np.ndarray
 
     def places(self) -> dict[str, int]:
         """The index of each view, by name."""
         return {view.name: k for k, view in enumerate(self.model.views)}
+
+    def points_at(self, k: int, keypoints: np.ndarray) -> np.ndarray:
+        """int (n,): the points that a view observes at keypoints, original pixels; -1: none."""
+        tracks = self.model.tracks
+        own = np.flatnonzero(tracks.view == k)
+        if not len(own) or not len(keypoints):
+            return np.full(len(keypoints), -1)
+        at = self.model.views[k].pixels.from_original(keypoints)
+        distance, nearest = map(np.asarray, KDTree(tracks.xy[own]).query(at))
+        return np.where(distance <= SAME_PX, tracks.point[own[nearest]], -1)
 
 
 def rejoined(
@@ -116,109 +131,134 @@ def _joins(
     ways = []
     for i, one in enumerate(arrays):
         for j in range(i):
-            common = _common_points(one, arrays[j], given.matches, given.two_views.keys())
-            ways.append((len(common[0]), i, j, common))
-    for count, i, j, (here, there) in sorted(ways, key=lambda way: (-way[0], way[1], way[2])):
+            ways.append((i, j, _same_points(one, arrays[j], given.matches, given.two_views)))
+    for i, j, same in sorted(ways, key=lambda way: (-len(way[2]), *way[:2])):
         names = frozenset({*arrays[i].places(), *arrays[j].places()})
-        if count < MIN_MATCHES or names in tried:
+        if len(same) < MIN_MATCHES or names in tried:
             continue
         tried.add(names)
-        for similarity in _similarities(arrays[i].model, here, there, options.seed):
-            part = _joined(arrays[i], arrays[j], similarity, checker, with_points, options)
+        for way in _similarities(arrays[i].model, arrays[j].model, same, options.seed):
+            part = _joined(arrays[i], arrays[j], way, checker, with_points, options)
             if part is not None:
                 yield (whole[i], whole[j]), part
 
 
 def _open(checker: Checker, part: Part) -> _Opened:
-    model, _ = opened(part.model, checker.given.photos)
-    neighbours = checker.refinement().neighbours
-    return _Opened(model, plane_geometry.normals(model, neighbours=neighbours))
+    return _Opened(opened(checker.with_all_points(part.model), checker.given.photos)[0])
 
 
-def _common_points(
-    one: _Opened, other: _Opened, matches: Mapping[Pair, PairResult], pairs: Collection[Pair]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of one model and of the other one that matches join."""
+def _same_points(
+    one: _Opened,
+    other: _Opened,
+    matches: Mapping[Pair, PairResult],
+    pairs: Collection[Pair],
+) -> np.ndarray:
+    """int (n, 2): points of one model and of the other one whose keypoints are matched.
+
+    Pairs with a photo that both models have are left out: they say where this photo is.
+    """
     index, others = one.places(), other.places()
-    here, there = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    found = [np.zeros((0, 2), np.int64)]
     for pair in sorted(pairs):
-        for a, b, swapped in ((*pair, False), (*reversed(pair), True)):
+        for swapped in (False, True):
+            a, b = pair[::-1] if swapped else pair
             if a not in index or b not in others or a in others or b in index:
                 continue
             result = matches[pair]
-            sides = (result.keypoints0, result.keypoints1)
-            near = []
-            for part, k, xy in zip(
-                (one, other), (index[a], others[b]), sides[:: -1 if swapped else 1], strict=True
-            ):
-                at = part.model.views[k].pixels.from_original(xy)
-                near.append(
-                    plane_geometry.under_pixels(part.model, part.normal, k, at, reach_px=REACH_PX)
-                )
-            _, rows, columns = np.intersect1d(near[0][1], near[1][1], return_indices=True)
-            here.append(near[0][0][rows])
-            there.append(near[1][0][columns])
-    return np.concatenate(here), np.concatenate(there)
+            sides = (result.keypoints0, result.keypoints1)[:: -1 if swapped else 1]
+            points = np.stack(
+                [one.points_at(index[a], sides[0]), other.points_at(others[b], sides[1])], axis=1
+            )
+            found.append(points[(points >= 0).all(1)])
+    return np.unique(np.concatenate(found), axis=0)
 
 
-def _similarities(
-    model: Model, here: np.ndarray, there: np.ndarray, seed: int
-) -> Iterator[Similarity]:
-    """How points (n, 3) lie on those of a model, the way with most of them first."""
-    tracks = model.tracks
-    centres = np.asarray([view.centre for view in model.views])
+class _Way(NamedTuple):
+    """How one model lies in another one."""
+
+    similarity: Similarity
+    same: np.ndarray
+    """int (n, 2): the points of the first model and of the other one that agree with it."""
+
+
+def _similarities(one: Model, other: Model, same: np.ndarray, seed: int) -> Iterator[_Way]:
+    """How the other model lies in the first one, the way with most points first.
+
+    Args:
+      same: int (n, 2), points of the two models that are matched.
+    """
+    tracks = one.tracks
+    centres = np.asarray([view.centre for view in one.views])
     away = np.linalg.norm(tracks.points[tracks.point] - centres[tracks.view], axis=1)
     limit = TOLERANCE * float(np.median(away))
     for _ in range(MAX_SIMILARITIES):
-        if len(here) < MIN_MATCHES:
+        if len(same) < MIN_MATCHES:
             return
-        found = robust_similarity(there, here, max_error=limit, seed=seed)
+        source, target = other.tracks.points[same[:, 1]], tracks.points[same[:, 0]]
+        found = robust_similarity(source, target, max_error=limit, seed=seed)
         if found.inliers.sum() < MIN_MATCHES:
             return
-        yield found.similarity
-        here, there = here[~found.inliers], there[~found.inliers]
+        yield _Way(found.similarity, same[found.inliers])
+        same = same[~found.inliers]
 
 
-def _together(one: Model, other: Model, similarity: Similarity) -> Model:
-    """Both models in the frame of the first one. Views that both have stay where the first has
-    them, without what the second has seen there."""
+def _together(one: Model, other: Model, way: _Way) -> Model:
+    """Both models in the frame of the first one, with the points that they share joined.
+
+    Views that both have stay where the first has them, without what the second has seen there.
+    """
     own = {view.name for view in one.views}
-    new, _ = other.part({view.name for view in other.views} - own)
+    new, rows = other.part({view.name for view in other.views} - own)
     views = []
     for view in new.views:
-        pose = similarity.moved(CameraPose(view.rotation, view.centre))
+        pose = way.similarity.moved(CameraPose(view.rotation, view.centre))
         views.append(dataclasses.replace(view, rotation=pose.rotation, centre=pose.centre))
+    place = np.arange(len(rows)) + len(one.tracks.points)
+    shared = np.full(len(other.tracks.points), -1)
+    shared[way.same[:, 1]] = way.same[:, 0]
+    place = np.where(shared[rows] >= 0, shared[rows], place)
     tracks = Tracks(
-        np.concatenate([one.tracks.points, similarity.apply(new.tracks.points)]),
-        np.concatenate([one.tracks.point, new.tracks.point + len(one.tracks.points)]),
+        np.concatenate([one.tracks.points, way.similarity.apply(new.tracks.points)]),
+        np.concatenate([one.tracks.point, place[new.tracks.point]]),
         np.concatenate([one.tracks.view, new.tracks.view + len(one.views)]),
         np.concatenate([one.tracks.xy, new.tracks.xy]),
     )
+    # Two points of the second model may be one of the first, which keeps one keypoint for a view.
+    _, once = np.unique(
+        tracks.point * (len(one.views) + len(views)) + tracks.view, return_index=True
+    )
+    tracks = tracks.select(np.sort(once))
     return Model([*one.views, *views], tracks, {**new.cameras, **one.cameras})
 
 
 def _joined(
     one: _Opened,
     other: _Opened,
-    similarity: Similarity,
+    way: _Way,
     checker: Checker,
     with_points: WithPoints,
     options: MapOptions,
 ) -> Part | None:
     """Two models as one; None if its photos do not agree, or if they say nothing."""
-    both = _together(one.model, other.model, similarity)
-    agreeing = _agreeing_pairs(both, checker)
+    both = _together(one.model, other.model, way)
     new = {view.name for view in both.views[len(one.model.views) :]}
     old = one.places().keys() - other.places().keys()
-    if not any(len(set(pair) & new) == 1 for pair in agreeing):
+    sizes = {view.name: (view.size, view.pixels.scale) for view in both.views}
+
+    def adjusted(model: "pycolmap.Reconstruction", loss_px: float) -> "pycolmap.Reconstruction":
+        bundle_adjust(
+            model,
+            loss_px=loss_px * options.scale,
+            refine_intrinsics=options.refine_intrinsics,
+            threads=options.threads,
+        )
+        return model
+
+    model = adjusted(both.to_colmap(), FIRST_LOSS_PX)
+    agreeing = _agreeing_pairs(Model.from_colmap(model, sizes), checker)
+    if not any(set(pair) & new and set(pair) & old for pair in agreeing):
         return None
-    model = with_points(both.to_colmap(), agreeing)
-    bundle_adjust(
-        model,
-        loss_px=LOSS_PX * options.scale,
-        refine_intrinsics=options.refine_intrinsics,
-        threads=options.threads,
-    )
+    model = adjusted(with_points(model, agreeing), LOSS_PX)
     (done,) = checker.check([model], ())
     if done is None or done.check.contradictions:
         return None

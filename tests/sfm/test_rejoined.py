@@ -171,15 +171,19 @@ def test_a_second_similarity_is_that_of_the_matches_that_the_first_leaves():
     source = rng.uniform(-5, 5, (160, 3))
     other = Similarity(1.0, np.eye(3), np.asarray([30.0, 0, 0]))
     target = np.where(np.arange(160)[:, None] < 100, MOTION.apply(source), other.apply(source))
-    model = exact_street(target)
-    found = list(module._similarities(model, target, source, 0))
+    order = rng.permutation(160)
+    same = np.stack([np.arange(160), order], axis=1)
+    moved = np.empty_like(source)
+    moved[order] = source
+    found = list(module._similarities(seen_by_one(target), seen_by_one(moved), same, 0))
     assert len(found) == 2
-    np.testing.assert_allclose(found[0].apply(source[:100]), target[:100], atol=1e-6)
-    np.testing.assert_allclose(found[1].apply(source[100:]), target[100:], atol=1e-6)
+    for way, own in zip(found, (np.arange(100), np.arange(100, 160)), strict=True):
+        np.testing.assert_array_equal(way.same, same[own])
+        np.testing.assert_allclose(way.similarity.apply(source[own]), target[own], atol=1e-6)
 
 
-def exact_street(points: np.ndarray) -> Model:
-    """A view that sees all points from about 20 metres."""
+def seen_by_one(points: np.ndarray) -> Model:
+    """A view that observes all points."""
     seen = scene([([big_wall()], cameras([0.0, 5.0]))]).model
     tracks = seen.tracks._replace(
         points=points,
@@ -188,3 +192,30 @@ def exact_street(points: np.ndarray) -> Model:
         xy=np.zeros((len(points), 2)),
     )
     return Model(seen.views, tracks)
+
+
+def test_points_that_matches_join_are_the_same_whichever_photo_has_the_first_name(rendered):
+    model = exact_model(rendered)
+    parts, checker, _, _ = parts_of(model, rendered.images, NAMES[:3], NAMES[2:])
+    one, other = (module._open(checker, part) for part in parts)
+    given = checker.given
+    same = module._same_points(one, other, given.matches, given.two_views)
+    assert len(same) > 100
+    back = module._same_points(other, one, given.matches, given.two_views)
+    assert set(map(tuple, same.tolist())) == set(map(tuple, back[:, ::-1].tolist()))
+    here, there = one.model.tracks.points[same[:, 0]], other.model.tracks.points[same[:, 1]]
+    np.testing.assert_allclose(MOTION.apply(here), there, atol=1e-6)
+
+
+def test_what_was_joined_wrongly_by_some_percent_is_pulled_together(rendered):
+    """The second part is bent: its cameras and points are 3 % off along one axis."""
+    model = exact_model(rendered)
+    parts, checker, with_points, _ = parts_of(model, rendered.images, NAMES[:3], NAMES[2:])
+    bent, _ = module.opened(parts[1].model, checker.given.photos)
+    stretch = np.diag([1.03, 1.0, 1.0])
+    views = [dataclasses.replace(view, centre=stretch @ view.centre) for view in bent.views]
+    points = bent.tracks.points @ stretch
+    wrong = Model(views, bent.tracks._replace(points=points), bent.cameras).to_colmap()
+    parts[1] = parts[1]._replace(model=wrong)
+    (whole,) = rejoined(parts, checker, with_points, OPTIONS)
+    assert max(errors(whole.model, rendered)) < 0.01
