@@ -70,7 +70,7 @@ class Checker(NamedTuple):
                 checks.append(None)
                 continue
             try:
-                checks.append(check_model(*self._opened(each), matches, self.refinement()))
+                checks.append(check_model(*self._opened(each), matches, self._refinement()))
             except ImageError as error:  # a photo was deleted since; the model remains
                 logger.warning("a model was not checked: %s", error)
                 checks.append(None)
@@ -90,7 +90,7 @@ class Checker(NamedTuple):
             found = second_places(
                 *self._opened(model),
                 self._matches(()),
-                self.refinement(),
+                self._refinement(),
                 done.against,
             )
         except ImageError as error:
@@ -105,6 +105,5 @@ class Checker(NamedTuple):
         given = self.given
         return VerifiedMatches(given.matches, given.two_views.keys(), refuted, self.seed)
 
-    def refinement(self) -> Refinement:
-        """How patches are aligned."""
+    def _refinement(self) -> Refinement:
         return self.config.refinement or Refinement()

@@ -134,10 +134,6 @@ class Similarity(NamedTuple):
     translation: np.ndarray
     """float64 (3,)."""
 
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) after the map."""
-        return self.scale * points @ self.rotation.T + self.translation
-
     def moved(self, pose: CameraPose) -> CameraPose:
         """The pose after the map was applied to the world."""
         centre = self.scale * self.rotation @ pose.centre + self.translation

@@ -5,7 +5,7 @@ made again without them. So other ways to join the groups of photos are tried un
 with one, or until no pair is left that joins the groups. The two hypotheses are described in
 `jaxsfm.sfm.hypotheses`. The second is tried if something speaks against the first one. If both
 stand, both models are returned. Models in which photos contradict each other to the end are taken
-apart (`jaxsfm.sfm.told_apart`), and what belongs together is joined again (`jaxsfm.sfm.rejoined`).
+apart (`jaxsfm.sfm.told_apart`).
 """
 
 import dataclasses
@@ -107,8 +107,7 @@ def build_checked_models(
         rounds.go_back_to(best)
         red = best.contradicted() > 0
         if red:
-            best, parts = rounds.rejoined(*rounds.told_apart(best))
-            rounds.go_back_to(best)
+            best, parts = rounds.told_apart(best)
             checks = _checks(best, following, parts)
         checks = _without_strays(best, checks, following)
         if not complete:

@@ -7,16 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
-from jaxsfm.colmap.mapper import Attempt, MapOptions, registered
-from jaxsfm.colmap.triangulation import with_all_points
+from jaxsfm.colmap.mapper import Attempt, MapOptions
 from jaxsfm.colmap.two_views import TwoView, read_two_views, verify
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair
-from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
 from jaxsfm.sfm.checker import Checker, VerifiedPairs
 from jaxsfm.sfm.mapper_runs import MapperRuns
-from jaxsfm.sfm.rejoined import Part, rejoined
 from jaxsfm.sfm.round import Hypothesis, Refuted, Round
 from jaxsfm.sfm.told_apart import told_apart
 from jaxsfm.sfm.view_graph import Verdict
@@ -92,43 +89,6 @@ class Rounds:
         whole = dataclasses.replace(made, models=found.models, checks=found.checks)
         return whole, found.told_apart
 
-    def rejoined(self, made: Round, parts: Sequence[list[str]]) -> tuple[Round, list[list[str]]]:
-        """The models of a round, joined again where no photo objects; their parts.
-
-        Args:
-          parts: the photos that were told apart.
-        """
-        self.go_back_to(made)
-        each = list(zip(made.models, made.checks, strict=True))
-        sound = [Part(m, done) for m, done in each if done and not done.check.contradictions]
-        found = rejoined(sound, self._checker, self._with_points_of, self._options)
-        if len(found) == len(sound):
-            return made, list(parts)
-        joined = [part for part in found if not any(part is one for one in sound)]
-        names = [sorted(registered(part.model)) for part in joined]
-        left = [group for group in parts if not any(set(group) <= set(own) for own in names)]
-        rest = [(m, done) for m, done in each if not done or done.check.contradictions]
-        models = sorted(
-            [*((part.model, part.done) for part in found), *rest],
-            key=lambda one: -one[0].num_reg_images(),
-        )
-        again = dataclasses.replace(
-            made,
-            models=[model for model, _ in models],
-            checks=[done for _, done in models],
-            verdicts=_judged(made.verdicts, [part.done for part in joined]),
-        )
-        return again, sorted([*left, *names], key=lambda group: (-len(group), group))
-
-    def _with_points_of(
-        self, model: "pycolmap.Reconstruction", pairs: Collection[Pair]
-    ) -> "pycolmap.Reconstruction":
-        """A model with the points of all matches of some pairs."""
-        path = self._second_database.with_name("joined.db")
-        shutil.copyfile(self.given.database, path)
-        drop_pairs(path, sorted(self.given.two_views.keys() - set(pairs)))
-        return with_all_points(model, path, self._options)
-
     def with_second_places(
         self, made: Round, checks: Sequence[ModelCheck | None]
     ) -> list[ModelCheck | None]:
@@ -188,22 +148,6 @@ class Rounds:
             self._seconds |= {pair: found[pair] for pair in new if pair in found}
             self._asked |= set(new)
         return set(pairs) & self._seconds.keys()
-
-
-def _judged(before: Mapping[Pair, Verdict], joined: Sequence[Checked]) -> dict[Pair, Verdict]:
-    """Verdicts after models were joined: pairs that agree with them are trusted again."""
-    after = dict(before)
-    for done in joined:
-        for pair in done.explained & after.keys():
-            if not after[pair].trusted:
-                after[pair] = dataclasses.replace(
-                    after[pair], trusted=True, refuted=False, reason=""
-                )
-        for pair in done.against & after.keys():
-            if after[pair].trusted:
-                reason = "it does not agree with the model that parts were joined to"
-                after[pair] = dataclasses.replace(after[pair], trusted=False, reason=reason)
-    return after
 
 
 def _refuted(each: Contradiction) -> Verdict:

@@ -25,7 +25,6 @@ from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import MAX_ROUNDS
 from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
-from jaxsfm.sfm.rejoined import Part
 from jaxsfm.sfm.told_apart import Parts
 
 A, B, C, D, E = PAIRS = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d"), ("d", "e")]
@@ -752,7 +751,6 @@ def test_what_is_red_to_the_end_is_told_apart_and_amber(rounds, monkeypatch):
         return Parts([frozenset("abc"), models[1]], left, parts)
 
     monkeypatch.setattr(module, "told_apart", told_apart)
-    monkeypatch.setattr(module, "rejoined", lambda parts, *_: parts)
     tries = itertools.cycle([outcome(refuted=[A]), outcome()])
     found = rounds(lambda pairs: next(tries), models=2)
     (((_, whole), verdicts, options),) = asked
@@ -760,40 +758,6 @@ def test_what_is_red_to_the_end_is_told_apart_and_amber(rounds, monkeypatch):
     assert found.models == [frozenset("abc"), whole] and found.searched == []
     assert [told and told.verdict for told in found.figures.checks] == ["amber", "amber"]
     assert [told and told.told_apart for told in found.figures.checks] == [parts, parts]
-
-
-def test_parts_that_are_joined_again_are_one_model_and_say_which_pairs_are_right(
-    rounds, monkeypatch
-):
-    """Of three parts, the first two are joined: B agrees with the whole, and C does not."""
-    parts = [["a", "b"], ["c", "d"], ["e"]]
-    one, other, third = (FakeModel({pair}) for pair in (A, D, E))
-    whole, asked = FakeModel({A, B, D}), []
-    red = contradiction(C)
-
-    def told_apart(models, checks, checker, options):
-        opposed = outcome()
-        opposed.check.contradictions.append(red)
-        return Parts([one, other, third], [outcome(), outcome(), opposed], parts)
-
-    def rejoined(sound, checker, with_points, options):
-        asked.append([part.model for part in sound])
-        done = outcome(explained=[A, B, D])._replace(against={C})
-        return [Part(whole, done)]
-
-    monkeypatch.setattr(module, "told_apart", told_apart)
-    monkeypatch.setattr(module, "rejoined", rejoined)
-    monkeypatch.setattr(module, "registered", lambda model: set("abcd"))
-    tries = iter([outcome(refuted=[B]), *[outcome(refuted=[C])] * 9])
-    found = rounds(lambda pairs: next(tries), config=dataclasses.replace(ALL, view_graph=True))
-    assert asked == [[one, other]]
-    assert found.models == [whole, third]  # what is contradicted stays as it is
-    joined = [["a", "b", "c", "d"], ["e"]]
-    assert [told and told.told_apart for told in found.figures.checks] == [joined, joined]
-    assert [told and told.verdict for told in found.figures.checks] == ["amber", "red"]
-    verdicts = found.figures.verdicts
-    assert verdicts[B].trusted and not verdicts[B].refuted and not verdicts[B].reason
-    assert not verdicts[C].trusted and C in found.dropped and B not in found.dropped
 
 
 def test_models_that_nothing_contradicts_are_not_told_apart(rounds, monkeypatch):
