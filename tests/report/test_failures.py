@@ -206,7 +206,9 @@ def test_an_image_of_a_smaller_model_that_trusted_pairs_join_to_the_best_is_told
     for row in found.values():
         assert "sparse/1" in row["detail"] and row["model"] == 1
         reasons = " ".join(each["reason"] for each in row["help"])
-        assert "photos between b - c" in reasons and "42 inliers, which did not join them" in reasons
+        assert (
+            "photos between b - c" in reasons and "42 inliers, which did not join them" in reasons
+        )
         assert "--intrinsics" not in options(row)  # they have poses
 
 
