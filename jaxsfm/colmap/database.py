@@ -150,7 +150,7 @@ def write_database(
                 db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
 
 
-def _ids(db: pycolmap.Database) -> dict[str, int]:
+def image_ids(db: pycolmap.Database) -> dict[str, int]:
     """The numbers of the images, by name."""
     return {image.name: image.image_id for image in db.read_all_images()}
 
@@ -169,7 +169,7 @@ def read_matches(
       the top-left one is (0, 0).
     """
     with pycolmap.Database.open(path) as db:
-        ids = _ids(db)
+        ids = image_ids(db)
         a, b = ids[names[0]], ids[names[1]]
         if not verified:
             matches = db.read_matches(a, b)
@@ -192,7 +192,7 @@ def read_images(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:
 def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
     """Delete the verified geometries of pairs from a database. Their matches stay."""
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        ids = _ids(db)
+        ids = image_ids(db)
         for a, b in pairs:
             db.delete_two_view_geometry(ids[a], ids[b])
 
@@ -203,7 +203,7 @@ def keep_outliers(path: Path, pairs: Iterable[Pair]) -> None:
     The geometries of these pairs are deleted. COLMAP's verification then looks for another one.
     """
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        ids = _ids(db)
+        ids = image_ids(db)
         for names in pairs:
             a, b = (ids[name] for name in names)
             matches = np.asarray(db.read_matches(a, b)).reshape(-1, 2)
@@ -226,7 +226,7 @@ def copy_geometries(source: Path, target: Path, pairs: Iterable[Pair]) -> None:
         pycolmap.Database.open(target) as db,
         pycolmap.DatabaseTransaction(db),
     ):
-        ids = _ids(db)
+        ids = image_ids(db)
         for names in pairs:
             a, b = (ids[name] for name in names)
             db.delete_two_view_geometry(a, b)

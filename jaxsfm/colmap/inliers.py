@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET
+from jaxsfm.colmap.database import PIXEL_OFFSET, image_ids
 from jaxsfm.io.pairs import Pair
 
 
@@ -57,7 +57,7 @@ def keep_inliers(path: Path, kept: Mapping[Pair, np.ndarray]) -> None:
       kept: for each pair, the rows of `Inliers.matches` to keep. Other pairs are not changed.
     """
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        ids = {image.name: image.image_id for image in db.read_all_images()}
+        ids = image_ids(db)
         for names, rows in kept.items():
             a, b = (ids[name] for name in names)
             geometry = db.read_two_view_geometry(a, b)
