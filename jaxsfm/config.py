@@ -90,6 +90,11 @@ class Config:
     """Longer side of the working image, pixels; larger images are reduced."""
     enlarge: float = 1.0
     """Smaller images are enlarged by up to this factor, but not beyond `max_size`."""
+    first_look: int | None = None
+    """Longer side of the working image, pixels, at which a run first describes and matches its
+    photos. Only those photos that this leaves without a place are described again at `max_size`
+    (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None: photos are
+    described at `max_size` from the beginning."""
     octaves: int = 1
     """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
@@ -151,13 +156,22 @@ class Config:
     def matching(self) -> dict[str, object]:
         """The settings that matches depend on, as plain data."""
         parts = dataclasses.asdict(self)
-        for later in ("aligned_octaves", "view_graph", "checked", "refinement"):
+        for later in ("first_look", "aligned_octaves", "view_graph", "checked", "refinement"):
             del parts[later]
         return parts
+
+    def of_first_look(self) -> "Config":
+        """The settings of a run's first look; these settings if there is none."""
+        size = min(self.first_look or self.max_size, self.max_size)
+        return dataclasses.replace(self, max_size=size, first_look=None)
 
     def __post_init__(self) -> None:
         if self.max_size < MIN_SIDE:
             raise ValueError(f"max_size must be at least {MIN_SIDE} pixels; got {self.max_size}")
+        if self.first_look is not None and self.first_look < MIN_SIDE:
+            raise ValueError(
+                f"first_look must be at least {MIN_SIDE} pixels; got {self.first_look}"
+            )
         if not self.enlarge >= 1:
             raise ValueError(f"enlarge must be at least 1; got {self.enlarge}")
         for name, least in (("octaves", 1), ("aligned_octaves", 0)):
@@ -202,6 +216,7 @@ MAX_OCTAVES = 4
 """Largest number of octaves. At an eighth of 1600 px there are only 12 x 9 coarse cells left."""
 
 _DEFAULT = Config(
+    first_look=800,
     octaves=4,
     centred=True,
     pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
@@ -216,18 +231,21 @@ PRESETS: dict[str, Config] = {
     "robust": dataclasses.replace(
         _DEFAULT,
         enlarge=2.0,
+        first_look=None,
         pair=dataclasses.replace(_DEFAULT.pair, local_refits=10),
     ),
 }
 """The named presets.
 
 - `paper` has the constants of the authors' code.
-- `default` adds octaves, centred descriptors and neighbourhood consensus (for night, seasons and
-  weather), repeated local refits (one refit leaves up to a fifth of a plane's inliers behind,
-  tests/core/test_ransac.py), planes that compete, the most similar of several matches of a cell,
-  aligned matches of single pairs, the view graph and the refinement.
-- `robust` also enlarges small images up to twice, which then take as long as large ones, and refits
-  planes until they gain nothing, so that matches depend less on the seed.
+- `default` first describes the photos of a run at half the size. It adds octaves, centred
+  descriptors and neighbourhood consensus (for night, seasons and weather), repeated local refits
+  (one refit leaves up to a fifth of a plane's inliers behind, tests/core/test_ransac.py), planes
+  that compete, the most similar of several matches of a cell, aligned matches of single pairs, the
+  view graph, the check and the refinement.
+- `robust` describes all photos at full size and enlarges small ones up to twice, so that they take
+  as long as large ones. It refits planes until they gain nothing, so that matches depend less on
+  the seed.
 """
 
 

@@ -79,10 +79,14 @@ class ModelChoice(MatchingChoice):
         pairs. It is for scenes that repeat themselves. preset: as the preset says.
       refine: Number of passes of the refinement, which moves keypoints to a fraction of a pixel. 0
         switches it off. Without it, as many as the preset says.
+      first_look: Longer side, in pixels, at which photos are described and matched first. Photos
+        that find no place in this way are looked at again at --max-size. 0 describes all photos at
+        --max-size. Without it, as the preset says.
     """
 
     view_graph: Literal["preset", "yes", "no"] = "preset"
     refine: int | None = None
+    first_look: int | None = None
 
     def _config(self, relocalizer: Path | None) -> Config:
         config = super()._config(relocalizer)
@@ -93,4 +97,6 @@ class ModelChoice(MatchingChoice):
                 raise ValueError(f"refine must be at least 0; got {self.refine}")
             passes = Refinement(passes=self.refine) if self.refine else None
             config = dataclasses.replace(config, refinement=passes)
+        if self.first_look is not None:
+            config = dataclasses.replace(config, first_look=self.first_look or None)
         return config

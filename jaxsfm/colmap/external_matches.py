@@ -16,7 +16,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.hashes import sha256_of
 from jaxsfm.io.images import ImageFile, shown_name
-from jaxsfm.io.pairs import LazyMatches, Pair, PairCounts, PairResult
+from jaxsfm.io.pairs import LazyMatches, Pair, PairCounts, PairResult, united
 
 logger = logging.getLogger("jaxsfm")
 
@@ -157,23 +157,6 @@ def _check_focal(camera: CameraRow, intrinsics: Intrinsics, where: str, name: st
         )
 
 
-def _joined(theirs: PairResult, ours: PairResult) -> PairResult:
-    """Both results of a pair as one. Its planes are ours."""
-
-    def both(name: str) -> np.ndarray:
-        return np.concatenate([getattr(theirs, name), getattr(ours, name)])
-
-    return dataclasses.replace(
-        ours,
-        cells=both("cells"),
-        keypoints0=both("keypoints0"),
-        keypoints1=both("keypoints1"),
-        plane=both("plane"),
-        num_tentative=theirs.num_tentative + ours.num_tentative,
-        status=Status.VERIFIED,
-    )
-
-
 class JoinedMatches(LazyMatches):
     """Our matches and external ones together. A pair is joined when it is asked for.
 
@@ -202,4 +185,4 @@ class JoinedMatches(LazyMatches):
             first = np.asarray([len(keypoints.get(name, ())) for name in pair], np.int32)
             ours = self._ours[pair]
             parts.append(dataclasses.replace(ours, cells=ours.cells + first))
-        return parts[0] if len(parts) == 1 else _joined(*parts)
+        return parts[0] if len(parts) == 1 else united(*parts)

@@ -60,6 +60,26 @@ class PairResult:
         )
 
 
+def united(first: PairResult, second: PairResult) -> PairResult:
+    """Two results of a pair as one; their cells must differ."""
+
+    def both(name: str) -> np.ndarray:
+        return np.concatenate([getattr(first, name), getattr(second, name)])
+
+    count = len(first.homographies)
+    return dataclasses.replace(
+        second,
+        cells=both("cells"),
+        keypoints0=both("keypoints0"),
+        keypoints1=both("keypoints1"),
+        plane=np.concatenate([first.plane, np.where(second.plane < 0, -1, second.plane + count)]),
+        homographies=both("homographies"),
+        num_tentative=first.num_tentative + second.num_tentative,
+        num_dropped=first.num_dropped + second.num_dropped,
+        status=min(first.status, second.status, key=lambda s: s != Status.VERIFIED),
+    )
+
+
 class LazyMatches(Mapping[Pair, PairResult]):
     """The matches of `pairs`, in their order. Each is made (`_load`) when it is asked for."""
 

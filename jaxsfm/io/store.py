@@ -7,7 +7,7 @@ does not depend on the change, and it never takes a file for something else.
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,10 @@ from jaxtyping import Array
 
 from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
-from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, read_json, save_arrays, write_atomic
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import DamagedImage, ImageError, ImageFile
-from jaxsfm.io.pairs import LazyMatches, Pair, PairResult, describe
+from jaxsfm.io.pairs import Pair, PairResult
 
 Identity = Mapping[str, Json]
 """What the matches of a run depend on: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
@@ -225,23 +224,3 @@ def _are_features(dense: DenseFeatures, scale: tuple[float, float]) -> bool:
         and int(dense.coarse_grid.prod(dtype=np.int64)) <= len(dense.coarse[0])
         and int(dense.fine_grid.prod(dtype=np.int64)) <= cells
     )
-
-
-class SavedMatches(LazyMatches):
-    """The matches of pairs in a store, read from their files when they are asked for.
-
-    Reading raises UserError if a file is missing or damaged.
-    """
-
-    def __init__(self, store: Store, pairs: Iterable[Pair]) -> None:
-        super().__init__(pairs)
-        self._store = store
-
-    def _load(self, pair: Pair) -> PairResult:
-        found = self._store.load_matches(pair)
-        if found is None:
-            raise UserError(
-                f"--out {self._store.path}: matches of {describe(pair)} are missing or damaged, "
-                "so run the same command again"
-            )
-        return found

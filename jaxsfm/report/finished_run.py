@@ -21,6 +21,7 @@ from jaxsfm.io.images import (
     read_image,
     size_and_scale,
 )
+from jaxsfm.io.looks import Looks
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
 from jaxsfm.report.run_inputs import RecordedConfig
@@ -100,7 +101,10 @@ class FinishedRun:
     colours: np.ndarray
     """uint8 (n, 3): RGB of each point of the model."""
     reference: ReferencePoses | None
-    matches: Store
+    store: Store
+    """The features and matches that the folder keeps."""
+    matches: Looks
+    """The run's matches."""
 
     @functools.cached_property
     def errors(self) -> np.ndarray:
@@ -161,6 +165,24 @@ def evaluation_report(
     return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
 
 
+def _described(report: RunReport) -> RecordedConfig:
+    """The limits of the working images whose cells the matches are of."""
+    config, looks = report.options.config, report.looks
+    if looks is None or looks.whole:
+        return config
+    return dataclasses.replace(config, max_size=looks.first_px)
+
+
+def _looks(home: Path, report: RunReport) -> Looks:
+    """Where the matches of a run are."""
+    identity, looks = report.identity, report.looks
+    last = Store(home, to_json(identity))
+    if looks is None or looks.whole:
+        return Looks(last)
+    first = dataclasses.replace(identity, config=identity.config | {"max_size": looks.first_px})
+    return Looks(Store(home, to_json(first)), last, set(looks.again))
+
+
 def read_run(
     folder: Path, *, images: Path | None = None, reference: Path | None = None
 ) -> FinishedRun:
@@ -191,9 +213,10 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(where, report.identity.images, report.options.config),
+        photos=RecordedPhotos(where, report.identity.images, _described(report)),
         model=model,
         colours=colours,
         reference=known,
-        matches=Store(home, to_json(report.identity)),
+        store=Store(home, to_json(report.identity)),
+        matches=_looks(home, report),
     )

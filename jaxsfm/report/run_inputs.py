@@ -84,6 +84,20 @@ class FoundPhotos(PhotoFolder):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class UsedLooks:
+    """The sizes at which the photos of a run were described."""
+
+    first_px: Count
+    """The longer side of the photos in the first look, pixels."""
+    photos: list[str] = field(default_factory=list)
+    """The photos that had no place in the model after it. Pairs with them were matched again."""
+    again: list[tuple[str, str]] = field(default_factory=list)
+    """The pairs that were matched again, at the size of the config."""
+    whole: bool = False
+    """Whether these are all pairs; then nothing of the first look was used."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class UsedExternalMatches:
     """The matches of another tool that were mapped together with the run's own."""
 

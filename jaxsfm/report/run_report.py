@@ -18,6 +18,7 @@ from jaxsfm.report.run_inputs import (
     RecordedOptions,
     RunIdentity,
     UsedExternalMatches,
+    UsedLooks,
     UsedWeights,
 )
 from jaxsfm.report.run_results import (
@@ -71,6 +72,8 @@ class RunReport:
     images: FoundPhotos
     pairs: TriedPairs
     given: UsedExternalMatches | None = None
+    looks: UsedLooks | None = None
+    """None: all photos were described at the size of the config."""
     models: list[ModelRow]
     """The one with most photos first; empty if there is none."""
     mapping: list[Attempt] = field(default_factory=list)

@@ -151,6 +151,12 @@ def _fits(place: OtherPlace) -> str:
 
 
 def _other_model(other: Alternative) -> Finding:
+    if other.whole:
+        text = (
+            f"alternative/0 has {other.images} photos in one model, as they were before they were "
+            f"told apart; photos contradict each other at {other.contradicted} of its points"
+        )
+        return Finding(text, other.elsewhere, [])
     own: Basis = "order" if other.basis == "pairs" else "pairs"
     moved = "1 photo has" if len(other.elsewhere) == 1 else f"{len(other.elsewhere)} photos have"
     text = (
@@ -182,7 +188,7 @@ def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
     """Which photos would decide between two places or two models; empty if there is nothing to."""
     if places:
         way = f"from {shown_name(places[0].image)} to {named(places[0].pairs)}"
-    elif check.alternative:
+    elif check.alternative and not check.alternative.whole:
         way = f"from {named(check.alternative.elsewhere)} to the other photos"
     elif check.apart and check.verdict == "amber":
         way = f"from {shown_name(check.apart[0][0])} to {shown_name(check.apart[0][1])}"
@@ -204,7 +210,8 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
     if colour == "amber" and check.told_apart:
         return (
             "look at each model by itself; each may be right, and what is missing is how they "
-            "belong together; add such photos and run the same command again"
+            "belong together (alternative/0 is one way, which photos contradict); add such photos "
+            "and run the same command again"
         )
     if colour == "amber":
         unsure = places[0].image if places else other.elsewhere[0] if other else check.apart[0][1]

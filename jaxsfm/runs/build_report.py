@@ -12,8 +12,8 @@ from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
+from jaxsfm.io.looks import SavedMatches
 from jaxsfm.io.pairs import Pair, PairCounts
-from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
 from jaxsfm.report.lost_photos import explained
@@ -22,6 +22,7 @@ from jaxsfm.report.run_inputs import (
     RecordedOptions,
     RunIdentity,
     UsedExternalMatches,
+    UsedLooks,
     UsedWeights,
 )
 from jaxsfm.report.run_report import FORMAT, Extension, RunReport
@@ -55,6 +56,7 @@ class StageResults:
     """The matches of another tool, mapped together with ours."""
     reconstructed: Reconstructed
     weights: UsedWeights
+    looks: UsedLooks | None
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -98,6 +100,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
             each=_pair_rows(counts, stages.handed_on, verified, verdicts),
         ),
         given=None if about is None else from_json(UsedExternalMatches, about),
+        looks=stages.looks,
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,

@@ -13,9 +13,9 @@ from pathlib import Path
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
-from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
 from jaxsfm.io.work_folder import RECORD, lock_folder, open_locked_folder
 from jaxsfm.matching.engines import Engine, chosen_engine
@@ -130,7 +130,7 @@ def _added_photos(
     """
     skipped = run.report.images.skipped
     used = run.report.identity.images.keys() - skipped.keys()
-    fresh = [i for i in usable if i.name not in used and not run.matches.why_unusable(i)]
+    fresh = [i for i in usable if i.name not in used and not run.store.why_unusable(i)]
     unusable = {n: why for n, why in broken.items() if n not in used and n not in skipped}
     return {image.name: image for image in fresh}, unusable
 
@@ -173,4 +173,4 @@ def _match_new(
     if not lost.keys() - added.keys():
         for _ in job.match_missing(files, pairs_without(missing, lost)):
             pass
-    return SavedMatches(job.store, pairs_without(pairs, lost)), lost
+    return SavedMatches(Looks(job.store), pairs_without(pairs, lost)), lost

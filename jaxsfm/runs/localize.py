@@ -93,8 +93,8 @@ def localize_photos(
     with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
         temporary = Store(Path(scratch), to_json(finished.report.identity))
         job = Job(
-            store=finished.matches if options.keep_features else temporary,
-            earlier=(finished.matches,),
+            store=finished.store if options.keep_features else temporary,
+            earlier=(finished.store,),
             weights=weights,
             config=model.config,
             engine=engine,

@@ -1,26 +1,22 @@
 """A whole run in its work folder: from photos to a COLMAP model, a database and a report."""
 
+import dataclasses
 import importlib.metadata
 import logging
-import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.external_matches import JoinedMatches, read_external_matches
-from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, parse_intrinsics
-from jaxsfm.colmap.mapper import MapOptions
-from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.colmap.external_matches import read_external_matches
+from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
+from jaxsfm.io.looks import Looks
 from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
-from jaxsfm.io.pairs import Pair, PairCounts, PairResult, best_pairs
-from jaxsfm.io.store import SavedMatches, digest
+from jaxsfm.io.pairs import Pair
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import open_folder
 from jaxsfm.matching.engines import chosen_engine
@@ -28,13 +24,21 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, nearest_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page.after_run import page_after_run
-from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
+from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
-from jaxsfm.runs.job import Job, images_of, pairs_without
+from jaxsfm.runs.job import Job, pairs_without
+from jaxsfm.runs.matching_looks import (
+    MatchedPairs,
+    first_look,
+    job_of_look,
+    match_again,
+    match_pairs,
+    timed,
+)
 from jaxsfm.runs.run_options import RunOptions, check_options
-from jaxsfm.sfm.reconstruction import Reconstructed, StageCache, reconstruct
+from jaxsfm.runs.run_stages import RunStages
 
 logger = logging.getLogger("jaxsfm")
 
@@ -101,46 +105,50 @@ def reconstruct_folder(
         )
         skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
         if selection.retrieval:
-            with _timed(seconds, "retrieval"):
+            with timed(seconds, "retrieval"):
                 tried = [image for image in usable if image.name not in skipped]
                 found, lost = _retrieve(job, tried, options.retrieval, selection.retrieval)
                 pairs, skipped = sorted({*pairs, *found}), skipped | lost
         by_name = {image.name: image for image in usable if image.name not in skipped}
-        pairs = pairs_without(pairs, skipped)
-        with _timed(seconds, "extraction"):
-            results = {p: r.counts for p in pairs if (r := folder.load_matches(p)) is not None}
-            missing = [pair for pair in pairs if pair not in results]
-            if results:
-                logger.info("%d of %d pairs have been matched before", len(results), len(pairs))
-            skipped |= job.extract_missing(images_of(missing, by_name))
-            missing = pairs_without(missing, skipped)
-            good = [image for image in usable if image.name not in skipped]
-            _check_enough(images, good, skipped)
-        with _timed(seconds, "matching"):
-            for result in job.match_missing(by_name, missing):
-                results[result.pair] = result.counts
-        chosen = sorted(_verified_pairs(results, options.best_pairs))
-        ours = SavedMatches(folder, chosen)
-        handed_on = JoinedMatches(ours, external, {image.name for image in good})
-        matches_key = digest(
-            [[*pair, folder.match_key(pair)] for pair in chosen],
-            external.about and external.about["sha256"],
+        first = first_look(config, by_name.values())
+        look = job_of_look(job, identity, first) if first else job
+        counts, lost = match_pairs(look, by_name, pairs_without(pairs, skipped), seconds)
+        skipped |= lost
+        good = [image for image in usable if image.name not in skipped]
+        _check_enough(images, good, skipped)
+        stages = RunStages(
+            folder=folder,
+            images=good,
+            intrinsics=intrinsics,
+            external=external,
+            config=config,
+            options=options,
+            seconds=seconds,
         )
-        stages = StageCache(folder, matches_key)
+        matched = MatchedPairs(Looks(look.store), look.config, counts)
+        mapped = stages.map(matched, again=False)
+        looks = UsedLooks(first_px=first.max_size) if first else None
+        again = mapped.unsettled(counts) if first else None
+        if looks is not None and again is not None:
+            logger.info("%s", again.in_words())
+            matched = match_again(job, by_name, matched, again, seconds)
+            mapped = stages.map(matched, again=True)
+            tried = sorted(again.pairs)
+            looks = dataclasses.replace(looks, photos=again.photos, again=tried, whole=again.whole)
         with folder.publish() as target:
-            made, took = _map(target, good, handed_on, intrinsics, stages, config, options)
-            seconds |= took
+            made = stages.refine(mapped, target)
             report = run_report(
                 StageResults(
                     folder=images,
                     identity=identity,
                     usable=good,
                     skipped=skipped,
-                    results=results,
-                    handed_on=handed_on,
+                    results=matched.counts,
+                    handed_on=mapped.handed_on,
                     external=external,
                     reconstructed=made,
                     weights=from_json(UsedWeights, weights.described(config)),
+                    looks=looks,
                     seconds=seconds,
                 ),
                 config=config,
@@ -157,72 +165,10 @@ def reconstruct_folder(
         return report
 
 
-def _map(
-    target: Path,
-    images: list[ImageFile],
-    matches: Mapping[Pair, PairResult],
-    intrinsics: Intrinsics | None,
-    stages: StageCache,
-    config: Config,
-    options: RunOptions,
-) -> tuple[Reconstructed, dict[str, float]]:
-    """Write the database and the models into `target`; returns also the seconds of each stage."""
-    start, seconds = time.monotonic(), {}
-    passes = config.refinement.passes if config.refinement else 0
-    quiet = not options.progress
-    with (
-        tqdm(total=len(images), desc="mapping", unit="image", disable=quiet) as bar,
-        tqdm(total=passes, desc="refinement", unit="pass", disable=quiet or not passes) as turns,
-    ):
-
-        def on_image() -> None:
-            bar.update(bar.n < len(images))  # several models may share images
-
-        def on_mapped() -> None:
-            seconds["mapping"] = time.monotonic() - start
-            turns.reset()
-
-        def on_pass() -> None:
-            turns.update(turns.n < passes)
-
-        made = reconstruct(
-            images,
-            matches,
-            target / "database.db",
-            config=config,
-            intrinsics=intrinsics,
-            options=MapOptions(
-                mapper=options.mapper,
-                refine_intrinsics=options.refines,
-                seed=options.seed,
-                threads=options.threads,
-            ),
-            kept=stages,
-            on_image=on_image,
-            on_mapped=on_mapped,
-            on_pass=on_pass,
-        )
-        if made.models:
-            # The global mapper does not report images before it ends.
-            bar.update(made.models[0].num_reg_images() - bar.n)
-    if passes:
-        seconds["refinement"] = time.monotonic() - start - seconds["mapping"]
-    write_models(made.models, target / "sparse")
-    write_models(made.alternative, target / "alternative")
-    return made, seconds
-
-
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:
     if len(images) < 2:
         why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
         raise UserError(f"{folder}: {len(images)} usable images, at least 2 are needed{why}")
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.monotonic()
-    yield
-    seconds[stage] = time.monotonic() - start
 
 
 def _retrieve(
@@ -243,11 +189,3 @@ def _retrieve(
         job.store.record_failure(image, error)
     lost = {image.name: str(error) for image, error in found.lost}
     return nearest_pairs(found.vectors, k), lost
-
-
-def _verified_pairs(results: dict[Pair, PairCounts], n: int | None) -> set[Pair]:
-    """The pairs with inliers; with `n`, only the best `n` pairs of each image."""
-    counts = {pair: result.num_inliers for pair, result in results.items()}
-    if n is None:
-        return {pair for pair, count in counts.items() if count}
-    return best_pairs(counts, n)

@@ -53,12 +53,12 @@ def similar_photos(
     def descriptor(name: str) -> np.ndarray:
         if name in new:
             return describe(new[name])
-        saved = run.matches.load_descriptor(run.photos.recorded(name), GEM)
+        saved = run.store.load_descriptor(run.photos.recorded(name), GEM)
         if saved is not None:
             return saved
         image = photos_of_run(run, [name])[name]
         try:
-            return describe(image, run.matches)
+            return describe(image, run.store)
         except ImageError:
             raise
         except UserError:  # the run's folder cannot be written

@@ -80,7 +80,8 @@ def build_checked_models(
     """Map verified pairs until no photo contradicts the others, with two hypotheses.
 
     If photos still contradict each other after the last round, the parts of the best models are
-    returned, and their checks say so. A round that leaves no model to check does not count.
+    returned, and their checks say so; the alternative is then what they are parts of. A round that
+    leaves no model to check does not count.
 
     Args:
       database: where to write the pairs that the models were made from.
@@ -105,6 +106,7 @@ def build_checked_models(
                 best, other = other, best
                 checks, complete = _checks(best, following), False
         rounds.go_back_to(best)
+        whole, parts = best, []
         red = best.contradicted() > 0
         if red:
             best, parts = rounds.told_apart(best)
@@ -113,7 +115,11 @@ def build_checked_models(
         if not complete:
             checks = rounds.with_second_places(best, checks)
         alternative = []
-        if other is not None and checks[0] is not None and _stands(other, red=red):
+        if parts and checks[0] is not None:
+            whole = whole.contradicting()
+            checks[0] = dataclasses.replace(checks[0], alternative=_untold(whole, checks[0]))
+            alternative = rounds.with_all_points(whole)
+        elif other is not None and checks[0] is not None and _stands(other, red=red):
             told = _alternative(best, other)
             if told is not None:
                 checks[0] = dataclasses.replace(checks[0], alternative=told)
@@ -177,6 +183,26 @@ def _stands(other: Round, *, red: bool) -> bool:
       red: whether photos contradict the best models too.
     """
     return bool(other.checked_photos()) and (red or not other.contradicted())
+
+
+def _untold(whole: Round, part: ModelCheck) -> Alternative:
+    """What the largest model that was told apart says of the largest part.
+
+    Args:
+      whole: the round, with the models that were told apart alone.
+    """
+    assert whole.checks[0] is not None
+    before, now = (
+        {name for group in check.groups for name in group}
+        for check in (whole.checks[0].check, part)
+    )
+    return Alternative(
+        basis=whole.basis,
+        images=len(before),
+        elsewhere=sorted(before - now),
+        contradicted=whole.contradicted(),
+        whole=True,
+    )
 
 
 def _alternative(best: Round, other: Round) -> Alternative | None:

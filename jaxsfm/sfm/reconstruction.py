@@ -45,6 +45,52 @@ class StageCache(NamedTuple):
     folder: WorkFolder
     matches_key: str
     """Identifies the matches. A stage is used again only for the same matches."""
+    suffix: str = ""
+    """Of the names of the stages, so that those of several looks lie beside each other."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MatchedPhotos:
+    """Photos with their matches, and how models are made from them.
+
+    UserError if the known cameras do not fit the photos.
+    """
+
+    images: list[ImageFile]
+    matches: Mapping[Pair, PairResult]
+    """The result of `match`."""
+    config: Config
+    """Its `view_graph`, `checked` and `refinement` switch those parts on. The refinement works at
+    its size."""
+    described: Config
+    """The settings that the matches were made with."""
+    intrinsics: KnownCameras | None
+    """None takes one camera per photo."""
+    options: MapOptions
+    """Of the mapper; its `scale` is that of the described photos."""
+
+    def __post_init__(self) -> None:
+        if self.intrinsics is not None:
+            check_fits(self.intrinsics, {image.name: image.size for image in self.images})
+
+
+class MappedStage(NamedTuple):
+    """The models of the mapper, in the folder of their stage."""
+
+    verification: VerificationFigures
+    figures: MappingFigures
+    folder: Path
+    key: str
+    """Identifies all that the models depend on."""
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database of the models."""
+        return self.folder / DATABASE
+
+    def models(self, name: str = SPARSE) -> "list[pycolmap.Reconstruction]":
+        """The models, or the `ALTERNATIVE` ones."""
+        return read_models(self.folder / name, self.database)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,10 +115,6 @@ def reconstruct(
     config: Config,
     intrinsics: KnownCameras | None = None,
     options: MapOptions | None = None,
-    kept: StageCache | None = None,
-    on_image: Callable[[], None] = lambda: None,
-    on_pass: Callable[[], None] = lambda: None,
-    on_mapped: Callable[[], None] = lambda: None,
 ) -> Reconstructed:
     """Make COLMAP models from verified matches: mapping of trusted pairs, check, refinement.
 
@@ -86,28 +128,68 @@ def reconstruct(
       intrinsics: the known cameras. None takes one camera per photo.
       options: of the mapper. By default it is incremental, and refines the intrinsics unless they
         are given.
-      kept: stages of earlier runs, which are used again where they hold. New ones are kept there.
-      on_image: called for every image that the mapper registers.
 
     Raises:
       UserError: the intrinsics do not fit the images, or COLMAP fails.
     """
-    if options is None:
-        options = MapOptions(refine_intrinsics=intrinsics is None)
-    photos = Photos(images, config)
-    options = dataclasses.replace(options, scale=photos.median_scale())
-    if intrinsics is not None:
-        check_fits(intrinsics, {image.name: image.size for image in images})
+    given = matched_photos(
+        images, matches, config=config, described=config, intrinsics=intrinsics, options=options
+    )
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        stages = StageCache(WorkFolder(Path(scratch), {}), "")
+        return refine_mapped(given, map_matches(given, stages), database, stages)
+
+
+def matched_photos(
+    images: list[ImageFile],
+    matches: Mapping[Pair, PairResult],
+    *,
+    config: Config,
+    described: Config,
+    intrinsics: KnownCameras | None,
+    options: MapOptions | None,
+) -> MatchedPhotos:
+    """Photos with their matches; `options` as in `reconstruct`, in pixels of the described photos.
+
+    Raises:
+      UserError: the intrinsics do not fit the images.
+    """
+    options = options or MapOptions(refine_intrinsics=intrinsics is None)
+    scale = Photos(images, described).median_scale()
+    return MatchedPhotos(
+        images=images,
+        matches=matches,
+        config=config,
+        described=described,
+        intrinsics=intrinsics,
+        options=dataclasses.replace(options, scale=scale),
+    )
+
+
+def map_matches(
+    given: MatchedPhotos, kept: StageCache, on_image: Callable[[], None] = lambda: None
+) -> MappedStage:
+    """Verify the matches, and map the trusted pairs until no photo contradicts the others.
+
+    Args:
+      kept: stages of earlier runs, which are used again where they hold. New ones are kept there.
+      on_image: called for every image that the mapper registers.
+
+    Raises:
+      UserError: COLMAP fails.
+    """
+    config, options, stages = given.config, given.options, kept.folder
 
     def verify_matches(folder: Path) -> None:
-        write_database(folder / DATABASE, images, matches, intrinsics)
+        write_database(folder / DATABASE, given.images, given.matches, given.intrinsics)
         figures = _verified(folder / DATABASE, options, config.view_graph)
         stage_files.write_verification(folder, figures)
 
     def build(folder: Path) -> None:
         two_views = read_two_views(verified / DATABASE)
+        photos = Photos(given.images, given.described)
         made = build_checked_models(
-            VerifiedPairs(verified / DATABASE, two_views, matches, photos),
+            VerifiedPairs(verified / DATABASE, two_views, given.matches, photos),
             folder / DATABASE,
             config=config,
             options=options,
@@ -117,49 +199,68 @@ def reconstruct(
         write_models(made.alternative, folder / ALTERNATIVE)
         stage_files.write_mapping(folder, made.figures)
 
+    by_image = [[image.name, image.sha256, image.size] for image in given.images]
+    camera = _plain(given.intrinsics)
+    verifying = [options.seed, options.threads, options.scale, config.view_graph]
+    key = digest(
+        kept.matches_key, stage_files.FORMAT, by_image, camera, verifying, package_versions()
+    )
+    verified = stages.stage("verified" + kept.suffix, key, verify_matches)
+    aligning = config.refinement or Refinement()
+    checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
+    refines = config.refinement is not None
+    key = digest(key, dataclasses.asdict(options), checking, refines)
+    verification = stage_files.read_verification(verified)
+    mapped = stages.stage("mapped" + kept.suffix, key, build)
+    return MappedStage(verification, stage_files.read_mapping(mapped), mapped, key)
+
+
+def refine_mapped(
+    given: MatchedPhotos,
+    mapped: MappedStage,
+    database: Path,
+    kept: StageCache,
+    on_pass: Callable[[], None] = lambda: None,
+) -> Reconstructed:
+    """Refine the models of the mapper, if asked for, and colour their points.
+
+    Args:
+      mapped: made from what is given.
+      database: where to write the COLMAP database; a file there is replaced.
+      kept: as in `map_matches`.
+    """
+    config, matches = given.config, given.matches
+
     def refine(folder: Path) -> None:
-        false = mapping.misleading()
+        false = mapped.figures.misleading()
         believed = ChosenMatches(matches, [pair for pair in matches if pair not in false])
         made = refine_models(
-            read_models(mapped / SPARSE, mapped / DATABASE),
-            photos,
-            Believed(mapped / DATABASE, believed, verification.verified.keys() - false),
+            mapped.models(),
+            Photos(given.images, config),
+            Believed(mapped.database, believed, mapped.verification.verified.keys() - false),
             config=config,
-            options=options,
+            options=given.options,
             on_pass=on_pass,
         )
         write_models(made.models, folder / SPARSE)
         stage_files.write_refinement(folder, made.figures, made.order)
 
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        stages, key = kept or (WorkFolder(Path(scratch), {}), "")
-        by_image = [[image.name, image.sha256, image.size] for image in images]
-        camera = _plain(intrinsics)
-        verifying = [options.seed, options.threads, options.scale, config.view_graph]
-        key = digest(key, stage_files.FORMAT, by_image, camera, verifying, package_versions())
-        verified = stages.stage("verified", key, verify_matches)
-        aligning = config.refinement or Refinement()
-        checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
-        refines = config.refinement is not None
-        key = digest(key, dataclasses.asdict(options), checking, refines)
-        verification = stage_files.read_verification(verified)
-        mapped = stages.stage("mapped", key, build)
-        mapping = stage_files.read_mapping(mapped)
-        on_mapped()
-        key = digest(key, config.refinement and dataclasses.asdict(config.refinement))
-        refined = stages.stage("refined", key, refine)
-        shutil.copyfile(mapped / DATABASE, database)
-        refinement, order = stage_files.read_refinement(refined)
-        models = read_models(refined / SPARSE, database)
-        if config.refinement is not None and None in refinement:
-            stages.forget_stage("refined")  # a photo could not be read; perhaps it can next time
-        return Reconstructed(
-            verification=verification,
-            mapping=dataclasses.replace(mapping, checks=[mapping.checks[k] for k in order]),
-            models=models,
-            alternative=read_models(mapped / ALTERNATIVE, database),
-            refinement=refinement,
-        )
+    settings = config.refinement and dataclasses.asdict(config.refinement)
+    key = digest(mapped.key, settings, config.max_size, config.enlarge)
+    refined = kept.folder.stage("refined", key, refine)
+    shutil.copyfile(mapped.database, database)
+    refinement, order = stage_files.read_refinement(refined)
+    models = read_models(refined / SPARSE, database)
+    if config.refinement is not None and None in refinement:
+        kept.folder.forget_stage("refined")  # a photo could not be read; perhaps it can next time
+    checks = [mapped.figures.checks[k] for k in order]
+    return Reconstructed(
+        verification=mapped.verification,
+        mapping=dataclasses.replace(mapped.figures, checks=checks),
+        models=models,
+        alternative=mapped.models(ALTERNATIVE),
+        refinement=refinement,
+    )
 
 
 def _plain(intrinsics: KnownCameras | None) -> Json:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import math
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -64,7 +65,9 @@ def refine_models(
     They are refined one after the other, each with the unmapped photos that none before took.
 
     Args:
+      photos: at the size that the refinement works at.
       config: its `refinement` and `checked` switch these parts on.
+      options: of the mapper; its `scale` is that of the photos in which keypoints were found.
     """
     cameras = read_images(believed.database)
     mapped = {name for model in models for name in registered(model)}
@@ -87,6 +90,7 @@ def refine_models(
                     refine_intrinsics=options.refine_intrinsics,
                     evidence=evidence,
                     with_all_points=whole,
+                    described_px=described_px(options.scale / photos.median_scale()),
                     threads=options.threads,
                     on_pass=on_pass,
                 )
@@ -106,6 +110,15 @@ def refine_models(
     for model in refined:
         colour_points(model, photos.rgb)
     return RefinedModels([refined[k] for k in order], [figures[k] for k in order], order)
+
+
+def described_px(ratio: float) -> int:
+    """The size in which keypoints were found, as the nearest power of two of working pixels.
+
+    Args:
+      ratio: working pixels per pixel of the images in which they were found, at least 1.
+    """
+    return 2 ** max(0, round(math.log2(ratio)))
 
 
 def _without_doubtful(

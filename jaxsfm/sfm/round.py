@@ -6,7 +6,7 @@ joined photos that contradict each other.
 
 import functools
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.two_views import PairGeometry
@@ -79,6 +79,16 @@ class Round:
     def contradicted(self) -> int:
         """The number of points at which photos contradict each other."""
         return sum(c.contradicted for each in self._done() for c in each.check.contradictions)
+
+    def contradicting(self) -> "Round":
+        """The same round with only those models whose photos contradict each other."""
+        red = [
+            k
+            for k, done in enumerate(self.checks)
+            if done is not None and done.check.contradictions
+        ]
+        models, checks = ([column[k] for k in red] for column in (self.models, self.checks))
+        return replace(self, models=models, checks=checks)
 
     def consistent_pairs(self) -> int:
         """The number of pairs of photos, matched or not, whose places nothing contradicts: those in

@@ -9,6 +9,7 @@ from verdicts import NAMES, OTHER, check_of, with_verdicts
 from jaxsfm.report.run_report import read_report
 from jaxsfm.report.summary import summary_lines
 from jaxsfm.report.verdict import MAX_FINDINGS, model_verdict, model_verdicts, verdict_lines
+from jaxsfm.sfm.check.model_check import Alternative
 
 FORMAT_1 = Path(__file__).parent / "report_of_format_1.json"
 
@@ -94,6 +95,19 @@ def test_photos_that_were_told_apart_are_amber_and_each_group_is_named():
     assert found.images == NAMES[:3] and found.others == NAMES[3:]
     (found,) = model_verdict(dataclasses.replace(check_of("green"), told_apart=groups[:3])).parts
     assert found.text.endswith(f"; {NAMES[5]}")
+
+
+def test_the_model_that_was_told_apart_is_shown_as_one_way_to_join_the_groups():
+    whole = Alternative(basis="order", images=8, elsewhere=NAMES[3:], contradicted=9, whole=True)
+    groups = [NAMES[:3], NAMES[3:]]
+    check = dataclasses.replace(check_of("green"), told_apart=groups, alternative=whole)
+    lines = verdict_lines([model_verdict(check)])
+    assert lines[1] == (
+        "other model      alternative/0 has 8 photos in one model, as they were before they were "
+        "told apart; photos contradict each other at 9 of its points"
+    )
+    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}" in lines[3]
+    assert "look at each model by itself" in lines[4] and "alternative/0" in lines[4]
 
 
 def test_a_red_model_points_to_the_other_one_and_to_what_speaks_against_it():

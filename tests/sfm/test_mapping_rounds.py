@@ -758,6 +758,11 @@ def test_what_is_red_to_the_end_is_told_apart_and_amber(rounds, monkeypatch):
     assert found.models == [frozenset("abc"), whole] and found.searched == []
     assert [told and told.verdict for told in found.figures.checks] == ["amber", "amber"]
     assert [told and told.told_apart for told in found.figures.checks] == [parts, parts]
+    # The first of the two models, which was told apart, is still there as one of the two ways.
+    assert found.alternative == asked[0][0][:1]
+    told = found.figures.checks[0]
+    assert told is not None and told.alternative is not None and told.alternative.whole
+    assert told.alternative.contradicted == 30 and told.alternative.basis == "pairs"
 
 
 def test_models_that_nothing_contradicts_are_not_told_apart(rounds, monkeypatch):

@@ -11,6 +11,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.images import WorkingImage
+from jaxsfm.io.looks import SECOND_CELLS
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.report.finished_run import FinishedRun
@@ -35,7 +36,7 @@ class Patch(NamedTuple):
     name: str
     uri: str
     cell: tuple[float, float] | None
-    """The top-left corner of the cell of FINE_STRIDE pixels; None if no cell matched."""
+    """The top-left corner of the cell of FINE_STRIDE pixels; None if no such cell matched."""
     walked: tuple[float, float] | None
     """The keypoint: the pixel with the strongest features in the cell."""
     final: tuple[float, float]
@@ -106,7 +107,7 @@ def _patch(
     pixels = Pixels(image.scale)
     aligned = pixels.from_original(final)
     corner, walked = None, None
-    if own is not None:
+    if own is not None and own[0] < SECOND_CELLS:
         row, column = divmod(own[0], width // FINE_STRIDE)
         corner = np.asarray([column, row]) * float(FINE_STRIDE)
         walked = pixels.from_original(own[1].astype(np.float64))

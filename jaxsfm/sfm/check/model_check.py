@@ -61,13 +61,16 @@ class Alternative:
     """Another model of the same photos, which joins them in another way."""
 
     basis: Basis
-    """What it follows; the model itself follows the other one."""
+    """What it follows."""
     images: int
     """The number of its photos."""
     elsewhere: list[str]
     """Photos that have other places in it than in the model, as seen from most photos. Sorted."""
     contradicted: int
     """Points at which its photos contradict each other."""
+    whole: bool = False
+    """Whether it is the model that was told apart, as it was before. Otherwise it follows what the
+    model itself does not follow."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

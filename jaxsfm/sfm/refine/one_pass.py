@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
-from jaxsfm.colmap.model import Model, Sizes
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -65,15 +65,16 @@ class Refined(NamedTuple):
 def run_pass(
     before: Refined,
     images: DeviceImages,
-    sizes: Sizes,
+    px: int,
     limits: AlignmentLimits,
     settings: PassSettings,
 ) -> tuple[Refined, PassFigures]:
     """Align the observations of a model and adjust it.
 
     Args:
-      images, sizes: those of its views.
-      limits: what an aligned keypoint must fulfil to count.
+      images: those of its views.
+      px: the size of a pixel in this pass, working pixels.
+      limits: what an aligned keypoint must fulfil to count, in pixels of this pass.
 
     Returns:
       the model after the pass, which is the one before if too little agreed; what was done.
@@ -81,9 +82,13 @@ def run_pass(
     Raises:
       ImageError: an image of the model cannot be read any more.
     """
-    blocks = list(align_blocks(before.model, images, settings.refinement, limits))
-    aligned, weak = _gather(before.model, blocks)
-    adjusted = _adjust(aligned, weak, sizes, settings)
+    start = before.model.in_octave(px)
+    blocks = list(align_blocks(start, images.octave(px), settings.refinement, limits))
+    aligned, weak = _gather(start, blocks)
+    adjusted = _adjust(aligned, weak, settings)
+    if adjusted is not None and px > 1:
+        sizes = {view.name: (view.size, view.pixels.scale) for view in before.model.views}
+        adjusted = adjusted._replace(model=Model.from_colmap(adjusted.reconstruction, sizes))
     enough = max(MIN_POINTS, MIN_POINT_SHARE * len(before.model.tracks.points))
     accepted = adjusted is not None and adjusted.reconstruction.num_points3D() >= enough
     after = adjusted if adjusted is not None and accepted else before
@@ -128,7 +133,6 @@ def _gather(model: Model, blocks: Sequence[AlignedBlock]) -> tuple[Model, np.nda
 def _adjust(
     model: Model,
     weak: np.ndarray,
-    sizes: Sizes,
     settings: PassSettings,
 ) -> Refined | None:
     """Filter the observations and adjust the bundle, twice; None if (nearly) nothing is left.
@@ -139,6 +143,7 @@ def _adjust(
     loss_px = float(np.median([view.mean_scale for view in model.views]))
     weak_view = np.isin(np.arange(len(model.views)), weak)
     limit = settings.refinement.max_error_px * np.where(weak_view, 4.0, 1.0)
+    sizes = {view.name: (view.size, view.pixels.scale) for view in model.views}
     adjusted = None
     # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
     for slack in (4.0, 1.0):

@@ -45,6 +45,12 @@ def _as_arrays(reconstruction: "pycolmap.Reconstruction", sizes: Sizes) -> Refin
     return Refined(reconstruction, Model.from_colmap(reconstruction, sizes))
 
 
+def _sizes_of_passes(passes: int, described_px: int) -> list[int]:
+    """The sizes of a pixel in all passes, working pixels."""
+    larger = [2**k for k in reversed(range(described_px.bit_length() - 1))]
+    return [described_px] * passes + larger
+
+
 def _working_sizes(
     reconstruction: "pycolmap.Reconstruction", read: Reader, evidence: Evidence
 ) -> tuple[Sizes, Evidence]:
@@ -74,6 +80,7 @@ def refine_model(
     refine_intrinsics: bool,
     evidence: Evidence = NO_EVIDENCE,
     with_all_points: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction] | None" = None,
+    described_px: int = 1,
     threads: int = -1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
@@ -89,8 +96,12 @@ def refine_model(
       read: intensities by image name; may be called several times per image.
       refine_intrinsics: whether bundle adjustment moves focal lengths and distortion.
       evidence: images that the mapper left out, and matches to place them and weak views by.
-      with_all_points: gives a model the points of all matches, before the last pass. None: it has
-        them already.
+      with_all_points: gives a model the points of all matches, before the last of the `passes`.
+        None: it has them already.
+      described_px: the size of a pixel in which the keypoints were found, a power of two of working
+        pixels. The `passes` are done with images of this size, and one more follows at each size
+        above it, up to the working size: keypoints of a small image are too far off for a larger
+        one.
       threads: of bundle adjustment. With one thread the model is repeatable to the last byte.
 
     Raises:
@@ -98,10 +109,10 @@ def refine_model(
     """
     sizes, evidence = _working_sizes(reconstruction, read, evidence)
     images, settings = DeviceImages(read), PassSettings(refinement, refine_intrinsics, threads)
-    now = Refined(reconstruction, Model.from_colmap(reconstruction, sizes))
+    now = _as_arrays(reconstruction, sizes)
     figures: list[PassFigures] = []
     limits = AlignmentLimits.of(refinement)
-    for number in range(refinement.passes):
+    for number, px in enumerate(_sizes_of_passes(refinement.passes, described_px)):
         if number > 0:
             limits = limits._replace(max_shift_px=refinement.max_shift_px / 2)
         if with_all_points is not None and number == refinement.passes - 1:
@@ -109,7 +120,7 @@ def refine_model(
             limits = AlignmentLimits.of(refinement)  # the keypoints of new points are not aligned
         if len(now.model.tracks.points) < MIN_POINTS or len(now.model.views) < 2:
             break
-        now, done = run_pass(now, images, sizes, limits, settings)
+        now, done = run_pass(now, images, px, limits, settings)
         figures.append(done)
         on_pass()
         if not done.accepted:

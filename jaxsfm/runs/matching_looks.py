@@ -1,0 +1,112 @@
+"""The matching of a run's photos, at one size or at two."""
+
+import dataclasses
+import logging
+import time
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from jaxsfm.config import Config
+from jaxsfm.io.images import ImageFile, working_size
+from jaxsfm.io.looks import Looks, SavedMatches
+from jaxsfm.io.pairs import Pair, PairCounts, best_pairs
+from jaxsfm.io.store import Store
+from jaxsfm.report.run_inputs import RunIdentity
+from jaxsfm.report.typed_json import to_json
+from jaxsfm.runs.job import Job, images_of, pairs_without
+from jaxsfm.sfm.second_look import SecondLook
+
+logger = logging.getLogger("jaxsfm")
+
+WORTH = 1.25
+"""A first look is not worth its time if the median photo is reduced less than by this factor."""
+
+
+@contextmanager
+def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the time of the block to that of a stage."""
+    start = time.monotonic()
+    yield
+    seconds[stage] = seconds.get(stage, 0.0) + time.monotonic() - start
+
+
+class MatchedPairs(NamedTuple):
+    """The pairs of a run after a look."""
+
+    looks: Looks
+    """Where the matches are."""
+    described: Config
+    """The settings of the look; after two looks at some pairs, those of the first one."""
+    counts: dict[Pair, PairCounts]
+    """Of every pair that was tried."""
+
+    def with_inliers(self, n: int | None) -> list[Pair]:
+        """The pairs with inliers, sorted; with `n`, only the best `n` pairs of each image."""
+        counts = {pair: result.num_inliers for pair, result in self.counts.items()}
+        if n is None:
+            return sorted(pair for pair, count in counts.items() if count)
+        return sorted(best_pairs(counts, n))
+
+
+def first_look(config: Config, images: Collection[ImageFile]) -> Config | None:
+    """The settings of the first look; None if it would hardly be smaller than the second one."""
+    first = config.of_first_look()
+
+    def side(image: ImageFile, at: Config) -> int:
+        return max(working_size(image.size, at.max_size, at.enlarge))
+
+    ratios = sorted(side(image, config) / side(image, first) for image in images)
+    return first if ratios and ratios[len(ratios) // 2] >= WORTH else None
+
+
+def job_of_look(job: Job, identity: RunIdentity, config: Config) -> Job:
+    """The same job with the settings of a look."""
+    identity = dataclasses.replace(identity, config=config.matching())
+    store = Store(job.store.path, to_json(identity))
+    return dataclasses.replace(job, config=config, store=store)
+
+
+def match_pairs(
+    job: Job,
+    by_name: Mapping[str, ImageFile],
+    pairs: Collection[Pair],
+    seconds: dict[str, float],
+) -> tuple[dict[Pair, PairCounts], dict[str, str]]:
+    """Match the pairs whose matches the job's store lacks.
+
+    Returns:
+      the counts of all pairs whose photos can be decoded; why other photos cannot, by name.
+    """
+    store = job.store
+    with timed(seconds, "extraction"):
+        counts = {p: r.counts for p in pairs if (r := store.load_matches(p)) is not None}
+        missing = [pair for pair in pairs if pair not in counts]
+        if counts:
+            logger.info("%d of %d pairs have been matched before", len(counts), len(pairs))
+        lost = job.extract_missing(images_of(missing, by_name))
+    with timed(seconds, "matching"):
+        for result in job.match_missing(by_name, pairs_without(missing, lost)):
+            counts[result.pair] = result.counts
+    return counts, lost
+
+
+def match_again(
+    job: Job,
+    by_name: Mapping[str, ImageFile],
+    matched: MatchedPairs,
+    again: SecondLook,
+    seconds: dict[str, float],
+) -> MatchedPairs:
+    """Match pairs again at the size of the job.
+
+    Args:
+      matched: the pairs after the first look.
+    """
+    counts, _ = match_pairs(job, by_name, again.pairs, seconds)
+    if again.whole:
+        return MatchedPairs(Looks(job.store), job.config, counts)
+    looks = Looks(matched.looks.first, job.store, counts.keys())
+    both = SavedMatches(looks, counts)
+    united = {pair: both[pair].counts for pair in counts}
+    return MatchedPairs(looks, matched.described, matched.counts | united)

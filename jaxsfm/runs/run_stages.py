@@ -1,0 +1,145 @@
+"""The stages of a run after matching, with their progress bars and times."""
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from tqdm import tqdm
+
+from jaxsfm.colmap.external_matches import ExternalMatches, JoinedMatches
+from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.config import Config
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.looks import SavedMatches
+from jaxsfm.io.pairs import Pair, PairCounts
+from jaxsfm.io.store import digest
+from jaxsfm.io.work_folder import WorkFolder
+from jaxsfm.runs.matching_looks import MatchedPairs, timed
+from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.reconstruction import (
+    MappedStage,
+    MatchedPhotos,
+    Reconstructed,
+    StageCache,
+    map_matches,
+    matched_photos,
+    refine_mapped,
+)
+from jaxsfm.sfm.second_look import SecondLook, second_look
+
+
+class MappedRun(NamedTuple):
+    """The photos of a run, and the models that the mapper made of them."""
+
+    given: MatchedPhotos
+    stage: MappedStage
+    cache: StageCache
+
+    @property
+    def handed_on(self) -> Collection[Pair]:
+        """The pairs whose matches were written into COLMAP's database."""
+        return self.given.matches.keys()
+
+    def unsettled(self, counts: Mapping[Pair, PairCounts]) -> SecondLook | None:
+        """What to look at again; None if nothing.
+
+        Args:
+          counts: of all pairs that were tried.
+        """
+        names = [image.name for image in self.given.images]
+        return second_look(counts, names, self.photos(), self.trusted(), green=self.green())
+
+    def photos(self) -> list[set[str]]:
+        """The photos of each model, the model with most photos first."""
+        return [set(registered(model)) for model in self.stage.models()]
+
+    def trusted(self) -> set[Pair]:
+        """The verified pairs that the models were made from."""
+        verdicts = self.stage.figures.verdicts
+        verified = self.stage.verification.verified
+        return {p for p in verified if p not in verdicts or verdicts[p].trusted}
+
+    def green(self) -> bool:
+        """Whether nothing speaks against the models."""
+        checks = self.stage.figures.checks
+        return all(check is None or check.verdict == "green" for check in checks)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunStages:
+    """What the stages of a run need besides its matches."""
+
+    folder: WorkFolder
+    images: list[ImageFile]
+    intrinsics: Intrinsics | None
+    external: ExternalMatches
+    config: Config
+    options: RunOptions
+    seconds: dict[str, float]
+    """Wall-clock time of each stage, seconds; the stages add theirs."""
+
+    def map(self, matched: MatchedPairs, *, again: bool) -> MappedRun:
+        """Map the pairs with inliers.
+
+        Args:
+          again: whether this is after the second look.
+        """
+        chosen = matched.with_inliers(self.options.best_pairs)
+        ours = SavedMatches(matched.looks, chosen)
+        matches = JoinedMatches(ours, self.external, {image.name for image in self.images})
+        key = digest(
+            [[*pair, *matched.looks.match_key(pair)] for pair in chosen],
+            self.external.about and self.external.about["sha256"],
+        )
+        options = self.options
+        given = matched_photos(
+            self.images,
+            matches,
+            config=self.config,
+            described=matched.described,
+            intrinsics=self.intrinsics,
+            options=MapOptions(
+                mapper=options.mapper,
+                refine_intrinsics=options.refines,
+                seed=options.seed,
+                threads=options.threads,
+            ),
+        )
+        cache = StageCache(self.folder, key, "-again" if again else "")
+        total, quiet = len(self.images), not options.progress
+        with (
+            timed(self.seconds, "mapping"),
+            tqdm(total=total, desc="mapping", unit="image", disable=quiet) as bar,
+        ):
+
+            def on_image() -> None:
+                bar.update(bar.n < total)  # several models may share images
+
+            mapped = MappedRun(given, map_matches(given, cache, on_image), cache)
+            # The global mapper does not report images before it ends.
+            bar.update(max(map(len, mapped.photos()), default=0) - bar.n)
+        return mapped
+
+    def refine(self, mapped: MappedRun, target: Path) -> Reconstructed:
+        """Refine the models, and write the database and the models into `target`."""
+        passes = self.config.refinement.passes if self.config.refinement else 0
+        quiet = not (self.options.progress and passes)
+        taken: dict[str, float] = {}
+        with (
+            timed(taken, "refinement"),
+            tqdm(total=passes, desc="refinement", unit="pass", disable=quiet) as turns,
+        ):
+
+            def on_pass() -> None:
+                turns.update(turns.n < passes)
+
+            database = target / "database.db"
+            made = refine_mapped(mapped.given, mapped.stage, database, mapped.cache, on_pass)
+        if passes:
+            self.seconds.update(taken)
+        write_models(made.models, target / "sparse")
+        write_models(made.alternative, target / "alternative")
+        return made

@@ -1,0 +1,73 @@
+"""Which photos and pairs need a second look, at full size, after a first one at a small size.
+
+Most photos find their places in a model from small descriptions, at a quarter of the network's work
+and a sixteenth of the products of descriptors. A photo is *settled* if it is in the best model and
+no photo contradicts this model. The others get a second look:
+
+* If most photos are unsettled, or if something speaks against the model, all pairs are matched
+  again. The matches of the first look are not used then.
+* Otherwise each unsettled photo is matched again with the photos that it came closest to. To get a
+  pose, it must see points of the model, and these come from keypoints of the second look, too. So
+  trusted pairs between these photos are also matched again. Their matches of the first look stay.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+from jaxsfm.io.images import named
+from jaxsfm.io.pairs import Pair, PairCounts
+
+CLOSEST = 10
+"""Pairs of an unsettled photo that are matched again: those with most inliers, then with most
+tentative matches."""
+MOST_UNSETTLED = 1 / 3
+"""If a larger share of the photos is unsettled, all pairs are matched again."""
+
+
+class SecondLook(NamedTuple):
+    """What is looked at again."""
+
+    photos: list[str]
+    """The unsettled photos, sorted."""
+    pairs: list[Pair]
+    """The pairs to match again, sorted."""
+    whole: bool
+    """Whether these are all pairs, and the matches of the first look are not used."""
+
+    def in_words(self) -> str:
+        """What is looked at again, and why, for the log."""
+        which = "all pairs" if self.whole else f"{len(self.pairs)} pairs"
+        return f"{which} are matched again at full size, because of {named(self.photos)}"
+
+
+def second_look(
+    counts: Mapping[Pair, PairCounts],
+    photos: Collection[str],
+    models: Sequence[Collection[str]],
+    trusted: Collection[Pair],
+    *,
+    green: bool,
+) -> SecondLook | None:
+    """What to look at again; None if all photos are settled.
+
+    Args:
+      counts: of all pairs that were tried in the first look.
+      photos: the names of all photos.
+      models: the photos of each model, the model with most photos first.
+      trusted: the verified pairs that the models were made from.
+      green: whether nothing speaks against the models.
+    """
+    best = set(models[0]) if models and green else set()
+    unsettled = sorted(set(photos) - best)
+    if not unsettled:
+        return None
+    if len(unsettled) > MOST_UNSETTLED * len(photos):
+        return SecondLook(unsettled, sorted(counts), whole=True)
+    pairs: set[Pair] = set()
+    for name in unsettled:
+        own = [pair for pair in counts if name in pair]
+        own.sort(key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))
+        pairs.update(own[:CLOSEST])
+    near = {name for pair in pairs for name in pair}
+    pairs |= {pair for pair in trusted if near >= set(pair)}
+    return SecondLook(unsettled, sorted(pairs), whole=False)
