@@ -93,8 +93,8 @@ class Config:
     first_look: int | None = None
     """Longer side of the working image, pixels, at which a run first describes and matches its
     photos. Only those photos that this leaves without a place are described again at `max_size`
-    (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None: photos are
-    described at `max_size` from the beginning."""
+    (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None, or without a
+    refinement: photos are described at `max_size` from the beginning."""
     octaves: int = 1
     """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
@@ -162,7 +162,9 @@ class Config:
 
     def of_first_look(self) -> "Config":
         """The settings of a run's first look; these settings if there is none."""
-        size = min(self.first_look or self.max_size, self.max_size)
+        size = self.max_size
+        if self.first_look is not None and self.refinement is not None:
+            size = min(self.first_look, size)
         return dataclasses.replace(self, max_size=size, first_look=None)
 
     def __post_init__(self) -> None:

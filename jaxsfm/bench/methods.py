@@ -88,6 +88,10 @@ are verified by homographies, and aligned where the method does so, as `jaxsfm m
 """
 RUN_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-alignment")))
 """The methods of the benchmarks of whole reconstructions."""
+ROOTSIFT, REFINED_ROOTSIFT = "rootsift", "rootsift+refined"
+"""The methods that have COLMAP's own features, without and with our refinement."""
+SET_METHODS = (ROOTSIFT, REFINED_ROOTSIFT, *RUN_METHODS[1:])
+"""The methods of the benchmarks of sets of photos."""
 
 
 MAPPERS: dict[str, Mapper] = {"colmap": "incremental", "colmap-global": "global"}
@@ -98,7 +102,7 @@ again from other initial pairs if its model lacks photos, and the global mapper 
 incremental one gives no model (`jaxsfm.colmap.mapper.build_models`).
 """
 _MAPPED = dataclasses.replace(CONFIGS["default"], view_graph=False, checked=False, refinement=None)
-AMBIGUOUS_METHODS = (*RUN_METHODS, *MAPPERS)
+AMBIGUOUS_METHODS = (*SET_METHODS, *MAPPERS)
 """The methods of `bench ambiguous`."""
 
 

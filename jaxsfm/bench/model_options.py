@@ -15,7 +15,8 @@ class _Runs(SetOptions, NetworkOptions):
 
     Attributes:
       methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
-        paper, default, robust: the presets. paper-grid, paper-learned: the preset paper with
+        rootsift+refined: the same with our refinement. paper, default, robust: the presets.
+        paper-grid, paper-learned: the preset paper with
         keypoints at the centres of cells or at the largest learned scores. paper-grid-80px: the
         same as paper-grid with the paper's threshold for it, 80 pixels. paper-naive: the preset
         paper, with matches that are followed down to pixels instead of relocalization. paper-k4: K
@@ -63,7 +64,7 @@ class StrechaOptions(_OneSeed):
     """
 
     root: Path
-    methods: tuple[str, ...] = ("rootsift,grid,reloc,default",)
+    methods: tuple[str, ...] = ("rootsift,rootsift+refined,grid,reloc,default",)
     intrinsics: Literal["known", "unknown"] = "known"
     best_pairs: int | None = None
     out: Path | None = None

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, TypedDict
 import numpy as np
 
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
-from jaxsfm.bench.methods import RUN_METHODS
+from jaxsfm.bench.memory import forget_peak, peak_bytes
+from jaxsfm.bench.methods import SET_METHODS
 from jaxsfm.bench.model_options import StrechaOptions
 from jaxsfm.bench.strecha_models import MethodRun, SetModels, set_models
 from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 BASELINE = "rootsift"
 """The method that the others are compared with."""
+STAGES = ("extraction", "matching", "mapping", "refinement")
+"""The stages whose seconds are shown."""
 PUBLISHED = {"DoG + RootSIFT": (0.17, 0.90), "dense + relocalization": (0.59, 2.27)}
 """What the paper reports (Widya et al. 2018): the means over its six sets, in full size, of the
 mean position errors (metres) and of the mean rotation errors (degrees)."""
@@ -55,7 +58,7 @@ class ModelRow(CameraErrors):
     images: int
     """The number of reference poses."""
     stages: dict[str, float]
-    """Seconds of each stage."""
+    """Seconds of each stage. COLMAP's own extraction is part of its matching."""
 
 
 class StrechaRow(ModelRow):
@@ -63,6 +66,8 @@ class StrechaRow(ModelRow):
 
     registered: int
     model: ModelFigures | None
+    peak_bytes: int | None
+    """The most memory that the process held; None where the system does not say."""
 
 
 Ratios = dict[str, dict[str, dict[str, float]]]
@@ -98,8 +103,8 @@ def camera_errors(model: Poses | None, truth: Poses) -> CameraErrors:
     return {"position": errors.position, "rotation_deg": errors.rotation_deg, "not_evaluated": ""}
 
 
-def _row(each: StrechaSet, method: str, made: SetModels) -> StrechaRow:
-    """The figures of the largest model."""
+def _row(each: StrechaSet, method: str, made: SetModels, peak: int | None) -> StrechaRow:
+    """The figures of the largest model; `peak` is `peak_bytes`."""
     model = made.models[0] if made.models else None
     return {
         "set": each.folder.name,
@@ -107,6 +112,7 @@ def _row(each: StrechaSet, method: str, made: SetModels) -> StrechaRow:
         "images": len(each.truth),
         "registered": model.num_reg_images() if model else 0,
         "stages": made.seconds,
+        "peak_bytes": peak,
         "model": _model_figures(model, each.focal) if model else None,
         **camera_errors(model_poses(model) if model else None, each.truth),
     }
@@ -127,7 +133,7 @@ def _model_figures(model: "pycolmap.Reconstruction", focal: float) -> ModelFigur
 
 def bench_strecha(options: StrechaOptions) -> BenchFigures[StrechaRow, StrechaSummary]:
     """Run all methods on all sets, with the same images, camera, verification and mapper."""
-    methods = options.chosen_methods(RUN_METHODS)
+    methods = options.chosen_methods(SET_METHODS)
     # All inputs are read before the first reconstruction, which takes minutes.
     sets = read_sets(options.root, options.chosen_sets())
 
@@ -144,7 +150,9 @@ def bench_strecha(options: StrechaOptions) -> BenchFigures[StrechaRow, StrechaSu
                         threads=options.threads,
                         best_pairs=options.best_pairs,
                     )
-                    yield _row(each, method, set_models(each, work, run))
+                    forget_peak()
+                    made = set_models(each, work, run)
+                    yield _row(each, method, made, peak_bytes())
 
     def summary(measured: list[StrechaRow]) -> StrechaSummary:
         return {"means": means(measured), "ratios": ratios(measured)}
@@ -192,6 +200,7 @@ def _compared(row: StrechaRow) -> dict[str, float] | None:
         "rotation": row["rotation_deg"]["mean"],
         "points": row["model"]["points"],
         "reprojection error": row["model"]["reprojection_error_px"],
+        "seconds": sum(row["stages"].values()),
     }
 
 
@@ -211,6 +220,9 @@ def cells(row: StrechaRow) -> Cells:
         found["track"] = f"{model['track_length']:.2f}"
         found["reprojection"] = f"{model['reprojection_error_px']:.3f}"
         found["focal"] = f"{model['focal_error_percent']:.2f}%"
+    found |= {stage: f"{row['stages'].get(stage, 0.0):.1f}" for stage in STAGES}
+    if row["peak_bytes"] is not None:
+        found["GB"] = f"{row['peak_bytes'] / 1e9:.2f}"
     return found | {"seconds": f"{sum(row['stages'].values()):.1f}"}
 
 

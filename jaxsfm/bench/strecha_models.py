@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.methods import MAPPERS, NAIVE, method_config
+from jaxsfm.bench.methods import MAPPERS, NAIVE, REFINED_ROOTSIFT, ROOTSIFT, method_config
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.strecha_sets import StrechaSet
 from jaxsfm.colmap.intrinsics import parse_intrinsics
@@ -20,14 +20,17 @@ from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.errors import writing
 from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.io.pairs import best_pairs, exhaustive_pairs
+from jaxsfm.io.photos import Photos
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import RECORD
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.report.run_report import RunReport
+from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.reconstruction import reconstruct
+from jaxsfm.sfm.refined_models import Believed, refine_models
 
 if TYPE_CHECKING:
     import pycolmap
@@ -73,8 +76,10 @@ class SetModels(NamedTuple):
 def set_models(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     """Reconstruct a set. The models are also in `work`/sparse."""
     work.mkdir(parents=True, exist_ok=True)
-    if run.method == "rootsift":
+    if run.method == ROOTSIFT:
         return _run_rootsift(each, work, run)
+    if run.method == REFINED_ROOTSIFT:
+        return _run_refined_rootsift(each, work, run)
     if run.method == NAIVE:
         return _run_naive(each, work, run)
     return _run_method(each, work, run)
@@ -99,13 +104,34 @@ def _run_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     """The models of a set by COLMAP's own features."""
     photos, database = each.folder / "images", work / "database.db"
     images, _ = open_images(photos)
-    start = time.monotonic()
+    seconds: dict[str, float] = {}
     camera = parse_intrinsics(each.camera) if run.known else None
     verification = VerificationOptions(seed=run.seed, threads=run.threads)
-    write_rootsift_database(database, photos, images, camera, verification, max_size=run.max_size)
-    models, _ = build_models(database, read_two_views(database), run.mapping)
+    with timed(seconds, "matching"):  # COLMAP does not say how long its extraction takes
+        write_rootsift_database(
+            database, photos, images, camera, verification, max_size=run.max_size
+        )
+    with timed(seconds, "mapping"):
+        models, _ = build_models(database, read_two_views(database), run.mapping)
     write_models(models, work / "sparse")
-    return SetModels(models, {"all": time.monotonic() - start}, None)
+    return SetModels(models, seconds, None)
+
+
+def _run_refined_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
+    """The models of a set by COLMAP's own features, with our refinement."""
+    made, config = _run_rootsift(each, work, run), method_config("default", max_size=run.max_size)
+    photos = Photos(open_images(each.folder / "images")[0], config)
+    options = dataclasses.replace(run.mapping, scale=photos.median_scale())
+    with timed(made.seconds, "refinement"):
+        refined = refine_models(
+            made.models,
+            photos,
+            Believed(work / "database.db", {}, ()),
+            config=config,
+            options=options,
+        )
+    write_models(refined.models, work / "sparse")
+    return made._replace(models=refined.models)
 
 
 def _run_method(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:

@@ -80,8 +80,8 @@ class ModelChoice(MatchingChoice):
       refine: Number of passes of the refinement, which moves keypoints to a fraction of a pixel. 0
         switches it off. Without it, as many as the preset says.
       first_look: Longer side, in pixels, at which photos are described and matched first. Photos
-        that find no place in this way are looked at again at --max-size. 0 describes all photos at
-        --max-size. Without it, as the preset says.
+        that find no place in this way are looked at again at --max-size. 0, or --refine 0,
+        describes all photos at --max-size. Without it, as the preset says.
     """
 
     view_graph: Literal["preset", "yes", "no"] = "preset"

@@ -96,6 +96,17 @@ class UsedLooks:
     whole: bool = False
     """Whether these are all pairs; then nothing of the first look was used."""
 
+    def in_words(self) -> str:
+        """What the looks found, in a sentence without a full stop."""
+        if not self.photos:
+            return f"all photos found a place with descriptions at {self.first_px} px"
+        lost = "1 photo" if len(self.photos) == 1 else f"{len(self.photos)} photos"
+        which = "all pairs" if self.whole else f"{len(self.again)} pairs"
+        return (
+            f"{lost} found no sure place at {self.first_px} px; {which} were matched again at full "
+            "size"
+        )
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class UsedExternalMatches:

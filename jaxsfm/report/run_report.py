@@ -72,7 +72,7 @@ class RunReport:
     images: FoundPhotos
     pairs: TriedPairs
     given: UsedExternalMatches | None = None
-    looks: UsedLooks | None = None
+    looks: UsedLooks | None = field(default=None, metadata=OMITTED)
     """None: all photos were described at the size of the config."""
     models: list[ModelRow]
     """The one with most photos first; empty if there is none."""

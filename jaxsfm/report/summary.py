@@ -107,6 +107,8 @@ def summary_lines(report: RunReport) -> list[str]:
         f"{pairs.handed_on} handed to COLMAP"
         + (f", {pairs.trusted} trusted" if pairs.trusted is not None else ""),
     ]
+    if looks := report.looks:
+        lines.append(f"looks            {looks.in_words()}")
     if given := report.given:
         lines.append(
             f"given            {given.matches} matches in {given.pairs} pairs of {given.images} "

@@ -25,12 +25,12 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
     assert main([*args, "--out", str(tmp_path / "work"), "--threads", "1"]) == 0
     text, figures = capsys.readouterr().out, json.loads(out.read_text())
     rows = {row["method"]: row for row in figures["rows"]}
-    assert tuple(rows) == ("rootsift", "grid", "reloc", "default")
+    assert tuple(rows) == ("rootsift", "rootsift+refined", "grid", "reloc", "default")
     for method, row in rows.items():
         assert (
             row["set"] == "room"
             and row["images"] == 3
-            and re.search(rf"^room +{method} ", text, re.M)
+            and re.search(rf"^room +{re.escape(method)} ", text, re.M)
         )
         assert sum(row["stages"].values()) > 0
         assert (tmp_path / "work" / "room" / method / "sparse").is_dir()
@@ -39,7 +39,13 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
         assert rows[method]["registered"] == 3 and models[method]["focal_error_percent"] == 0
     default, reloc = models["default"], models["reloc"]
     assert default["reprojection_error_px"] < 0.5 * reloc["reprojection_error_px"]
+    refined, bare = models["rootsift+refined"], models["rootsift"]
+    assert refined["reprojection_error_px"] < 0.5 * bare["reprojection_error_px"]
+    assert rows["rootsift+refined"]["stages"].keys() == {"matching", "mapping", "refinement"}
+    assert all(1e8 < row["peak_bytes"] < 1e10 for row in rows.values())
     assert "published" in text
+    for column in ("extraction", "matching", "mapping", "refinement", "seconds", "GB"):
+        assert re.search(rf"^set .* {column}\b", text, re.M)
 
     again = ["--methods", "reloc,default", "--sets", "room", "--intrinsics", "unknown"]
     assert main([*args, *again, "--out", str(tmp_path / "work")]) == 0
@@ -71,6 +77,7 @@ def row(name, method, position, points):
         "position": {"mean": position},
         "rotation_deg": {"mean": 2 * position},
         "model": {"points": points, "reprojection_error_px": 0.5 * position},
+        "stages": {"matching": 2.0 * points, "mapping": points},
     }
 
 
@@ -90,6 +97,7 @@ def test_ratios_are_means_of_the_sets_ratios():
         "rotation": 1.0,
         "points": 2.5,
         "reprojection error": 1.0,
+        "seconds": 2.5,
     }
 
 

@@ -135,3 +135,23 @@ def test_skipped_and_lost_images_have_one_line_each_whatever_their_names(tmp_pat
     assert [line for line in lines if line.startswith("lost")] == [
         r"lost             lost\n.jpg: no plane (5 tentative matches)"
     ]
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        ({}, "all photos found a place with descriptions at 800 px"),
+        (
+            {"photos": ["a"], "again": [["a", "b"], ["a", "c"]]},
+            "1 photo found no sure place at 800 px; 2 pairs were matched again at full size",
+        ),
+        (
+            {"photos": ["a", "b"], "again": [["a", "b"]], "whole": True},
+            "2 photos found no sure place at 800 px; all pairs were matched again at full size",
+        ),
+    ],
+)
+def test_what_the_first_look_found_is_said(found, said):
+    lines = summary_lines(report(looks={"first_px": 800} | found))
+    assert f"looks            {said}" in lines
+    assert not any(line.startswith("looks") for line in summary_lines(report()))

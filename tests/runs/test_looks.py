@@ -115,8 +115,8 @@ def test_a_second_look_at_one_pair_adds_its_matches_to_those_of_the_first_one(
     db.close()
     assert written == sum(both.values())
     found = read_run(out)
-    cells = found.matches.load_matches(again).cells
-    assert ((cells >= SECOND_CELLS).sum(0) == full[again]).all()
-    assert (found.matches.load_matches((first, second)).cells < SECOND_CELLS).all()
+    united, once = map(found.matches.load_matches, (again, (first, second)))
+    assert united is not None and ((united.cells >= SECOND_CELLS).sum(0) == full[again]).all()
+    assert once is not None and (once.cells < SECOND_CELLS).all()
     assert report["models"][0]["registered"] == 3
     assert pair_pictures(found)[0] and close_ups(found)
