@@ -193,9 +193,9 @@ def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(
 
     run, seen = passes.run_pass, []
 
-    def recorded(before, images, sizes, limits, settings):
+    def recorded(before, images, px, limits, settings):
         seen.append(limits.max_shift_px)
-        return run(before, images, sizes, limits, settings)
+        return run(before, images, px, limits, settings)
 
     monkeypatch.setattr(passes, "run_pass", recorded)
     refine_model(

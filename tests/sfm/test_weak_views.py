@@ -30,7 +30,7 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.sfm.evaluation import evaluate
-from jaxsfm.sfm.refine import plane_geometry, weak_views
+from jaxsfm.sfm.refine import one_pass, passes, plane_geometry, weak_views
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, matched_points
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.passes import refine_model
@@ -393,3 +393,41 @@ def test_a_shared_camera_is_no_views_own(monkeypatch, rendered, own):
     assert [pose.own_camera for pose in followed] == [own]
     place(before, rendered, refine_intrinsics=False)
     assert not followed[-1].own_camera
+
+
+def test_a_doubtful_view_is_placed_again_and_one_pass_more_follows(rendered, monkeypatch):
+    """The mapper's pose is wrong, but as many observations agree as it had."""
+    run, calls = passes.run_pass, []
+
+    def doubting(before, images, px, limits, settings):
+        calls.append((px, night_error(before.reconstruction, rendered)[1]))
+        after, done = run(before, images, px, limits, settings)
+        if len(calls) > 2:
+            return after, done
+        return before, dataclasses.replace(done, weak_views=[], doubtful_views=[NIGHT_NAME])
+
+    monkeypatch.setattr(passes, "run_pass", doubting)
+    before = lost_view(rendered, turn_deg=2.0)
+    after, figures = refine_model(
+        before, read_of(rendered), refinement=Refinement(), refine_intrinsics=False, threads=1
+    )
+    turned = [error > 1.9 for _, error in calls]
+    assert turned == [True, True, False] and [px for px, _ in calls] == [1, 1, 1]
+    assert max(night_error(after, rendered)) < 0.03
+    assert [done.doubtful_views for done in figures.passes] == [[NIGHT_NAME], [NIGHT_NAME], []]
+    assert [(at.name, at.registered, at.octave_px) for at in figures.placed] == [
+        (NIGHT_NAME, True, 1)
+    ]
+
+
+@pytest.mark.parametrize(("turn_deg", "found"), [(0.0, []), (4.0, [NIGHT_NAME])])
+def test_a_view_is_doubtful_if_it_shows_little_of_what_it_should_show(rendered, turn_deg, found):
+    model = arrays(lost_view(rendered, turn_deg=turn_deg), rendered)
+    limits = AlignmentLimits.of(Refinement())
+    blocks = list(align_blocks(model, images_of(rendered), Refinement(), limits))
+    assert [view.name for view in one_pass._doubtful(model.views, blocks)] == found
+
+
+def test_no_view_is_doubtful_where_all_poses_are_right(rendered):
+    _, figures = refine(noisy_model(rendered, 0.7), rendered)
+    assert [done.doubtful_views for done in figures.passes] == [[], []] and not figures.placed

@@ -15,8 +15,8 @@ the points of the matches that the mapper was given. Then all others return.
 
 import contextlib
 import dataclasses
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.config import Refinement
@@ -88,8 +88,10 @@ def refine_model(
 
     Thresholds are in pixels of the working images. An image where too little agrees keeps its old
     observations, with four times the error limit, until it is placed on the refined structure. One
-    that cannot be placed and has hardly any observations is taken out. A pass that would lose most
-    of the points is taken back.
+    that cannot be placed and has hardly any observations is taken out. Images that show far less of
+    what they should show than others do may have a wrong pose of the mapper. They are placed again
+    where alignment agrees, and one pass more follows. A pass that would lose most of the points is
+    taken back.
 
     Args:
       reconstruction: from the mapper; not changed.
@@ -127,29 +129,69 @@ def refine_model(
             break
     if with_all_points is not None:  # the passes ended early
         now = _as_arrays(with_all_points(now.reconstruction), sizes)
-    reconstruction, model = now
+    placing = _Placing(images, sizes, evidence, settings)
     placed: list[Placement] = []
+    if doubtful := _doubtful(figures):
+        model, placed = placing.placed(now.model, doubtful, unmapped=False)
+        if model is not now.model:
+            now, done = run_pass(_as_arrays(model.to_colmap(), sizes), images, 1, limits, settings)
+            figures.append(done)
     # A view that was weak in any pass is placed: what little agreed in the first pass looks like
     # much in the next (58 of 153 observations after 22 of 393, and the camera 0.4 m off).
-    weak_names = sorted({name for f in figures if f.accepted for name in f.weak_views})
-    if any(f.accepted for f in figures) and (weak_names or evidence.unmapped):
-        before = model
-        model, placed = place_weak_views(
+    weak = sorted(_weak(figures))
+    if any(done.accepted for done in figures) and (weak or evidence.unmapped):
+        now, later = placing.confirmed(now, weak)
+        placed = [*({at.name: at for at in (*placed, *later)}).values()]
+    return now.reconstruction, RefinementFigures(passes=figures, placed=placed)
+
+
+def _weak(figures: Sequence[PassFigures]) -> set[str]:
+    """The images that were weak in any pass."""
+    return {name for done in figures if done.accepted for name in done.weak_views}
+
+
+def _doubtful(figures: Sequence[PassFigures]) -> list[str]:
+    """The images that were doubtful in the last pass. Weak ones are left to the end: a pass that
+    aligns them would move them away from where they are placed."""
+    last = figures[-1] if figures and figures[-1].accepted else None
+    weak = _weak(figures)
+    return [name for name in last.doubtful_views if name not in weak] if last else []
+
+
+class _Placing(NamedTuple):
+    """What views are placed with."""
+
+    images: DeviceImages
+    sizes: Sizes
+    evidence: Evidence
+    settings: PassSettings
+
+    def placed(
+        self, model: Model, names: Sequence[str], *, unmapped: bool
+    ) -> tuple[Model, list[Placement]]:
+        """`place_weak_views`; `unmapped`: also images that the mapper left out."""
+        evidence = self.evidence if unmapped else self.evidence._replace(unmapped=[])
+        return place_weak_views(
             model,
-            weak_names,
-            images,
-            sizes,
-            refinement=refinement,
-            refine_intrinsics=refine_intrinsics,
+            names,
+            self.images,
+            self.sizes,
+            refinement=self.settings.refinement,
+            refine_intrinsics=self.settings.refine_intrinsics,
             evidence=evidence,
         )
+
+    def confirmed(self, now: Refined, weak: Sequence[str]) -> tuple[Refined, list[Placement]]:
+        """A model whose weak views are placed, with the images that the mapper left out, and
+        without the views that nothing confirms."""
+        reconstruction, before = now
+        model, placed = self.placed(before, weak, unmapped=True)
         if model is not before:
             reconstruction = model.to_colmap()
-        if refinement.weak_octaves:  # otherwise nothing has tried to confirm their poses
+        if self.settings.refinement.weak_octaves:  # otherwise nothing has tried to confirm them
             if model is not before:  # COLMAP left out points whose rays are too close
-                model = Model.from_colmap(reconstruction, sizes)
-            before = model
-            model, placed = remove_unconfirmed(model, placed)
-            if model is not before:
-                reconstruction = model.to_colmap()
-    return reconstruction, RefinementFigures(passes=figures, placed=placed)
+                model = Model.from_colmap(reconstruction, self.sizes)
+            left, placed = remove_unconfirmed(model, placed)
+            if left is not model:
+                reconstruction, model = left.to_colmap(), left
+        return Refined(reconstruction, model), placed
