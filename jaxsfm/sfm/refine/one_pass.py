@@ -122,7 +122,7 @@ def _doubtful(views: Sequence[View], blocks: Sequence[AlignedBlock]) -> list[Vie
     shown = sum(np.bincount(block.found.view, minlength=count) for block in blocks)
     agreed = sum(np.bincount(block.found.view[block.agrees], minlength=count) for block in blocks)
     share = np.asarray(agreed / np.maximum(shown, 1))
-    return [views[k] for k in np.flatnonzero(share < DOUBTFUL_SHARE * np.median(share))]
+    return [views[k] for k in np.flatnonzero(share < DOUBTFUL_SHARE * np.median(share)).tolist()]
 
 
 def _gather(model: Model, blocks: Sequence[AlignedBlock]) -> tuple[Model, np.ndarray]:
