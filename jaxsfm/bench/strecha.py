@@ -15,7 +15,7 @@ from jaxsfm.bench.strecha_models import MethodRun, SetModels, set_models
 from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.errors import UserError
-from jaxsfm.sfm.evaluation import evaluate
+from jaxsfm.sfm.evaluation import evaluate, own_rotation_deg
 
 if TYPE_CHECKING:
     import pycolmap
@@ -65,6 +65,8 @@ class StrechaRow(ModelRow):
     """The figures of one set and one method."""
 
     registered: int
+    own_rotation_deg: float | None
+    """The mean rotation error after the rotations alone were aligned; None without a model."""
     model: ModelFigures | None
     peak_bytes: int | None
     """The most memory that the process held; None where the system does not say."""
@@ -111,6 +113,7 @@ def _row(each: StrechaSet, method: str, made: SetModels, peak: int | None) -> St
         "method": method,
         "images": len(each.truth),
         "registered": model.num_reg_images() if model else 0,
+        "own_rotation_deg": own_rotation_deg(model_poses(model), each.truth) if model else None,
         "stages": made.seconds,
         "peak_bytes": peak,
         "model": _model_figures(model, each.focal) if model else None,
@@ -214,6 +217,8 @@ def cells(row: StrechaRow) -> Cells:
     if row["position"] is not None and row["rotation_deg"] is not None:
         found["position"] = f"{row['position']['mean']:.4f}"
         found["rotation"] = f"{row['rotation_deg']['mean']:.4f}"
+    if row["own_rotation_deg"] is not None:
+        found["own rotation"] = f"{row['own_rotation_deg']:.4f}"
     if (model := row["model"]) is not None:
         found["points"] = str(model["points"])
         found["observations"] = str(model["observations"])

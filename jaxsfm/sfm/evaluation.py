@@ -15,7 +15,7 @@ from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pairs import listed_lines
-from jaxsfm.sfm.view_graph import rotation_angle_deg
+from jaxsfm.sfm.view_graph import mean_rotation, rotation_angle_deg
 
 DISTANCES = (0.5, 1.0, 5.0, 10.0, 20.0)
 """Distances at which the share of good images is counted, units of the reference."""
@@ -230,3 +230,23 @@ def evaluate(
         errors[name] = pose_error(sim.moved(model[name]), reference[other])
     missing = sorted(set(reference) - set(names.values()))
     return Evaluation(images=errors, missing=missing, aligned_on=len(chosen))
+
+
+def own_rotation_deg(model: Poses, reference: Poses) -> float:
+    """The mean rotation error, degrees, after the rotations alone have been aligned.
+
+    `evaluate` aligns camera centres. If these are nearly on a line, small position errors turn all
+    cameras about this line, and most of its rotation errors are this common turn. Here the common
+    turn is that of the rotations themselves (their chordal mean), so it does not count.
+
+    Raises:
+      UserError: no common images.
+    """
+    names = pair_names(model, reference)
+    if not names:
+        raise UserError("--reference: no common images")
+    ours = np.asarray([model[name].rotation for name in names])
+    theirs = np.asarray([reference[other].rotation for other in names.values()])
+    turns = theirs.transpose(0, 2, 1) @ ours
+    common = mean_rotation(turns, np.ones(len(turns)))
+    return float(rotation_angle_deg(turns, common).mean())

@@ -39,12 +39,22 @@ def test_all_methods_run_side_by_side_and_give_one_table(root, tmp_path, capsys)
         assert rows[method]["registered"] == 3 and models[method]["focal_error_percent"] == 0
     default, reloc = models["default"], models["reloc"]
     assert default["reprojection_error_px"] < 0.5 * reloc["reprojection_error_px"]
+    for row in rows.values():
+        assert 0 < row["own_rotation_deg"] < 1.1 * row["rotation_deg"]["mean"]
     refined, bare = models["rootsift+refined"], models["rootsift"]
     assert refined["reprojection_error_px"] < 0.5 * bare["reprojection_error_px"]
     assert rows["rootsift+refined"]["stages"].keys() == {"matching", "mapping", "refinement"}
     assert all(1e8 < row["peak_bytes"] < 1e10 for row in rows.values())
     assert "published" in text
-    for column in ("extraction", "matching", "mapping", "refinement", "seconds", "GB"):
+    for column in (
+        "own rotation",
+        "extraction",
+        "matching",
+        "mapping",
+        "refinement",
+        "seconds",
+        "GB",
+    ):
         assert re.search(rf"^set .* {column}\b", text, re.M)
 
     again = ["--methods", "reloc,default", "--sets", "room", "--intrinsics", "unknown"]

@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 
 from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.errors import UserError
-from jaxsfm.sfm.evaluation import evaluate, pair_names, read_names, rotation_angle_deg
+from jaxsfm.sfm.evaluation import (
+    evaluate,
+    own_rotation_deg,
+    pair_names,
+    read_names,
+    rotation_angle_deg,
+)
 
 law = settings(max_examples=25, deadline=None)
 
@@ -70,6 +76,33 @@ def test_one_wrong_camera_has_its_own_error_when_aligned_on_the_others(similarit
     assert result.images["2.jpg"].position == pytest.approx(np.linalg.norm(step), abs=1e-9)
     assert result.images["2.jpg"].rotation_deg == pytest.approx(angle, abs=1e-9)
     assert max(result.images[name].position for name in others) < 1e-9
+
+
+@law
+@given(similarities, st.integers(0, 5))
+def test_a_common_turn_of_all_cameras_is_no_own_rotation(similarity, seed):
+    """Whatever the centres are."""
+    log_scale, axis, degrees, shift = similarity
+    truth = poses(seed=seed)
+    turned = {
+        name: CameraPose(pose.rotation, 10 * poses(seed=seed + 1)[name].centre)
+        for name, pose in truth.items()
+    }
+    model = moved(turned, 10**log_scale, turn(axis, degrees), shift)
+    assert own_rotation_deg(model, truth) < 1e-9
+    assert evaluate(model, truth).rotation_deg["mean"] > 1
+
+
+def test_own_rotations_are_the_deviations_from_the_common_turn():
+    """Two cameras that turn by 3 deg one way and the other, beside four that do not."""
+    truth = poses()
+    model = dict(truth)
+    for name, degrees in (("1.jpg", 3.0), ("4.jpg", -3.0)):
+        pose = truth[name]
+        model[name] = CameraPose(pose.rotation @ turn([1, 2, 3], degrees), pose.centre)
+    assert own_rotation_deg(model, truth) == pytest.approx(1.0, abs=1e-9)
+    with pytest.raises(UserError, match="no common images"):
+        own_rotation_deg(model, {})
 
 
 def test_units_are_those_of_the_reference():
