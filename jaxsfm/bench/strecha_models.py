@@ -137,6 +137,7 @@ def _run_refined_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetMo
 def _run_method(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     """The models of a set by one of our methods, for which `work` is its work folder."""
     options = RunOptions(
+        pairs="exhaustive",  # as RootSIFT
         intrinsics=each.camera if run.known else None,
         network=run.network,
         seed=run.seed,

@@ -1,7 +1,7 @@
 """The option `--pairs`: which pairs of photos are matched.
 
 Its value is `exhaustive`, a file, `sequential:K`, `retrieval:K`, or several of these joined by `+`,
-which selects the pairs of all of them.
+which selects the pairs of all of them. `auto` stands for one of these, by the number of photos.
 """
 
 import os
@@ -12,6 +12,23 @@ from typing import NamedTuple
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.pairs import Pair, exhaustive_pairs, make_pair, read_pairs
+
+FEW = 40
+"""Up to so many photos, `auto` tries all pairs: at most 780, which take three minutes on two cores
+in a first look."""
+MANY = "retrieval:20+sequential:3"
+"""What `auto` tries of more photos: similar ones, and neighbours by name."""
+
+
+def chosen_pairs(text: str, photos: int) -> str:
+    """A value of `--pairs` with what `auto` stands for, unless a file of this name exists.
+
+    Args:
+      photos: their number.
+    """
+    if text != "auto" or os.path.isfile(text):
+        return text
+    return "exhaustive" if photos <= FEW else MANY
 
 
 class PairSelection(NamedTuple):

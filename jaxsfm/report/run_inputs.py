@@ -53,7 +53,7 @@ class RecordedOptions:
 
     config: RecordedConfig
     pairs: str
-    """The value of `--pairs`."""
+    """The value of `--pairs`, or what its value `auto` stood for."""
     intrinsics: str | None
     """The value of `--intrinsics`; None if the focal lengths were estimated."""
     seed: Count

@@ -15,7 +15,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.looks import Looks
-from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
+from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import open_folder
@@ -74,6 +74,7 @@ def reconstruct_folder(
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, skipped = open_images(images, progress=options.progress)
     names = [*(image.name for image in usable), *skipped]
+    options = dataclasses.replace(options, pairs=chosen_pairs(options.pairs, len(usable)))
     selection = parse_pair_selection(options.pairs)
     pairs = selected_pairs(selection, (image.name for image in usable), names)
     _check_enough(images, usable, skipped)

@@ -8,7 +8,10 @@ from hypothesis import strategies as st
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.pair_selection import (
+    FEW,
+    MANY,
     PairSelection,
+    chosen_pairs,
     natural,
     parse_pair_selection,
     selected_pairs,
@@ -105,3 +108,16 @@ def test_a_sequence_does_not_depend_on_order_and_is_whole(names, k, random):
 @given(st.lists(st.text("0123456789ab²٣", max_size=6), max_size=5))
 def test_any_names_can_be_ordered(names):
     assert sorted(names, key=natural) == sorted(reversed(names), key=natural)
+
+
+def test_auto_tries_all_pairs_of_few_photos_and_similar_ones_and_neighbours_of_many(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert (chosen_pairs("auto", FEW), chosen_pairs("auto", FEW + 1)) == ("exhaustive", MANY)
+    many = parse_pair_selection(MANY)
+    assert many.retrieval >= 10 and many.sequential >= 1 and not many.exhaustive
+    for text in ("exhaustive", "retrieval:2", "pairs.txt"):
+        assert chosen_pairs(text, 10_000) == text
+    (tmp_path / "auto").write_text("a b")
+    assert chosen_pairs("auto", 10_000) == "auto"
