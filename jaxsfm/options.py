@@ -111,7 +111,8 @@ class ReconstructionChoice:
       with_hloc: The features.h5 and matches.h5 that hloc wrote for the same photos. Its matches
         are mapped together with those of jaxsfm.
       keep_features: Keep the features in the folder (25 MB for a photo of 1536 x 1024), so that
-        localize and extend need not compute them again.
+        localize and extend need not compute them again. They use features of full size, so this
+        helps them with --first-look 0.
     """
 
     pairs: str = "auto"

@@ -168,7 +168,7 @@ def evaluation_report(
 def _described(report: RunReport) -> RecordedConfig:
     """The limits of the working images whose cells the matches are of."""
     config, looks = report.options.config, report.looks
-    if looks is None or looks.whole:
+    if looks is None or (looks.whole and not looks.in_vain):
         return config
     return dataclasses.replace(config, max_size=looks.first_px)
 
@@ -177,10 +177,11 @@ def _looks(home: Path, report: RunReport) -> Looks:
     """Where the matches of a run are."""
     identity, looks = report.identity, report.looks
     last = Store(home, to_json(identity))
-    if looks is None or looks.whole:
+    if looks is None or (looks.whole and not looks.in_vain):
         return Looks(last)
     first = dataclasses.replace(identity, config=identity.config | {"max_size": looks.first_px})
-    return Looks(Store(home, to_json(first)), last, set(looks.again))
+    again = () if looks.in_vain else set(looks.again)
+    return Looks(Store(home, to_json(first)), last, again)
 
 
 def read_run(

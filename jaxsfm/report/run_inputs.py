@@ -95,6 +95,8 @@ class UsedLooks:
     """The pairs that were matched again, at the size of the config."""
     whole: bool = False
     """Whether these are all pairs; then nothing of the first look was used."""
+    in_vain: bool = False
+    """Whether the second look gave no better model, so that the one of the first look stayed."""
 
     def in_words(self) -> str:
         """What the looks found, in a sentence without a full stop."""
@@ -104,7 +106,7 @@ class UsedLooks:
         which = "all pairs" if self.whole else f"{len(self.again)} pairs"
         return (
             f"{lost} found no sure place at {self.first_px} px; {which} were matched again at full "
-            "size"
+            "size" + ", which gave no better model" * self.in_vain
         )
 
 

@@ -132,10 +132,17 @@ def reconstruct_folder(
         again = mapped.unsettled(counts) if first else None
         if looks is not None and again is not None:
             logger.info("%s", again.in_words())
-            matched = match_again(job, by_name, matched, again, seconds)
-            mapped = stages.map(matched, again=True)
-            tried = sorted(again.pairs)
-            looks = dataclasses.replace(looks, photos=again.photos, again=tried, whole=again.whole)
+            matched_again = match_again(job, by_name, matched, again, seconds)
+            mapped_again = stages.map(matched_again, again=True)
+            looks = dataclasses.replace(
+                looks,
+                photos=again.photos,
+                again=again.pairs,
+                whole=again.whole,
+                in_vain=mapped.better_than(mapped_again),
+            )
+            if not looks.in_vain:
+                matched, mapped = matched_again, mapped_again
         with folder.publish() as target:
             made = stages.refine(mapped, target)
             report = run_report(

@@ -52,6 +52,15 @@ class MappedRun(NamedTuple):
         names = [image.name for image in self.given.images]
         return second_look(counts, names, self.photos(), self.trusted(), green=self.green())
 
+    def better_than(self, other: "MappedRun") -> bool:
+        """Whether there are more photos in the best model. Models that something speaks against are
+        worse than others."""
+
+        def rank(run: MappedRun) -> tuple[bool, int]:
+            return run.green(), max(map(len, run.photos()), default=0)
+
+        return rank(self) > rank(other)
+
     def photos(self) -> list[set[str]]:
         """The photos of each model, the model with most photos first."""
         return [set(registered(model)) for model in self.stage.models()]

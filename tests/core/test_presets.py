@@ -12,6 +12,7 @@ from jaxsfm.core.types import Status
 PAPER = {
     # What the paper and the authors' code say: section numbers are the paper's.
     "max_size": 1600,  # longer side, pixels; section 4
+    "first_look": None,  # photos are described at one size
     "layers": "pool4/pool3",  # conv4 and conv3 in the paper
     "keypoints": "relocalized",  # section 3.2
     "children": 2,  # K
@@ -62,6 +63,7 @@ REFINEMENT = {
     "weak_min_score": 0.6,
 }
 DEFAULT = PAPER | {
+    "first_look": 800,
     "octaves": 4,
     "centred": True,
     "aligned_octaves": 4,
@@ -78,7 +80,8 @@ DEFAULT_PAIR = PAPER_PAIR | {
 EXPECTED = {
     "paper": PAPER | {"pair": PAPER_PAIR},
     "default": DEFAULT | {"pair": DEFAULT_PAIR},
-    "robust": DEFAULT | {"enlarge": 2.0, "pair": DEFAULT_PAIR | {"local_refits": 10}},
+    "robust": DEFAULT
+    | {"enlarge": 2.0, "first_look": None, "pair": DEFAULT_PAIR | {"local_refits": 10}},
 }
 
 
@@ -91,6 +94,21 @@ def test_there_are_three_presets_and_others_are_refused_by_name():
     assert sorted(PRESETS) == sorted(EXPECTED)
     with pytest.raises(ValueError, match="default.*paper.*robust.*got 'best'"):
         preset("best")
+
+
+def test_the_first_look_is_smaller_and_only_where_a_refinement_follows():
+    default = preset("default")
+    assert default.of_first_look() == dataclasses.replace(default, max_size=800, first_look=None)
+    for changes, size in (
+        ({"max_size": 600}, 600),
+        ({"refinement": None}, 1600),
+        ({"first_look": None}, 1600),
+        ({"first_look": 2000}, 1600),
+    ):
+        config = dataclasses.replace(default, **changes)
+        assert config.of_first_look() == dataclasses.replace(config, max_size=size, first_look=None)
+    # The matches of the second look are those of a run without a first one.
+    assert default.matching() == dataclasses.replace(default, first_look=None).matching()
 
 
 def test_what_the_paper_fixes_for_all_presets():
@@ -129,6 +147,7 @@ def test_a_pair_shape_needs_room_for_correspondences():
     "field, allowed, refused",
     [
         ("max_size", 48, 47),
+        ("first_look", 48, 47),
         ("enlarge", 1.0, 0.99),
         ("octaves", 1, 0),
         ("octaves", 4, 5),

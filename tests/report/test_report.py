@@ -149,6 +149,11 @@ def test_skipped_and_lost_images_have_one_line_each_whatever_their_names(tmp_pat
             {"photos": ["a", "b"], "again": [["a", "b"]], "whole": True},
             "2 photos found no sure place at 800 px; all pairs were matched again at full size",
         ),
+        (
+            {"photos": ["a"], "again": [["a", "b"]], "whole": True, "in_vain": True},
+            "1 photo found no sure place at 800 px; all pairs were matched again at full size, "
+            "which gave no better model",
+        ),
     ],
 )
 def test_what_the_first_look_found_is_said(found, said):

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-import jaxsfm.runs.reconstruct
+import jaxsfm.runs.run_stages
 from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io.work_folder import WorkFolder
@@ -38,7 +38,7 @@ def interrupt_after(monkeypatch, owner, name: str, calls: int) -> list[int]:
     [
         ("extraction", WorkFolder, "save_features", 1),
         ("matching", WorkFolder, "save_matches", 2),
-        ("mapping", jaxsfm.runs.reconstruct, "reconstruct", 0),
+        ("mapping", jaxsfm.runs.run_stages, "map_matches", 0),
     ],
 )
 @pytest.mark.slow

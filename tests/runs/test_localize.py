@@ -225,7 +225,7 @@ def test_the_most_similar_photos_are_shortlisted_and_described_once(
     two = shortlist(2, names)
     assert two == shortlist(2, names[::-1]) and two[0] == "view0.png"
     assert shortlist(3, names) == names
-    assert (run.matches.path / "descriptors").is_dir()
+    assert (run.store.path / "descriptors").is_dir()
     monkeypatch.setattr(run.photos, "file", None)  # nobody opens them again
     assert shortlist(1, names) == ["view0.png"]
     with pytest.raises(UserError, match="--shortlist"):
@@ -244,7 +244,7 @@ def test_a_run_that_cannot_be_written_still_finds_the_most_similar_photos(
     plain, photos, weights, tmp_path, monkeypatch
 ):
     run = read_run(Path(shutil.copytree(plain[0], tmp_path / "run")))
-    home, save = run.matches.path, Store.save_descriptor
+    home, save = run.store.path, Store.save_descriptor
 
     def refused(self, *args):
         if self.path == home:

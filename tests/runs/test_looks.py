@@ -42,7 +42,13 @@ def looked(scene, tmp_path_factory) -> tuple[Path, dict]:
 def test_where_the_first_look_settles_all_photos_nothing_is_described_at_full_size(looked):
     out, report = looked
     assert report["models"][0]["registered"] == 3
-    assert report["looks"] == {"first_px": FIRST_PX, "photos": [], "again": [], "whole": False}
+    assert report["looks"] == {
+        "first_px": FIRST_PX,
+        "photos": [],
+        "again": [],
+        "whole": False,
+        "in_vain": False,
+    }
     # One pass more than the preset has, at full size.
     assert len(report["refinement"][0]["passes"]) == 3
     assert len(list((out / "matches").rglob("*.npz"))) == 3
@@ -119,4 +125,30 @@ def test_a_second_look_at_one_pair_adds_its_matches_to_those_of_the_first_one(
     assert united is not None and ((united.cells >= SECOND_CELLS).sum(0) == full[again]).all()
     assert once is not None and (once.cells < SECOND_CELLS).all()
     assert report["models"][0]["registered"] == 3
+    assert pair_pictures(found)[0] and close_ups(found)
+
+
+def test_the_model_of_the_first_look_stays_if_the_second_one_gives_no_better_one(
+    looked, scene, tmp_path, monkeypatch
+):
+    """At full size, a photo is lost."""
+    out = Path(shutil.copytree(looked[0], tmp_path / "out"))
+    third = sorted(looked[1]["identity"]["images"])[2]
+
+    def everything(counts, photos, models, trusted, *, green):
+        return SecondLook([third], sorted(counts), whole=True)
+
+    monkeypatch.setattr(run_stages, "second_look", everything)
+    photos = run_stages.MappedRun.photos
+
+    def without_one(mapped):
+        lost = {third} if mapped.cache.suffix else set()
+        return [names - lost for names in photos(mapped)]
+
+    monkeypatch.setattr(run_stages.MappedRun, "photos", without_one)
+    report = run(scene, out)
+    assert report["looks"]["in_vain"] and report["looks"]["whole"]
+    for key in ("models", "pairs", "refinement"):
+        assert report[key] == looked[1][key]
+    found = read_run(out)
     assert pair_pictures(found)[0] and close_ups(found)

@@ -209,6 +209,48 @@ def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(
     assert seen == [4.0, 2.0, 4.0 if returned else 2.0]
 
 
+@pytest.mark.parametrize(
+    ("described_px", "sizes"), [(1, [1, 1]), (2, [2, 2, 1]), (4, [4, 4, 2, 1])]
+)
+def test_passes_begin_at_the_size_of_the_descriptions(rendered, monkeypatch, described_px, sizes):
+    """The points return before the last of the two passes at this size."""
+    from jaxsfm.sfm.refine import passes
+
+    run, seen, returned = passes.run_pass, [], []
+
+    def recorded(before, images, px, limits, settings):
+        seen.append((px, limits.max_shift_px))
+        return run(before, images, px, limits, settings)
+
+    def with_all_points(model):
+        returned.append(len(seen))
+        return model
+
+    monkeypatch.setattr(passes, "run_pass", recorded)
+    refine_model(
+        noisy_model(rendered, 0.7),
+        read_of(rendered),
+        refinement=Refinement(),
+        refine_intrinsics=False,
+        with_all_points=with_all_points,
+        described_px=described_px,
+        threads=1,
+    )
+    assert [px for px, _ in seen] == sizes and returned == [1]
+    assert [shift for _, shift in seen] == [4.0, 4.0, *[2.0] * (len(sizes) - 2)]
+
+
+def test_keypoints_that_are_too_far_off_for_full_size_are_aligned_from_half_of_it(rendered):
+    """With a noise of 6 px, most are further off than the 4 px within which full size looks."""
+    before = noisy_model(rendered, 6.0)
+    known = {"refinement": Refinement(), "refine_intrinsics": False, "threads": 1}
+    once, _ = refine_model(before, read_of(rendered), **known)
+    twice, _ = refine_model(before, read_of(rendered), described_px=2, **known)
+    assert max(errors(twice, rendered)) < 0.02
+    seen = [arrays(model, rendered).tracks for model in (once, twice)]
+    assert len(seen[1].view) > 1.1 * len(seen[0].view)
+
+
 def test_all_points_return_if_the_passes_end_early(rendered):
     few = noisy_model(rendered, 1.0)
     images = {name: other_scene(k) for k, name in enumerate(rendered.images)}

@@ -35,6 +35,9 @@ class FakePhotos:
     def __init__(self, rendered) -> None:
         self.gray, self.rgb = read_of(rendered), None
 
+    def median_scale(self) -> float:
+        return 1.0
+
     def working_size(self, name):
         gray, scale = self.gray(name)
         return (gray.shape[1], gray.shape[0]), scale
@@ -125,3 +128,10 @@ def test_a_photo_that_went_away_leaves_the_mappers_models_with_all_points(refine
     made, _, _ = refined(placement(), {}, gone=True)
     assert made.figures == [None, None] and [len(registered(m)) for m in made.models] == [3, 3]
     assert "2.png: cannot be read" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("ratio", "px"), [(0.9, 1), (1.0, 1), (1.4, 1), (1.5, 2), (1.92, 2), (2.8, 2), (3.0, 4)]
+)
+def test_keypoints_are_aligned_from_the_nearest_power_of_two_of_their_size(ratio, px):
+    assert module.described_px(ratio) == px
