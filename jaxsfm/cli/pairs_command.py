@@ -36,14 +36,14 @@ def pairs(
     from tqdm import tqdm
 
     from jaxsfm.io.atomic import write_atomic
-    from jaxsfm.io.pair_selection import parse_pair_selection, selected_pairs
+    from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.pipeline import open_images
     from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
 
-    selection = parse_pair_selection(pairs)
     usable, skipped = open_images(images, progress=True)
     names = [image.name for image in usable]
+    selection = parse_pair_selection(chosen_pairs(pairs, len(names)))
     if len(names) < 2:
         raise UserError(f"{images}: {len(names)} usable images, at least 2 are needed")
     found = set(selected_pairs(selection, names, [*names, *skipped]))

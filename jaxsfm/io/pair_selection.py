@@ -62,7 +62,7 @@ def parse_pair_selection(text: str) -> PairSelection:
         else:
             raise UserError(
                 f"--pairs {text}: {part!r} is neither a file nor exhaustive, sequential:K or "
-                "retrieval:K"
+                "retrieval:K" + "; auto stands alone" * (part == "auto")
             )
     return selection
 

@@ -14,7 +14,7 @@ from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pair_selection import sequential_pairs
-from jaxsfm.io.pairs import read_pairs
+from jaxsfm.io.pairs import exhaustive_pairs, read_pairs
 from jaxsfm.io.store import Store
 from jaxsfm.io.weight_files import EXTRAS
 from jaxsfm.matching import global_descriptors
@@ -189,6 +189,13 @@ def test_the_command_writes_pairs_that_a_run_reads(folder, images, before, tmp_p
     nearest = nearest_pairs(before[1]["vlad"].vectors, 1)
     assert read_pairs(out, names) == sorted({*nearest, *sequential_pairs(names, 1)})
     assert "6 photos" in capsys.readouterr().out
+
+
+def test_auto_writes_all_pairs_of_few_photos(folder, tmp_path):
+    out = tmp_path / "pairs.txt"
+    assert main(["pairs", str(folder), "--out", str(out), "--pairs", "auto"]) == 0
+    names = [path.name for path in folder.iterdir()]
+    assert read_pairs(out, names) == exhaustive_pairs(names)
 
 
 def test_a_name_that_a_pair_file_cannot_hold_is_refused(folder, tmp_path, capsys):
