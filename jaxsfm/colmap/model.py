@@ -72,6 +72,11 @@ class Model:
         cameras = {i: reconstruction.camera(i) for i in reconstruction.cameras}
         return cls(views, tracks, cameras)
 
+    @property
+    def sizes(self) -> Sizes:
+        """Those of its views."""
+        return {view.name: (view.size, view.pixels.scale) for view in self.views}
+
     def to_colmap(self) -> pycolmap.Reconstruction:
         """Write the model as COLMAP's.
 

@@ -76,7 +76,7 @@ def united(first: PairResult, second: PairResult) -> PairResult:
         homographies=both("homographies"),
         num_tentative=first.num_tentative + second.num_tentative,
         num_dropped=first.num_dropped + second.num_dropped,
-        status=min(first.status, second.status, key=lambda s: s != Status.VERIFIED),
+        status=second.status if second.status == Status.VERIFIED else first.status,
     )
 
 

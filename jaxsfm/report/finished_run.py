@@ -168,20 +168,19 @@ def evaluation_report(
 def _described(report: RunReport) -> RecordedConfig:
     """The limits of the working images whose cells the matches are of."""
     config, looks = report.options.config, report.looks
-    if looks is None or (looks.whole and not looks.in_vain):
+    if looks is None or not looks.first_used:
         return config
     return dataclasses.replace(config, max_size=looks.first_px)
 
 
-def _looks(home: Path, report: RunReport) -> Looks:
-    """Where the matches of a run are."""
+def _looks(store: Store, report: RunReport) -> Looks:
+    """Where the matches of a run are; `store` has those at the size of its config."""
     identity, looks = report.identity, report.looks
-    last = Store(home, to_json(identity))
-    if looks is None or (looks.whole and not looks.in_vain):
-        return Looks(last)
+    if looks is None or not looks.first_used:
+        return Looks(store)
     first = dataclasses.replace(identity, config=identity.config | {"max_size": looks.first_px})
     again = () if looks.in_vain else set(looks.again)
-    return Looks(Store(home, to_json(first)), last, again)
+    return Looks(Store(store.path, to_json(first)), store, again)
 
 
 def read_run(
@@ -211,6 +210,7 @@ def read_run(
         report, known = _with_reference(report, model_poses(found), reference)
     elif reference is not None:
         raise UserError(f"--reference {reference}: {folder} has no model to compare with it")
+    store = Store(home, to_json(report.identity))
     return FinishedRun(
         folder=folder,
         report=report,
@@ -218,6 +218,6 @@ def read_run(
         model=model,
         colours=colours,
         reference=known,
-        store=Store(home, to_json(report.identity)),
-        matches=_looks(home, report),
+        store=store,
+        matches=_looks(store, report),
     )

@@ -98,6 +98,11 @@ class UsedLooks:
     in_vain: bool = False
     """Whether the second look gave no better model, so that the one of the first look stayed."""
 
+    @property
+    def first_used(self) -> bool:
+        """Whether the models are made of matches of the first look, alone or with others."""
+        return not self.whole or self.in_vain
+
     def in_words(self) -> str:
         """What the looks found, in a sentence without a full stop."""
         if not self.photos:

@@ -1,9 +1,9 @@
 """The stages of a run after matching, with their progress bars and times."""
 
 import dataclasses
+import functools
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from tqdm import tqdm
 
@@ -19,6 +19,7 @@ from jaxsfm.io.store import digest
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.runs.matching_looks import MatchedPairs, timed
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.mapping import green
 from jaxsfm.sfm.reconstruction import (
     MappedStage,
     MatchedPhotos,
@@ -31,7 +32,8 @@ from jaxsfm.sfm.reconstruction import (
 from jaxsfm.sfm.second_look import SecondLook, second_look
 
 
-class MappedRun(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class MappedRun:
     """The photos of a run, and the models that the mapper made of them."""
 
     given: MatchedPhotos
@@ -50,17 +52,18 @@ class MappedRun(NamedTuple):
           counts: of all pairs that were tried.
         """
         names = [image.name for image in self.given.images]
-        return second_look(counts, names, self.photos(), self.trusted(), green=self.green())
+        return second_look(counts, names, self.photos, self.trusted(), green=self.green())
 
     def better_than(self, other: "MappedRun") -> bool:
         """Whether there are more photos in the best model. Models that something speaks against are
         worse than others."""
 
         def rank(run: MappedRun) -> tuple[bool, int]:
-            return run.green(), max(map(len, run.photos()), default=0)
+            return run.green(), max(map(len, run.photos), default=0)
 
         return rank(self) > rank(other)
 
+    @functools.cached_property
     def photos(self) -> list[set[str]]:
         """The photos of each model, the model with most photos first."""
         return [set(registered(model)) for model in self.stage.models()]
@@ -73,8 +76,7 @@ class MappedRun(NamedTuple):
 
     def green(self) -> bool:
         """Whether nothing speaks against the models."""
-        checks = self.stage.figures.checks
-        return all(check is None or check.verdict == "green" for check in checks)
+        return green(self.stage.figures.checks)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -129,7 +131,7 @@ class RunStages:
 
             mapped = MappedRun(given, map_matches(given, cache, on_image), cache)
             # The global mapper does not report images before it ends.
-            bar.update(max(map(len, mapped.photos()), default=0) - bar.n)
+            bar.update(max(map(len, mapped.photos), default=0) - bar.n)
         return mapped
 
     def refine(self, mapped: MappedRun, target: Path) -> Reconstructed:

@@ -95,11 +95,11 @@ def build_checked_models(
         )
         best, other = by_votes(rounds, view_graph=config.view_graph), None
         checks, complete = _checks(best, following), False
-        if _green(checks):
+        if green(checks):
             checks, complete = rounds.with_second_places(best, checks), True
         names = {name for pair in given.two_views for name in pair}
         found = orders(names)
-        if found and ordered(found, names) and not _green(checks):
+        if found and ordered(found, names) and not green(checks):
             logger.info("something speaks against the model; following the order of the names")
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
@@ -130,7 +130,7 @@ def build_checked_models(
     return Mapped(best.models, figures, alternative)
 
 
-def _green(checks: Sequence[ModelCheck | None]) -> bool:
+def green(checks: Sequence[ModelCheck | None]) -> bool:
     """Whether nothing is known to speak against any of the models."""
     return all(check is None or check.verdict == "green" for check in checks)
 

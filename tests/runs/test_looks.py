@@ -139,13 +139,13 @@ def test_the_model_of_the_first_look_stays_if_the_second_one_gives_no_better_one
         return SecondLook([third], sorted(counts), whole=True)
 
     monkeypatch.setattr(run_stages, "second_look", everything)
-    photos = run_stages.MappedRun.photos
+    photos = run_stages.MappedRun.photos.func
 
     def without_one(mapped):
         lost = {third} if mapped.cache.suffix else set()
         return [names - lost for names in photos(mapped)]
 
-    monkeypatch.setattr(run_stages.MappedRun, "photos", without_one)
+    monkeypatch.setattr(run_stages.MappedRun, "photos", property(without_one))
     report = run(scene, out)
     assert report["looks"]["in_vain"] and report["looks"]["whole"]
     for key in ("models", "pairs", "refinement"):

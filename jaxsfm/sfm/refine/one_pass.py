@@ -96,8 +96,8 @@ def run_pass(
     aligned, weak = _gather(start, blocks)
     adjusted = _adjust(aligned, weak, settings)
     if adjusted is not None and px > 1:
-        sizes = {view.name: (view.size, view.pixels.scale) for view in before.model.views}
-        adjusted = adjusted._replace(model=Model.from_colmap(adjusted.reconstruction, sizes))
+        model = Model.from_colmap(adjusted.reconstruction, before.model.sizes)
+        adjusted = adjusted._replace(model=model)
     enough = max(MIN_POINTS, MIN_POINT_SHARE * len(before.model.tracks.points))
     accepted = adjusted is not None and adjusted.reconstruction.num_points3D() >= enough
     after = adjusted if adjusted is not None and accepted else before
@@ -162,7 +162,7 @@ def _adjust(
     loss_px = float(np.median([view.mean_scale for view in model.views]))
     weak_view = np.isin(np.arange(len(model.views)), weak)
     limit = settings.refinement.max_error_px * np.where(weak_view, 4.0, 1.0)
-    sizes = {view.name: (view.size, view.pixels.scale) for view in model.views}
+    sizes = model.sizes
     adjusted = None
     # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
     for slack in (4.0, 1.0):
