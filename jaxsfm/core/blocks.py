@@ -20,10 +20,11 @@ from jaxsfm.core.numerics import HIGHEST
 from jaxsfm.core.scores import Head, score
 from jaxsfm.core.winograd import conv3x3
 
-WINOGRAD_CHANNELS = 256
+WINOGRAD_CHANNELS = 128
 """Number of input channels from which Winograd's convolution is faster on CPUs."""
-WINOGRAD_PIXELS = 1 << 13
-"""Number of pixels of a map from which it is used. Compiling it takes a second for each layer."""
+WINOGRAD_PRODUCTS = 1 << 29
+"""Number of products (pixels x input channels x outputs) from which it is used. For less, the half
+second that each layer takes to compile is not worth the gain."""
 STRIP_ROWS = 16
 """Rows of the input of a block that are computed at once; even. 8 to 32 rows take the same time,
 128 rows a fifth more."""
@@ -73,7 +74,8 @@ def conv(
         rounded to bfloat16 before the bias is added.
     """
     height, width, channels = x.shape[1:]
-    small = channels < WINOGRAD_CHANNELS or height * width < WINOGRAD_PIXELS
+    products = height * width * channels * layer.kernel.shape[3]
+    small = channels < WINOGRAD_CHANNELS or products < WINOGRAD_PRODUCTS
 
     def on_cpu(x, kernel):
         x, kernel = rounded(x, bfloat16), rounded(kernel, bfloat16)

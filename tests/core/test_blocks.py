@@ -141,7 +141,7 @@ def test_products_of_bfloat16_are_the_cpus_bit_for_bit(way):
 def test_deep_layers_are_the_plain_sum_on_either_platform(way, monkeypatch, bfloat16):
     """CPUs take Winograd's convolution there, and the library's nowhere else."""
     monkeypatch.setattr(blocks, "WINOGRAD_CHANNELS", 4)
-    monkeypatch.setattr(blocks, "WINOGRAD_PIXELS", 90)
+    monkeypatch.setattr(blocks, "WINOGRAD_PRODUCTS", 1800)
     rng = rng_of(3)
     (layer,), used = layers(rng, 4, 5), []
     conv3x3 = blocks.conv3x3

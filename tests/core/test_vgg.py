@@ -140,7 +140,7 @@ def test_both_convolutions_give_the_same_maps(weights, photo, monkeypatch):
     """On CPUs; elsewhere it compares the library's with itself."""
     sizes = [photo.shape[:2]]
     library = apply(weights.params, photo[None], sizes)
-    monkeypatch.setattr(blocks, "WINOGRAD_PIXELS", 1)
+    monkeypatch.setattr(blocks, "WINOGRAD_PRODUCTS", 1)
     monkeypatch.setattr(blocks, "WINOGRAD_CHANNELS", 1)
     used = []
     monkeypatch.setattr(blocks, "conv3x3", lambda x, k: (used.append(x.shape), conv3x3(x, k))[1])
