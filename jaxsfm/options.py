@@ -102,8 +102,8 @@ class ReconstructionChoice:
         given.
       mapper: Which of COLMAP's mappers computes the model.
       seed: Seed of all random choices.
-      threads: Number of COLMAP's threads; -1 uses all cores. With 1 thread, the same command gives
-        the same model, byte for byte.
+      threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores. With 1 thread, the
+        same command gives the same model, byte for byte.
       reference: Reference poses (Strecha .camera files or a COLMAP model) that the model is
         compared with.
       with_database: COLMAP database of the same photos, made by another tool. Its matches are

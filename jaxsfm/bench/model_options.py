@@ -7,6 +7,7 @@ from typing import Literal
 
 from jaxsfm.bench.options import NetworkOptions, SeedOptions, SetOptions, check_side, split_names
 from jaxsfm.errors import UserError
+from jaxsfm.io.threads import limit_threads
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,23 +17,23 @@ class _Runs(SetOptions, NetworkOptions):
     Attributes:
       methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
         rootsift+refined: the same with our refinement. paper, default, robust: the presets.
-        paper-grid, paper-learned: the preset paper with
-        keypoints at the centres of cells or at the largest learned scores. paper-grid-80px: the
-        same as paper-grid with the paper's threshold for it, 80 pixels. paper-naive: the preset
-        paper, with matches that are followed down to pixels instead of relocalization. paper-k4: K
-        = 4 instead of 2. paper-conv4, paper-pool5: the layers conv4_3/conv3_3 or pool5/conv5_3
-        instead of pool4/pool3. grid, reloc, learned:
+        paper-grid, paper-learned: the preset paper with keypoints at the centres of cells or at the
+        largest learned scores. paper-grid-80px: the same as paper-grid with the paper's threshold
+        for it, 80 pixels. paper-naive: the preset paper, with matches that are followed down to
+        pixels instead of relocalization. paper-k4: K = 4 instead of 2. paper-conv4, paper-pool5:
+        the layers conv4_3/conv3_3 or pool5/conv5_3 instead of pool4/pool3. grid, reloc, learned:
         the preset default without refinement; keypoints are at the centres of cells (grid), at the
         largest norms (reloc) or at the largest learned scores (learned). PRESET-no-IDEA,
         PRESET-norm and so on: as in bench wxbs. PRESET-no-placing: default or robust without the
         separate placing of weak views.
-      threads: Number of COLMAP's threads; -1 uses all cores.
+      threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
     """
 
     methods: tuple[str, ...]
     threads: int = -1
 
     def __post_init__(self) -> None:
+        limit_threads(self.threads)
         from jaxsfm.runs.run_options import check_threads
 
         check_threads(self.threads)

@@ -13,6 +13,8 @@ import tyro
 from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.subcommands import named_options
 from jaxsfm.errors import UserError
+from jaxsfm.io.compiled_programs import announce_compilation
+from jaxsfm.io.threads import limit_threads
 from jaxsfm.options import EngineChoice, ExecutionChoice, ReconstructionChoice, WeightsChoice
 
 Positional = tyro.conf.Positional
@@ -63,6 +65,8 @@ def reconstruct(
       out: Folder for the results. If a run there was interrupted, the same command continues it.
     """
     chosen = config.config(network.relocalizer)
+    limit_threads(run.threads)
+    announce_compilation()
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
     from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -120,6 +124,7 @@ def match(
     config = matching.config(network.relocalizer)
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
+    announce_compilation()
     import numpy as np
 
     from jaxsfm.io.atomic import atomic_file

@@ -6,11 +6,14 @@ The cache is in the user's cache folder. With it, matching two photos with the p
 
 import contextlib
 import importlib
+import logging
 import os
 import zlib
 from pathlib import Path
 
 import platformdirs
+
+logger = logging.getLogger("jaxsfm")
 
 LEAST_SECONDS = 0.2
 """Programs that took longer than this to compile are kept; JAX's own default is one second."""
@@ -30,6 +33,17 @@ def keep_compiled() -> None:
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(LEAST_SECONDS)
         with contextlib.suppress(OSError):  # the folder is missing or not ours; JAX handles both
             drop_cut_short(folder)
+
+
+def announce_compilation() -> None:
+    """Say that a first run takes longer, if no compiled program is kept yet."""
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
+    if folder and not any(Path(folder).glob(_ENTRIES)):
+        logger.info(
+            "the first run compiles its programs, which takes about half a minute; "
+            "they are kept in %s",
+            folder,
+        )
 
 
 def drop_cut_short(folder: Path) -> int:

@@ -22,8 +22,8 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, shown_name, working_size
 
 SIDE_BUCKET = 32
-"""Pixels. Of photos with 800 pixels on the longer side, 2 % is padding on average. With 128 pixels it
-would be 30 %, and photos of one camera need a single program anyway."""
+"""Pixels. Photos with 800 pixels on the longer side get 2 % more pixels on average. With 128 they
+would get 30 % more, and photos of one camera need a single program anyway."""
 BYTES_PER_PIXEL, OCTAVES_BYTES_PER_PIXEL = 700, 900
 """Peak memory of the extraction on a CPU, for each pixel of the working image, with one octave and
 with four. Between 800 x 600 and 1600 x 1200 pixels it grows by 660 and 860 bytes per pixel

@@ -7,7 +7,7 @@ import zlib
 
 import pytest
 
-from jaxsfm.io.compiled_programs import drop_cut_short
+from jaxsfm.io.compiled_programs import announce_compilation, drop_cut_short
 
 OPTION = "jax_compilation_cache_dir"
 CODE = f"""
@@ -75,3 +75,14 @@ def test_after_one_that_was_cut_short_a_program_compiles_again_without_a_warning
         entry.write_bytes(entry.read_bytes()[:100])
     assert entries and "Warning" not in said()
     assert all(len(entry.read_bytes()) > 100 for entry in entries)
+
+
+def test_only_a_run_without_kept_programs_says_that_it_compiles(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    with caplog.at_level("INFO", logger="jaxsfm"):
+        announce_compilation()
+        assert str(tmp_path) in caplog.text and "compiles" in caplog.text
+        caplog.clear()
+        (tmp_path / "one-cache").write_bytes(b"1")
+        announce_compilation()
+        assert not caplog.text
