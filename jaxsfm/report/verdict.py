@@ -208,10 +208,12 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
             f"to the other, so that {_DECISIVE}, and run the same command again"
         )
     if colour == "amber" and check.told_apart:
+        way = (
+            " (alternative/0 is one way, which photos contradict)" if other and other.whole else ""
+        )
         return (
             "look at each model by itself; each may be right, and what is missing is how they "
-            "belong together (alternative/0 is one way, which photos contradict); add such photos "
-            "and run the same command again"
+            f"belong together{way}; add such photos and run the same command again"
         )
     if colour == "amber":
         unsure = places[0].image if places else other.elsewhere[0] if other else check.apart[0][1]

@@ -80,8 +80,9 @@ def build_checked_models(
     """Map verified pairs until no photo contradicts the others, with two hypotheses.
 
     If photos still contradict each other after the last round, the parts of the best models are
-    returned, and their checks say so; the alternative is then what they are parts of. A round that
-    leaves no model to check does not count.
+    returned, and their checks say so; the alternative is then what they are parts of. If they only
+    agree because an earlier model fell apart when pairs were left out, the checks say so, too. A
+    round that leaves no model to check does not count.
 
     Args:
       database: where to write the pairs that the models were made from.
@@ -94,7 +95,7 @@ def build_checked_models(
             given, database, Path(scratch), config=config, options=options, on_image=on_image
         )
         best, other = by_votes(rounds, view_graph=config.view_graph), None
-        checks, complete = _checks(best, following), False
+        checks, complete = _checks(best, following, rounds.fallen_apart(best)), False
         if green(checks):
             checks, complete = rounds.with_second_places(best, checks), True
         names = {name for pair in given.two_views for name in pair}
@@ -104,7 +105,7 @@ def build_checked_models(
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
                 best, other = other, best
-                checks, complete = _checks(best, following), False
+                checks, complete = _checks(best, following, rounds.fallen_apart(best)), False
         rounds.go_back_to(best)
         whole, parts = best, []
         red = best.contradicted() > 0
@@ -145,7 +146,7 @@ def _checks(
     """
 
     def with_neighbours(each: Checked) -> ModelCheck:
-        inside = {name for group in each.check.groups for name in group}
+        inside = each.check.photos()
         apart = [list(p) for p in sorted(following - each.explained) if inside >= set(p)]
         return dataclasses.replace(each.check, apart=apart, told_apart=list(parts))
 
@@ -192,10 +193,7 @@ def _untold(whole: Round, part: ModelCheck) -> Alternative:
       whole: the round, with the models that were told apart alone.
     """
     assert whole.checks[0] is not None
-    before, now = (
-        {name for group in check.groups for name in group}
-        for check in (whole.checks[0].check, part)
-    )
+    before, now = (check.photos() for check in (whole.checks[0].check, part))
     return Alternative(
         basis=whole.basis,
         images=len(before),

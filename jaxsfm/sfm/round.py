@@ -98,7 +98,7 @@ class Round:
 
     def checked_photos(self) -> set[str]:
         """The photos in models that were checked."""
-        return {name for each in self._done() for group in each.check.groups for name in group}
+        return {name for each in self._done() for name in each.check.photos()}
 
     def at_least_as_good_as(self, other: "Round") -> bool:
         """Compare the models: those that no photo contradicts first, then those with more photos.

@@ -14,7 +14,7 @@ from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
 from jaxsfm.sfm.checker import Checker, VerifiedPairs
 from jaxsfm.sfm.mapper_runs import MapperRuns
-from jaxsfm.sfm.round import Hypothesis, Refuted, Round
+from jaxsfm.sfm.round import FEWER, Hypothesis, Refuted, Round
 from jaxsfm.sfm.told_apart import told_apart
 from jaxsfm.sfm.view_graph import Verdict
 
@@ -54,6 +54,8 @@ class Rounds:
         """Pairs whose second geometry was looked for."""
         self._seconds: dict[Pair, TwoView] = {}
         """The second geometries that were found."""
+        self._opposed: list[set[str]] = []
+        """The photos of each model in which photos contradicted each other, in all rounds."""
 
     @property
     def attempts(self) -> list[Attempt]:
@@ -80,7 +82,28 @@ class Rounds:
             if more is not made:
                 made, checks = more, self._checker.check(more.models, refuted.pairs)
         self._last = Round(hypothesis.basis, made.models, verdicts, checks, refuted)
+        self._opposed += [
+            each.check.photos() for each in checks if each and each.check.contradictions
+        ]
         return self._last
+
+    def fallen_apart(self, made: Round) -> list[list[str]]:
+        """Photos that were in one model of an earlier round, where they contradicted each other,
+        and that no model of this round has together; the largest group first. There are none if
+        photos still contradict each other.
+
+        The rounds between have only left out pairs. If nothing else joins the photos, then nothing
+        says that the pairs that are left are right, as they come from the same repeated walls.
+        """
+        if made.contradicted():
+            return []
+        now = [each.check.photos() for each in made.checks if each is not None]
+        for before in sorted(self._opposed, key=len, reverse=True):
+            parts = sorted((before & photos for photos in now), key=lambda part: -len(part))
+            if not parts or len(parts[0]) < (1 - FEWER) * len(before):
+                alone = before.difference(*parts)
+                return [*(sorted(p) for p in parts if p), *([name] for name in sorted(alone))]
+        return []
 
     def told_apart(self, made: Round) -> tuple[Round, list[list[str]]]:
         """The models of a round, taken apart where photos contradict each other; their parts."""

@@ -770,6 +770,51 @@ def test_models_that_nothing_contradicts_are_not_told_apart(rounds, monkeypatch)
     assert rounds(lambda pairs: outcome(explained=pairs)).rounds == [set(PAIRS)]
 
 
+@pytest.mark.parametrize("left, colour", [(8, "amber"), (9, "green"), (10, "green")])
+def test_a_model_that_falls_apart_without_the_refuted_pairs_is_amber(rounds, left, colour):
+    """Ten photos contradict each other; without a pair, some are together and nothing does."""
+    names = [f"photo{k}" for k in range(10)]
+
+    def check(pairs):
+        found = outcome(refuted=[A]) if A in pairs else outcome()
+        groups = [names] if A in pairs else [names[:left]]
+        return found._replace(check=dataclasses.replace(found.check, groups=groups))
+
+    found = rounds(check)
+    assert found.models == [frozenset(set(PAIRS) - {A})] and found.alternative == []
+    (told,) = found.figures.checks
+    assert told is not None and told.verdict == colour
+    apart = [names[:left], *([name] for name in names[left:])] if colour == "amber" else []
+    assert told.told_apart == apart
+    assert bool(found.searched) == (colour == "green")  # it repeats itself: no need to look
+
+
+def test_of_several_models_each_is_a_group_of_what_fell_apart(rounds):
+    names = [f"photo{k}" for k in range(8)]
+    tries = itertools.cycle([names[:3], names[3:7]])
+
+    def check(pairs):
+        if A in pairs:
+            found = outcome(refuted=[A])
+            return found._replace(check=dataclasses.replace(found.check, groups=[names]))
+        return outcome()._replace(
+            check=dataclasses.replace(outcome().check, groups=[next(tries)[:2]])
+        )
+
+    found = rounds(check, models=2)
+    (one, two) = found.figures.checks
+    assert one is not None and two is not None
+    assert (
+        one.told_apart
+        == two.told_apart
+        == [
+            names[:2],
+            names[3:5],
+            *([names[k]] for k in (2, 5, 6, 7)),
+        ]
+    )
+
+
 def test_strong_pairs_need_a_right_rotation_also_beside_second_geometries(rounds):
     """As above, and the refuted pair has a second geometry."""
     strong = ("a", "d")

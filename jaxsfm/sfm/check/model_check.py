@@ -92,8 +92,9 @@ class ModelCheck:
     after them did not agree with it. Sorted."""
     told_apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Groups of photos, the largest first, that were in one model with others which they
-    contradict. Each group of three photos or more is a model of its own now. They are the same for
-    all models of a run: where there are any, the scene repeats itself, also elsewhere."""
+    contradict, also if it was a model of an earlier round. Each group of three photos or more is a
+    model of its own now. They are the same for all models of a run: where there are any, the scene
+    repeats itself, also elsewhere."""
 
     @property
     def verdict(self) -> VerdictColour:
@@ -102,6 +103,10 @@ class ModelCheck:
             return "red"
         doubts = self.other_places or self.alternative or self.apart or self.told_apart
         return "amber" if doubts else "green"
+
+    def photos(self) -> set[str]:
+        """The photos of the model."""
+        return {name for group in self.groups for name in group}
 
     def without(self, names: Collection[str]) -> "ModelCheck":
         """The check of the model from which photos have been taken out."""
