@@ -134,7 +134,7 @@ def _taken_out(report: RunReport) -> dict[str, str]:
         for name in check.taken_out
     }
     why |= {
-        name: "the mapper gave it a pose, but the other photos of its model contradict it"
+        name: "the mapper gave it a pose, but something speaks against the model that it was in"
         for check in report.checks
         if check
         for group in check.told_apart

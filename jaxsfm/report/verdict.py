@@ -54,7 +54,7 @@ class ModelVerdict(NamedTuple):
     neighbours: list[Finding]
     """Photos that follow each other and do not agree with the model."""
     parts: list[Finding]
-    """Photos that were in one model, contradict each other there, and were told apart."""
+    """Photos that were in one model, which something spoke against, and are in several now."""
     decisive: str
     """Photos that would decide between two places or two models; empty if there is no choice."""
     advice: str
@@ -177,7 +177,8 @@ def _told_apart(groups: Sequence[list[str]]) -> Finding:
     shown = "; ".join(named(group) for group in groups[:MAX_FINDINGS])
     more = f"; and {len(groups) - MAX_FINDINGS} more" if len(groups) > MAX_FINDINGS else ""
     return Finding(
-        "photos that contradict each other were in one model, and each group is by itself now: "
+        "these photos were in one model, which something spoke against; each group is by "
+        "itself now: "
         f"{shown}{more}",
         groups[0],
         [name for group in groups[1:] for name in group],

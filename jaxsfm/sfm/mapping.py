@@ -80,9 +80,9 @@ def build_checked_models(
     """Map verified pairs until no photo contradicts the others, with two hypotheses.
 
     If photos still contradict each other after the last round, the parts of the best models are
-    returned, and their checks say so; the alternative is then what they are parts of. If they only
-    agree because an earlier model fell apart when pairs were left out, the checks say so, too. A
-    round that leaves no model to check does not count.
+    returned, and their checks say so; the alternative is then what they are parts of. If nothing
+    speaks against the models only because an earlier one fell apart when pairs were left out, the
+    checks say so, too. A round that leaves no model to check does not count.
 
     Args:
       database: where to write the pairs that the models were made from.
@@ -102,6 +102,7 @@ def build_checked_models(
         found = orders(names)
         if found and ordered(found, names) and not green(checks):
             logger.info("something speaks against the model; following the order of the names")
+            rounds.doubt(checks)
             other = by_order(rounds, found)
             if other.at_least_as_good_as(best):
                 best, other = other, best

@@ -2,7 +2,7 @@
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,8 +54,8 @@ class Rounds:
         """Pairs whose second geometry was looked for."""
         self._seconds: dict[Pair, TwoView] = {}
         """The second geometries that were found."""
-        self._opposed: list[set[str]] = []
-        """The photos of each model in which photos contradicted each other, in all rounds."""
+        self._doubted: list[set[str]] = []
+        """The photos of each model that something spoke against, in all rounds."""
 
     @property
     def attempts(self) -> list[Attempt]:
@@ -82,15 +82,17 @@ class Rounds:
             if more is not made:
                 made, checks = more, self._checker.check(more.models, refuted.pairs)
         self._last = Round(hypothesis.basis, made.models, verdicts, checks, refuted)
-        self._opposed += [
-            each.check.photos() for each in checks if each and each.check.contradictions
-        ]
+        self.doubt(each and each.check for each in checks)
         return self._last
 
+    def doubt(self, checks: Iterable[ModelCheck | None]) -> None:
+        """Remember the models that something speaks against (`fallen_apart`)."""
+        self._doubted += [each.photos() for each in checks if each and each.verdict != "green"]
+
     def fallen_apart(self, made: Round) -> list[list[str]]:
-        """Photos that were in one model of an earlier round, where they contradicted each other,
-        and that no model of this round has together; the largest group first. There are none if
-        photos still contradict each other.
+        """Photos that were in one model of an earlier round, which something spoke against, and
+        that no model of this round has together; the largest group first. There are none if photos
+        still contradict each other.
 
         The rounds between have only left out pairs. If nothing else joins the photos, then nothing
         says that the pairs that are left are right, as they come from the same repeated walls.
@@ -98,7 +100,7 @@ class Rounds:
         if made.contradicted():
             return []
         now = [each.check.photos() for each in made.checks if each is not None]
-        for before in sorted(self._opposed, key=len, reverse=True):
+        for before in sorted(self._doubted, key=len, reverse=True):
             parts = sorted((before & photos for photos in now), key=lambda part: -len(part))
             if not parts or len(parts[0]) < (1 - FEWER) * len(before):
                 alone = before.difference(*parts)

@@ -789,6 +789,24 @@ def test_a_model_that_falls_apart_without_the_refuted_pairs_is_amber(rounds, lef
     assert bool(found.searched) == (colour == "green")  # it repeats itself: no need to look
 
 
+def test_a_doubt_stays_if_the_order_of_the_names_only_takes_photos_out_of_the_model(rounds):
+    """The model of most pairs is amber: two neighbours do not agree with it. That of the links
+    alone has its photos in two models, and nothing speaks against either."""
+    halves = itertools.cycle([WALK[:3], WALK[3:]])
+
+    def check(pairs):
+        groups = [WALK] if FALSE in pairs else [next(halves)]
+        agreeing = {*LINKS} - {(WALK[2], WALK[3])}
+        found = walked(pairs, agreeing=agreeing)
+        return found._replace(check=dataclasses.replace(found.check, groups=groups))
+
+    found = rounds(check, two_views=WALKED, models=2)
+    assert found.models[0] == frozenset(LINKS)
+    (told, _) = found.figures.checks
+    assert told is not None and told.verdict == "amber" and told.apart == []
+    assert told.told_apart == [WALK[:3], WALK[3:]]
+
+
 def test_of_several_models_each_is_a_group_of_what_fell_apart(rounds):
     names = [f"photo{k}" for k in range(8)]
     tries = itertools.cycle([names[:3], names[3:7]])

@@ -92,9 +92,9 @@ class ModelCheck:
     after them did not agree with it. Sorted."""
     told_apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Groups of photos, the largest first, that were in one model with others which they
-    contradict, also if it was a model of an earlier round. Each group of three photos or more is a
-    model of its own now. They are the same for all models of a run: where there are any, the scene
-    repeats itself, also elsewhere."""
+    contradict, or in a model of an earlier round that something spoke against. Each group of three
+    photos or more is a model of its own now. They are the same for all models of a run: where there
+    are any, the scene repeats itself, also elsewhere."""
 
     @property
     def verdict(self) -> VerdictColour:
