@@ -282,7 +282,7 @@ def test_an_image_that_contradicts_the_model_it_was_in_says_so():
     found = explained("abcd", tried, verified, [["a", "b"], ["d"]], checks=[check, None])
     first, second = found["lost"]
     assert first["image"] == "c" and first["stage"] == "not confirmed"
-    assert first["detail"].endswith("but the other photos of its model contradict it")
+    assert first["detail"].endswith("but something speaks against the model that it was in")
     assert second["image"] == "d" and second["stage"] == "other model"  # it is in a model again
 
 

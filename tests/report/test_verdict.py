@@ -87,7 +87,8 @@ def test_photos_that_were_told_apart_are_amber_and_each_group_is_named():
     assert head == "verdict          amber: two models may explain these photos"
     assert parts == (
         "told apart       these photos were in one model, which something spoke against; each "
-        f"group is by itself now: {', '.join(NAMES[:3])}; {NAMES[3]}, {NAMES[4]}; {NAMES[5]}; and 3 more"
+        f"group is by itself now: {', '.join(NAMES[:3])}; {NAMES[3]}, {NAMES[4]}; {NAMES[5]}; "
+        "and 3 more"
     )
     assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in decisive
     assert "look at each model by itself" in advice
