@@ -90,7 +90,9 @@ RUN_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-
 """The methods of the benchmarks of whole reconstructions."""
 ROOTSIFT, REFINED_ROOTSIFT = "rootsift", "rootsift+refined"
 """The methods that have COLMAP's own features, without and with our refinement."""
-SET_METHODS = (ROOTSIFT, REFINED_ROOTSIFT, *RUN_METHODS[1:])
+LIGHTGLUE = "aliked+lightglue"
+"""The method that has keypoints and matches of two trained networks."""
+SET_METHODS = (ROOTSIFT, REFINED_ROOTSIFT, LIGHTGLUE, *RUN_METHODS[1:])
 """The methods of the benchmarks of sets of photos."""
 
 

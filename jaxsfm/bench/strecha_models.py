@@ -8,15 +8,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.methods import MAPPERS, NAIVE, REFINED_ROOTSIFT, ROOTSIFT, method_config
+from jaxsfm.bench.lightglue import lightglue_matches
+from jaxsfm.bench.methods import (
+    LIGHTGLUE,
+    MAPPERS,
+    NAIVE,
+    REFINED_ROOTSIFT,
+    ROOTSIFT,
+    method_config,
+)
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.strecha_sets import StrechaSet
+from jaxsfm.colmap.database import write_keypoint_matches
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.errors import writing
 from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.io.pairs import best_pairs, exhaustive_pairs
@@ -80,6 +89,8 @@ def set_models(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
         return _run_rootsift(each, work, run)
     if run.method == REFINED_ROOTSIFT:
         return _run_refined_rootsift(each, work, run)
+    if run.method == LIGHTGLUE:
+        return _run_lightglue(each, work, run)
     if run.method == NAIVE:
         return _run_naive(each, work, run)
     return _run_method(each, work, run)
@@ -156,6 +167,20 @@ def _run_method(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
         report,
         read_model(other) if other.is_dir() else None,
     )
+
+
+def _run_lightglue(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
+    """The models of a set by ALIKED keypoints and LightGlue's matches."""
+    images, database = open_images(each.folder / "images")[0], work / "database.db"
+    seconds: dict[str, float] = {}
+    found = lightglue_matches(images, threads=run.threads, seconds=seconds)
+    camera = parse_intrinsics(each.camera) if run.known else None
+    with timed(seconds, "mapping"):
+        write_keypoint_matches(database, images, found, camera)
+        verify(database, VerificationOptions(seed=run.seed, threads=run.threads))
+        models, _ = build_models(database, read_two_views(database), run.mapping)
+    write_models(models, work / "sparse")
+    return SetModels(models, seconds, None)
 
 
 def _run_naive(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:

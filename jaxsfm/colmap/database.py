@@ -6,6 +6,7 @@ native code, and some unset options fail silently.
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -130,6 +131,44 @@ def write_database(
             raise ValueError(f"{name}: keypoints outside the image {names[name].size}")
     rows = sum(len(xy) for _, xy in tables.values()) + 2 * matched
     check_disk_space(path.parent, SPARE_BYTES + 2 * 8 * rows)  # twice, because of SQLite's journal
+
+    def pairs() -> Iterator[tuple[Pair, np.ndarray]]:
+        for a, b in sorted(results):
+            cells = results[a, b].cells
+            if len(cells):
+                columns = zip((a, b), cells.T, strict=True)
+                index = [np.searchsorted(tables[name][0], column) for name, column in columns]
+                yield (a, b), np.stack(index, axis=1)
+
+    keypoints = {name: xy for name, (_, xy) in tables.items()}
+    _write(path, images, keypoints, pairs(), intrinsics)
+
+
+class KeypointMatches(NamedTuple):
+    """Keypoints of photos and matches between them."""
+
+    keypoints: Mapping[str, np.ndarray]
+    """float (n, 2) for each photo, pixels; the centre of the top-left pixel is (0, 0)."""
+    matches: Mapping[Pair, np.ndarray]
+    """int (m, 2) for each pair: which keypoint of the first photo, and which of the second."""
+
+
+def write_keypoint_matches(
+    path: Path, images: list[ImageFile], found: KeypointMatches, intrinsics: KnownCameras | None
+) -> None:
+    """Write a new COLMAP database of keypoints that are not ours. Arguments are those of
+    `write_database`."""
+    rows = ((pair, index) for pair, index in sorted(found.matches.items()) if len(index))
+    _write(path, images, found.keypoints, rows, intrinsics)
+
+
+def _write(
+    path: Path,
+    images: list[ImageFile],
+    keypoints: Mapping[str, np.ndarray],
+    matches: Iterable[tuple[Pair, np.ndarray]],
+    intrinsics: KnownCameras | None,
+) -> None:
     empty = np.zeros((0, 2), np.float32)
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
@@ -140,14 +179,10 @@ def write_database(
                 known = None if intrinsics is None else camera_of(intrinsics, image.name)
                 camera_id = db.write_camera(camera_for(image, known))
             ids[image.name] = db.write_image(pycolmap.Image(name=image.name, camera_id=camera_id))
-            xy = tables[image.name][1] if image.name in tables else empty
+            xy = keypoints.get(image.name, empty)
             db.write_keypoints(ids[image.name], (xy + PIXEL_OFFSET).astype(np.float32))
-        for a, b in sorted(results):
-            cells = results[a, b].cells
-            if len(cells):
-                columns = zip((a, b), cells.T, strict=True)
-                index = [np.searchsorted(tables[name][0], column) for name, column in columns]
-                db.write_matches(ids[a], ids[b], np.stack(index, axis=1).astype(np.uint32))
+        for (a, b), index in matches:
+            db.write_matches(ids[a], ids[b], index.astype(np.uint32))
 
 
 def image_ids(db: pycolmap.Database) -> dict[str, int]:

