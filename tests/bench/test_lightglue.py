@@ -19,7 +19,7 @@ def photos(scene):
 def test_without_a_package_one_sentence_says_which(monkeypatch, missing):
     monkeypatch.setitem(sys.modules, "torch", sys.modules.get("torch", sys))
     monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(UserError, match=f"needs {missing}: pip install 'jaxsfm"):
+    with pytest.raises(UserError, match=f"needs {missing}: pip install"):
         lightglue_matches([], threads=-1, seconds={})
 
 
