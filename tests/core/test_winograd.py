@@ -39,12 +39,13 @@ def test_equals_the_plain_sum_for_all_sizes_and_strips(shape, tiles):
 
 
 def test_rounding_is_that_of_the_plain_sum_on_many_channels():
+    """The usual points 0, 1, -1, 2 and -2 would give 4.5e-6, and 1/2 and 2 more than 2e-6."""
     rng = rng_of(0)
     x = jnp.asarray(np.maximum(rng.normal(size=(12, 14, 512)), 0), jnp.float32)
     kernel = jnp.asarray(rng.normal(size=(3, 3, 512, 8)) / 68, jnp.float32)
     exact = oracles.convolution(np.asarray(x), np.asarray(kernel), np.zeros(8))
     error = np.abs(np.asarray(conv3x3(x, kernel)) - exact).max() / np.abs(exact).max()
-    assert error < 5e-6
+    assert error < 2e-6
 
 
 def test_gradients_are_those_of_the_plain_sum():
