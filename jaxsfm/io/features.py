@@ -24,6 +24,8 @@ from jaxsfm.io.images import ImageFile, shown_name, working_size
 SIDE_BUCKET = 32
 """Pixels. Photos with 800 pixels on the longer side get 2 % more pixels on average. With 128 they
 would get 30 % more, and photos of one camera need a single program anyway."""
+LEAST_SIDE = 128
+"""The fourth octave of a shorter side would have no coarse cell, and its map would be empty."""
 BYTES_PER_PIXEL, OCTAVES_BYTES_PER_PIXEL = 700, 900
 """Peak memory of the extraction on a CPU, for each pixel of the working image, with one octave and
 with four. Between 800 x 600 and 1600 x 1200 pixels it grows by 660 and 860 bytes per pixel
@@ -72,8 +74,8 @@ def padded_cells(num_coarse: int) -> int:
 
 def padded_size(size: tuple[int, int]) -> tuple[int, int]:
     """(rows, columns), in pixels, to which a working image of (width, height) is padded."""
-    width, height = size
-    return -(-height // SIDE_BUCKET) * SIDE_BUCKET, -(-width // SIDE_BUCKET) * SIDE_BUCKET
+    width, height = (max(-(-side // SIDE_BUCKET) * SIDE_BUCKET, LEAST_SIDE) for side in size)
+    return height, width
 
 
 def feature_capacity(size: tuple[int, int], *, fine_stride: int = FINE_STRIDE) -> FeatureCapacity:
