@@ -9,6 +9,8 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+from jaxsfm.errors import UserError
+
 EngineName = Literal["local", "ray"]
 Mapper = Literal["incremental", "global"]
 """COLMAP's mappers."""
@@ -155,3 +157,15 @@ class NewPhotosChoice:
     intrinsics: str | None = None
     shortlist: int = 20
     keep_features: bool = False
+
+
+def check_seed(seed: int) -> None:
+    """Raise UserError for a seed that COLMAP does not take."""
+    if not 0 <= seed < 2**31:
+        raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
+
+
+def check_threads(threads: int) -> None:
+    """Raise UserError for a number of threads that COLMAP does not take."""
+    if threads == 0 or threads < -1:
+        raise UserError(f"--threads must be positive, or -1 for all; got {threads}")

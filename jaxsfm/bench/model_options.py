@@ -7,7 +7,7 @@ from typing import Literal
 
 from jaxsfm.bench.options import NetworkOptions, SeedOptions, SetOptions, check_side, split_names
 from jaxsfm.errors import UserError
-from jaxsfm.io.threads import limit_threads
+from jaxsfm.options import check_seed, check_threads
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,9 +34,6 @@ class _Runs(SetOptions, NetworkOptions):
     threads: int = -1
 
     def __post_init__(self) -> None:
-        limit_threads(self.threads)
-        from jaxsfm.runs.run_options import check_threads
-
         check_threads(self.threads)
 
 
@@ -46,8 +43,6 @@ class _OneSeed(_Runs):
     """Seed of all random choices."""
 
     def __post_init__(self) -> None:
-        from jaxsfm.runs.run_options import check_seed
-
         super().__post_init__()
         check_seed(self.seed)
 

@@ -122,6 +122,11 @@ def _run_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
         write_rootsift_database(
             database, photos, images, camera, verification, max_size=run.max_size
         )
+    return _mapped(database, work, run, seconds)
+
+
+def _mapped(database: Path, work: Path, run: MethodRun, seconds: dict[str, float]) -> SetModels:
+    """The models of the verified pairs in a database."""
     with timed(seconds, "mapping"):
         models, _ = build_models(database, read_two_views(database), run.mapping)
     write_models(models, work / "sparse")
@@ -175,12 +180,10 @@ def _run_lightglue(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     seconds: dict[str, float] = {}
     found = lightglue_matches(images, threads=run.threads, seconds=seconds)
     camera = parse_intrinsics(each.camera) if run.known else None
-    with timed(seconds, "mapping"):
+    with timed(seconds, "matching"):  # RootSIFT's has the verification, too
         write_keypoint_matches(database, images, found, camera)
         verify(database, VerificationOptions(seed=run.seed, threads=run.threads))
-        models, _ = build_models(database, read_two_views(database), run.mapping)
-    write_models(models, work / "sparse")
-    return SetModels(models, seconds, None)
+    return _mapped(database, work, run, seconds)
 
 
 def _run_naive(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:

@@ -14,6 +14,7 @@ from jaxsfm.bench.options import (
     WxbsOptions,
 )
 from jaxsfm.cli.run_commands import check_writable
+from jaxsfm.io.threads import limit_threads
 
 Options = TypeVar("Options", bound=BenchOptions)
 Figures = TypeVar("Figures", bound=Mapping[str, object])
@@ -38,6 +39,7 @@ def strecha(bench: Unnamed[StrechaOptions]) -> int:
         $ jaxsfm bench strecha --root SETS --methods rootsift,default --json figures.json
         $ jaxsfm bench strecha --root SETS --best-pairs 5 --methods rootsift,paper-grid,paper
     """
+    limit_threads(bench.threads)
     from jaxsfm.bench.strecha import bench_strecha, table_lines
 
     return _run(bench_strecha, table_lines, bench)
@@ -52,6 +54,7 @@ def ambiguous(bench: Unnamed[AmbiguousOptions]) -> int:
         $ jaxsfm bench ambiguous --sets synthetic-room,synthetic-room-poster --sizes 480
         $ jaxsfm bench ambiguous --root SETS --sets castle-P19 --sizes 600,800,1000 --seeds 3
     """
+    limit_threads(bench.threads)
     from jaxsfm.bench.ambiguous import bench_ambiguous, table_lines
 
     return _run(bench_ambiguous, table_lines, bench)
@@ -99,6 +102,7 @@ def daynight(bench: Unnamed[DayNightOptions]) -> int:
     For example
         $ jaxsfm bench daynight --root SETS --severity 3.25 --curves curves.png
     """
+    limit_threads(bench.threads)
     from jaxsfm.bench.daynight import bench_daynight, table_lines
 
     check_writable(bench.curves, "--curves", (".png",))

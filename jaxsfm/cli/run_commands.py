@@ -13,9 +13,14 @@ import tyro
 from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.subcommands import named_options
 from jaxsfm.errors import UserError
-from jaxsfm.io.compiled_programs import announce_compilation
 from jaxsfm.io.threads import limit_threads
-from jaxsfm.options import EngineChoice, ExecutionChoice, ReconstructionChoice, WeightsChoice
+from jaxsfm.options import (
+    EngineChoice,
+    ExecutionChoice,
+    ReconstructionChoice,
+    WeightsChoice,
+    check_seed,
+)
 
 Positional = tyro.conf.Positional
 DOUBTFUL = 3
@@ -66,7 +71,6 @@ def reconstruct(
     """
     chosen = config.config(network.relocalizer)
     limit_threads(run.threads)
-    announce_compilation()
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
     from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -124,7 +128,6 @@ def match(
     config = matching.config(network.relocalizer)
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
-    announce_compilation()
     import numpy as np
 
     from jaxsfm.io.atomic import atomic_file
@@ -132,7 +135,6 @@ def match(
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
     from jaxsfm.matching.pair_matching import match_features
-    from jaxsfm.runs.run_options import check_seed
     from jaxsfm.sfm.refine.pair_alignment import align
 
     check_seed(seed)

@@ -16,6 +16,7 @@ from jaxsfm.config import Config
 from jaxsfm.core.features import Extraction, Walk
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
+from jaxsfm.io.compiled_programs import announce_compilation
 from jaxsfm.io.features import ImageFeatures, check_memory, feature_capacity, padded_size
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
 from jaxsfm.io.weights import Weights
@@ -105,6 +106,8 @@ def extract_images(
     at_once = mesh.size * (execution.images_at_once or 1)
     for image in images:  # before the first is computed
         check_memory(image, at_once, config=config)
+    if images:
+        announce_compilation()
     params = jax.device_put(weights.params, NamedSharding(mesh, PartitionSpec()))
     weights = dataclasses.replace(weights, params=params)
 

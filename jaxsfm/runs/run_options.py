@@ -13,6 +13,8 @@ from jaxsfm.options import (
     NewPhotosChoice,
     ReconstructionChoice,
     WeightsChoice,
+    check_seed,
+    check_threads,
 )
 
 
@@ -50,15 +52,3 @@ def check_options(options: RunOptions) -> None:
     check_seed(options.seed)
     check_threads(options.threads)
     chosen_engine(options.engine)
-
-
-def check_seed(seed: int) -> None:
-    """Raise UserError for a seed that COLMAP does not take."""
-    if not 0 <= seed < 2**31:
-        raise UserError(f"--seed must lie in 0 .. 2147483647; got {seed}")
-
-
-def check_threads(threads: int) -> None:
-    """Raise UserError for a number of threads that COLMAP does not take."""
-    if threads == 0 or threads < -1:
-        raise UserError(f"--threads must be positive, or -1 for all; got {threads}")

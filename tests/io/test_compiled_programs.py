@@ -7,6 +7,7 @@ import zlib
 
 import pytest
 
+from jaxsfm.cli.main import main
 from jaxsfm.io.compiled_programs import announce_compilation, drop_cut_short
 
 OPTION = "jax_compilation_cache_dir"
@@ -86,3 +87,16 @@ def test_only_a_run_without_kept_programs_says_that_it_compiles(tmp_path, monkey
         (tmp_path / "one-cache").write_bytes(b"1")
         announce_compilation()
         assert not caplog.text
+
+
+def test_a_command_says_it_when_its_work_begins_and_not_before(
+    scene, tmp_path, monkeypatch, capsys
+):
+    """A refusal stays one sentence."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "empty"))
+    photo = str(scene / "images" / "view0.png")
+    args = ["match", photo, photo, "--preset", "paper", "--max-size", "64", "--out"]
+    assert main([*args, str(tmp_path / "m.png")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    main([*args, str(tmp_path / "m.npz")])
+    assert capsys.readouterr().err.count("compiles its programs") >= 1

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import pytest
@@ -10,11 +11,9 @@ import pytest
 from jaxsfm.io.threads import READ_ONCE, limit_threads
 
 CODE = """
-import sys, time
-from jaxsfm.bench.model_options import StrechaOptions
-from pathlib import Path
-assert not {"jax", "numpy", "cv2"} & set(sys.modules), "a library has been imported before"
-StrechaOptions(root=Path("."), threads=%d)
+import os, sys, time
+from jaxsfm.cli.main import main
+assert main(sys.argv[1:]) == 2  # there is no such folder, which is found after the libraries' start
 import cv2, jax
 x = jax.numpy.ones((1024, 1024))
 product = jax.jit(lambda x: x @ x)
@@ -22,38 +21,56 @@ product(x).block_until_ready()
 wall, cpu = time.perf_counter(), time.process_time()
 for _ in range(10):
     product(x).block_until_ready()
-print((time.process_time() - cpu) / (time.perf_counter() - wall), cv2.getNumThreads())
+processors = (time.process_time() - cpu) / (time.perf_counter() - wall)
+print(processors, cv2.getNumThreads(), *(os.environ.get(v, -1) for v in %s))
 """
+COMMANDS = {
+    "reconstruct": ["no-folder", "--out", "out"],
+    "strecha": ["--root", "no-folder"],
+    "daynight": ["--root", "no-folder"],
+    "ambiguous": ["--root", "no-folder"],
+}
 
 
-def ran(threads: int) -> list[float]:
-    """Processors that JAX uses, and OpenCV's threads."""
+def ran(command: str, threads: int, folder: Path) -> list[float]:
+    """Processors that JAX uses, OpenCV's threads, and the variables' values, -1 for none."""
     environment = {k: v for k, v in os.environ.items() if k not in READ_ONCE.values()}
+    before = [] if command == "reconstruct" else ["bench"]
+    args = [*before, command, *COMMANDS[command], "--threads", str(threads)]
     found = subprocess.run(
-        [sys.executable, "-c", CODE % threads], env=environment, capture_output=True, text=True
+        [sys.executable, "-c", CODE % [*READ_ONCE.values()], *args],
+        env=environment,
+        capture_output=True,
+        text=True,
+        cwd=folder,
     )
     assert found.returncode == 0, found.stderr
     return [float(text) for text in found.stdout.split()]
 
 
-def test_one_thread_is_one_thread_for_jax_and_opencv():
-    processors, opencv = ran(1)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_one_thread_is_one_thread_for_jax_and_opencv(command, tmp_path):
+    """How many processors JAX gets depends on other processes, too; the variables do not."""
+    processors, opencv, *variables = ran(command, 1, tmp_path)
     assert processors < 1.2 and opencv == 1
+    assert variables == [1] * len(READ_ONCE)
 
 
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="there is one processor")
-def test_without_a_limit_opencv_has_more():
-    """So the test above can fail. How many processors JAX gets depends on other processes."""
-    assert ran(-1)[1] > 1
+def test_without_a_limit_opencv_has_more(tmp_path):
+    """So the test above can fail."""
+    _, opencv, *variables = ran("reconstruct", -1, tmp_path)
+    assert opencv > 1 and variables == [-1] * len(READ_ONCE)
 
 
 def test_a_library_that_is_loaded_is_left_alone(monkeypatch):
     """Else the number that workers get would not be that of this process."""
-    monkeypatch.setenv("NPROC", "7")
-    monkeypatch.setitem(sys.modules, "jax", sys.modules.get("jax"))
+    for name, variable in READ_ONCE.items():
+        monkeypatch.setitem(sys.modules, name, sys.modules.get(name))
+        monkeypatch.setenv(variable, "7")
+    monkeypatch.setattr(cv2, "setNumThreads", lambda count: None)
     limit_threads(3)
-    assert os.environ["NPROC"] == "7"
-    cv2.setNumThreads(-1)
+    assert {os.environ[variable] for variable in READ_ONCE.values()} == {"7"}
 
 
 @pytest.mark.parametrize("count", [-1, 0])
