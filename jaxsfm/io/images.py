@@ -1,7 +1,8 @@
 """Finding and reading images. All code that looks at the pixels of a photo reads it here.
 
-Pixels are read as they are stored; the orientation in the EXIF data is ignored. COLMAP 4.2 does the
-same (measured), so keypoints and intrinsics agree with COLMAP's own tools.
+Pixels are read as they are stored, unless the reader asks for an upright photo. All coordinates
+that are written are those of the stored pixels. COLMAP 4.2 does the same (measured), so keypoints
+and intrinsics agree with COLMAP's own tools.
 """
 
 import contextlib
@@ -12,16 +13,17 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
+from jaxsfm.io import orientation
 
 logger = logging.getLogger(__name__)
 
@@ -58,11 +60,29 @@ class ImageFile:
     """(width, height) as stored, pixels."""
     sha256: str
     """The SHA-256 of the file's bytes, hexadecimal."""
+    orientation: int = orientation.UPRIGHT
+    """How the stored photo is turned to be upright (`jaxsfm.io.orientation`)."""
+
+    @property
+    def content(self) -> str:
+        """What the features of the photo depend on: its bytes, and how it is turned."""
+        return orientation.content(self.sha256, self.orientation)
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """(width, height) of the photo when it is upright, pixels."""
+        return orientation.upright_size(self.size, self.orientation)
 
     @property
     def identity(self) -> int:
         """32 bits of the hash. They are the image's part in the random key of a pair."""
         return int(self.sha256[:8], 16)
+
+
+def orientations(images: Iterable[ImageFile]) -> dict[str, int]:
+    """How the images that are not stored upright are turned, by name."""
+    upright = orientation.UPRIGHT
+    return {i.name: i.orientation for i in images if i.orientation != upright}
 
 
 class WorkingImage(NamedTuple):
@@ -71,7 +91,8 @@ class WorkingImage(NamedTuple):
     rgb: np.ndarray
     """uint8 (height, width, 3)."""
     scale: tuple[float, float]
-    """Original pixels per working pixel, (x, y)."""
+    """Original pixels per working pixel, (x, y); of an upright photo, in pixels of the upright
+    original."""
 
 
 def find_images(folder: Path) -> list[str]:
@@ -134,7 +155,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
             warnings.simplefilter("ignore")  # about odd metadata; only the size is needed
             # Pillow is not given the path: reading from a file, it allocates what the header says.
             with Image.open(io.BytesIO(data)) as header:
-                size = header.size
+                size, noted = header.size, _noted_orientation(header)
     except Exception as error:  # Pillow's readers can raise almost anything
         raise ImageError(f"{shown}: not a readable image") from error
     if min(size) < MIN_SIDE:
@@ -145,7 +166,15 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
         raise ImageError(f"{shown}: the file is truncated")
     digest = hashlib.sha256(data).hexdigest()
-    return ImageFile(name=name or path.name, path=path, size=size, sha256=digest)
+    return ImageFile(name=name or path.name, path=path, size=size, sha256=digest, orientation=noted)
+
+
+def _noted_orientation(header: Image.Image) -> int:
+    """The orientation in the EXIF data of a photo; upright if there is none or it is damaged."""
+    try:
+        return orientation.checked(header.getexif().get(ExifTags.Base.Orientation))
+    except Exception:  # Pillow's readers can raise almost anything
+        return orientation.UPRIGHT
 
 
 def shown_name(name: str) -> str:
@@ -261,23 +290,28 @@ def size_and_scale(
     return (width, height), (size[0] / width, size[1] / height)
 
 
-def read_image(image: ImageFile, *, max_size: int, enlarge: float = 1.0) -> WorkingImage:
+def read_image(
+    image: ImageFile, *, max_size: int, enlarge: float = 1.0, upright: bool = False
+) -> WorkingImage:
     """Decode an image and resize it to its working size (`working_size`).
+
+    Args:
+      upright: turn the image so that it is upright, before it is resized.
 
     Images in grey, with alpha, with 16 bits or in CMYK are converted to RGB with 8 bits. Raises
     ImageError if the file cannot be decoded, or a side would be shorter than `MIN_SIDE`.
     """
-    rgb = _decode(image)
-    width, height = working_size(image.size, max_size, enlarge)
+    rgb, size = _decode(image), image.size
+    if upright:
+        rgb, size = orientation.upright(rgb, image.orientation), image.upright_size
+    width, height = working_size(size, max_size, enlarge)
     if min(width, height) < MIN_SIDE:
         raise ImageError(
             f"{shown_name(image.name)}: {width} x {height} pixels after reduction to "
             f"{max_size} is too narrow (at least {MIN_SIDE} per side)"
         )
     if rgb.shape[:2] != (height, width):
-        larger = width > image.size[0]
+        larger = width > size[0]
         how = cv2.INTER_CUBIC if larger else cv2.INTER_AREA
         rgb = cv2.resize(rgb, (width, height), interpolation=how)
-    return WorkingImage(
-        rgb=np.ascontiguousarray(rgb), scale=(image.size[0] / width, image.size[1] / height)
-    )
+    return WorkingImage(rgb=np.ascontiguousarray(rgb), scale=(size[0] / width, size[1] / height))

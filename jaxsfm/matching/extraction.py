@@ -112,7 +112,7 @@ def extract_images(
     weights = dataclasses.replace(weights, params=params)
 
     def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
-        return _shapes(working_size(image.size, config.max_size, config.enlarge), config)
+        return _shapes(working_size(image.upright_size, config.max_size, config.enlarge), config)
 
     def batches() -> Iterator[_Batch]:
         for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
@@ -158,7 +158,7 @@ def _read_ahead(
 
     def read(image: ImageFile) -> WorkingImage | ImageError:
         try:
-            return read_image(image, max_size=config.max_size, enlarge=config.enlarge)
+            return read_image(image, max_size=config.max_size, enlarge=config.enlarge, upright=True)
         except ImageError as error:
             return error
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,6 +13,7 @@ from jaxsfm.colmap.model import Model, Sizes, point_colours
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
+from jaxsfm.io import orientation
 from jaxsfm.io.images import (
     ImageError,
     ImageFile,
@@ -24,7 +25,7 @@ from jaxsfm.io.images import (
 from jaxsfm.io.looks import Looks
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
-from jaxsfm.report.run_inputs import RecordedConfig
+from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
 from jaxsfm.report.run_results import EvaluationReport
 from jaxsfm.report.typed_json import from_json, to_json
@@ -50,12 +51,10 @@ class ReferencePoses(NamedTuple):
 class RecordedPhotos:
     """The photos of a run, for as long as they are unchanged and where the run found them."""
 
-    def __init__(
-        self, folder: Path | None, hashes: Mapping[str, str], config: RecordedConfig
-    ) -> None:
-        """Photos in `folder` with the SHA-256 `hashes` by name."""
+    def __init__(self, folder: Path | None, identity: RunIdentity, config: RecordedConfig) -> None:
+        """The photos of the identity, which lie in `folder`."""
         self.folder = folder
-        self._hashes = hashes
+        self._hashes, self._orientations = identity.images, identity.orientations
         self._config = config
         self.read = functools.lru_cache(maxsize=16)(self._read)
 
@@ -67,12 +66,25 @@ class RecordedPhotos:
             image = inspect_image(self.folder / name, name=name)
         except ImageError:
             return None
-        return image if image.sha256 == self._hashes.get(name) else None
+        return self.as_described(image) if image.sha256 == self._hashes.get(name) else None
+
+    def as_described(self, image: ImageFile) -> ImageFile:
+        """The file of a photo of the run, turned as it was when the run described it."""
+        return dataclasses.replace(image, orientation=self._orientation(image.name))
+
+    def _orientation(self, name: str) -> int:
+        return orientation.checked(self._orientations.get(name))
 
     def recorded(self, name: str) -> ImageFile:
         """The file of a photo as the run found it, unseen: it may be gone. Its size is (0, 0)."""
         path = (self.folder or Path()) / name
-        return ImageFile(name=name, path=path, size=(0, 0), sha256=self._hashes[name])
+        return ImageFile(
+            name=name,
+            path=path,
+            size=(0, 0),
+            sha256=self._hashes[name],
+            orientation=self._orientation(name),
+        )
 
     def name_of(self, sha256: str) -> str | None:
         """The name of the photo with that content; None if the run has no such photo."""
@@ -214,7 +226,7 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(where, report.identity.images, _described(report)),
+        photos=RecordedPhotos(where, report.identity, _described(report)),
         model=model,
         colours=colours,
         reference=known,

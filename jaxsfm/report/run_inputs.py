@@ -22,6 +22,8 @@ class RunIdentity:
     seed: Count = 0
     images: dict[str, str]
     """The SHA-256 of every usable photo, by name."""
+    orientations: dict[str, Count] = field(default_factory=dict)
+    """How photos that are not stored upright are turned, by name (`jaxsfm.io.orientation`)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

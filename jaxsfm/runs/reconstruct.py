@@ -13,7 +13,7 @@ from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageFile
+from jaxsfm.io.images import ImageFile, orientations
 from jaxsfm.io.looks import Looks
 from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
@@ -92,6 +92,7 @@ def reconstruct_folder(
         config=config.matching(),
         seed=options.seed,
         images={image.name: image.sha256 for image in usable},
+        orientations=orientations(usable),
     )
     seconds: dict[str, float] = {}
     with open_folder(out, to_json(identity)) as folder:

@@ -61,7 +61,8 @@ class RayEngine:
     ) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
         """As `jaxsfm.matching.extraction.extract_images`, in any order; UserError also for Ray."""
         ordered = sorted(
-            images, key=lambda image: working_size(image.size, config.max_size, config.enlarge)
+            images,
+            key=lambda image: working_size(image.upright_size, config.max_size, config.enlarge),
         )
         if not ordered:
             return
