@@ -14,8 +14,8 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import match_features
 
-CONFIG = dataclasses.replace(preset("default"), max_size=200, octaves=2)
-WIDTH, HEIGHT = 256, 192
+CONFIG = preset("default")
+WIDTH, HEIGHT = 240, 180
 
 
 @pytest.fixture(scope="module")
@@ -74,4 +74,7 @@ def test_homographies_map_to_the_stored_pixels(matched, code):
     found = matched[code]
     for match, plane in enumerate(found.plane):
         x, y, w = found.homographies[plane] @ [*found.keypoints0[match], 1]
-        assert np.hypot(*(np.asarray([x, y]) / w - found.keypoints1[match])) < 15  # 10 px at 200
+        assert (
+            np.hypot(*(np.asarray([x, y]) / w - found.keypoints1[match]))
+            < 1.5 * CONFIG.threshold_px
+        )
