@@ -13,7 +13,7 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,6 +62,9 @@ class ImageFile:
     """The SHA-256 of the file's bytes, hexadecimal."""
     orientation: int = orientation.UPRIGHT
     """How the stored photo is turned to be upright (`jaxsfm.io.orientation`)."""
+    taken_with: str = ""
+    """The camera, its lens and its focal length, as EXIF names them; empty if EXIF names no camera.
+    Photos of one zoom lens differ in the focal length."""
 
     @property
     def content(self) -> str:
@@ -155,7 +158,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
             warnings.simplefilter("ignore")  # about odd metadata; only the size is needed
             # Pillow is not given the path: reading from a file, it allocates what the header says.
             with Image.open(io.BytesIO(data)) as header:
-                size, noted = header.size, _noted_orientation(header)
+                size, exif = header.size, _exif(header)
     except Exception as error:  # Pillow's readers can raise almost anything
         raise ImageError(f"{shown}: not a readable image") from error
     if min(size) < MIN_SIDE:
@@ -166,15 +169,35 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
         raise ImageError(f"{shown}: the file is truncated")
     digest = hashlib.sha256(data).hexdigest()
-    return ImageFile(name=name or path.name, path=path, size=size, sha256=digest, orientation=noted)
+    return ImageFile(
+        name=name or path.name,
+        path=path,
+        size=size,
+        sha256=digest,
+        orientation=orientation.checked(exif.get(ExifTags.Base.Orientation)),
+        taken_with=_taken_with(exif),
+    )
 
 
-def _noted_orientation(header: Image.Image) -> int:
-    """The orientation in the EXIF data of a photo; upright if there is none or it is damaged."""
+_CAMERA = ("Make", "Model", "BodySerialNumber", "LensModel", "FocalLength", "DigitalZoomRatio")
+"""The tags that tell cameras apart."""
+
+
+def _exif(header: Image.Image) -> dict[int, object]:
+    """The EXIF data of a photo; empty if there is none or it is damaged."""
     try:
-        return orientation.checked(header.getexif().get(ExifTags.Base.Orientation))
+        exif = header.getexif()
+        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
     except Exception:  # Pillow's readers can raise almost anything
-        return orientation.UPRIGHT
+        return {}
+
+
+def _taken_with(exif: Mapping[int, object]) -> str:
+    """What EXIF says of the camera (`ImageFile.taken_with`)."""
+    if not exif.get(ExifTags.Base.Model):
+        return ""
+    values = (exif.get(ExifTags.Base[tag], "") for tag in _CAMERA)
+    return ", ".join(text for value in values if (text := str(value).strip("\0 ")))
 
 
 def shown_name(name: str) -> str:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import read_external_matches
-from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
@@ -78,8 +79,8 @@ def reconstruct_folder(
     selection = parse_pair_selection(options.pairs)
     pairs = selected_pairs(selection, (image.name for image in usable), names)
     _check_enough(images, usable, skipped)
-    if intrinsics is not None:
-        check_fits(intrinsics, {image.name: image.size for image in usable})
+    cameras = Cameras(known=intrinsics, sharing=options.cameras, model=options.camera_model)
+    cameras.check_fits(usable)
     external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
     weights = chosen_weights(options.network, config.backbone)
     if selection.retrieval:
@@ -121,7 +122,7 @@ def reconstruct_folder(
         stages = RunStages(
             folder=folder,
             images=good,
-            intrinsics=intrinsics,
+            cameras=cameras,
             external=external,
             config=config,
             options=options,

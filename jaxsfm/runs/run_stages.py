@@ -7,8 +7,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import ExternalMatches, JoinedMatches
-from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.config import Config
@@ -85,7 +85,7 @@ class RunStages:
 
     folder: WorkFolder
     images: list[ImageFile]
-    intrinsics: Intrinsics | None
+    cameras: Cameras
     external: ExternalMatches
     config: Config
     options: RunOptions
@@ -111,7 +111,7 @@ class RunStages:
             matches,
             config=self.config,
             described=matched.described,
-            intrinsics=self.intrinsics,
+            cameras=self.cameras,
             options=MapOptions(
                 mapper=options.mapper,
                 refine_intrinsics=options.refines,

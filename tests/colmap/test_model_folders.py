@@ -39,7 +39,7 @@ def test_two_scenes_give_two_models_the_larger_first(tmp_path, scene):
         )
         for i, j in ((0, 1), (0, 2), (1, 2))
     }
-    write_database(tmp_path / "d.db", small + scene.images, scene.results | other, scene.known)
+    write_database(tmp_path / "d.db", small + scene.images, scene.results | other, scene.cameras)
     models = map_database(tmp_path / "d.db", ONE)
     assert [sorted(model_poses(m)) for m in models] == [scene.names, [i.name for i in small]]
 
