@@ -87,10 +87,7 @@ def test_a_shared_camera_takes_its_focal_length_from_any_of_its_photos(tmp_path)
     """Some programs keep the name of the camera and lose the rest."""
     exif = {0x0110: "Nobody knows this one"}
     images = [photo(tmp_path / "a.jpg", exif), photo(tmp_path / "b.jpg", exif, focal35=50)]
-    (camera, _), *others = Cameras().assigned(
-        [image if image.name == "a.jpg" else image for image in images]
-    )
-    assert not others
+    ((camera, _),) = Cameras().assigned(images)
     assert camera.has_prior_focal_length and camera.mean_focal_length() == pytest.approx(
         50 / np.hypot(36, 24) * np.hypot(*SIZE), rel=1e-3
     )
@@ -180,7 +177,7 @@ def test_a_camera_that_cannot_be_turned_is_refused(tmp_path):
     known = Intrinsics(model="FOV", params=(90.0, 90.0, 48.0, 32.0, 0.5))
     image = photo(tmp_path / "a.jpg", {0x0112: 6}, size=SIZE[::-1])
     with pytest.raises(
-        UserError, match="--intrinsics FOV: .*omega of this camera cannot be turned"
+        UserError, match="--intrinsics FOV: .*omega of this camera cannot be"
     ):
         Cameras(known=known).assigned([image])
 
