@@ -91,10 +91,11 @@ class Cameras:
 def _from_one_source(images: Sequence[ImageFile]) -> bool:
     """Whether photos without EXIF seem to come from one camera, such as the frames of a video.
 
-    They have one size, and no photo has EXIF. In a collection of a photo site some photos have, and
-    those that have lost it are of any camera.
+    They have one size, up to quarter turns, and the EXIF data of no photo names a camera. In a
+    collection of a photo site some photos have EXIF, and those that have lost it are of any camera.
     """
-    return len({image.size for image in images}) == 1 and not any(i.taken_with for i in images)
+    sizes = {tuple(sorted(image.size)) for image in images}
+    return len(sizes) == 1 and not any(image.taken_with for image in images)
 
 
 def estimated_camera(group: Sequence[ImageFile], model: str = "SIMPLE_RADIAL") -> pycolmap.Camera:

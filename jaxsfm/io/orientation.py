@@ -66,6 +66,17 @@ def turned(orientation: int, quarters: int) -> int:
     return by_matrix[matrix.tobytes()]
 
 
+def quarters_between(before: int, after: int) -> int:
+    """The quarter turns clockwise, 0 .. 3, that lead from one code to another (`turned`).
+
+    Raises ValueError if the codes differ by a mirror.
+    """
+    for quarters in range(4):
+        if turned(before, quarters) == after:
+            return quarters
+    raise ValueError(f"codes must differ by a turn; got {before} and {after}")
+
+
 def content(sha256: str, orientation: int) -> str:
     """What describes the pixels of an upright photo: its file's SHA-256 and how it is turned."""
     return sha256 if orientation == UPRIGHT else f"{sha256} turned {orientation}"

@@ -15,7 +15,6 @@ from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile, orientations
-from jaxsfm.io.looks import Looks
 from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.weights import chosen_weights
@@ -25,19 +24,13 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, nearest_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page.after_run import page_after_run
-from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
+from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.job import Job, pairs_without
-from jaxsfm.runs.matching_looks import (
-    MatchedPairs,
-    first_look,
-    job_of_look,
-    match_again,
-    match_pairs,
-    timed,
-)
+from jaxsfm.runs.mapping_looks import RunPhotos, map_in_looks
+from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.runs.run_stages import RunStages
 
@@ -113,9 +106,10 @@ def reconstruct_folder(
                 found, lost = _retrieve(job, tried, options.retrieval, selection.retrieval)
                 pairs, skipped = sorted({*pairs, *found}), skipped | lost
         by_name = {image.name: image for image in usable if image.name not in skipped}
-        first = first_look(config, by_name.values())
-        look = job_of_look(job, identity, first) if first else job
-        counts, lost = match_pairs(look, by_name, pairs_without(pairs, skipped), seconds)
+        photos = RunPhotos(
+            job=job, identity=identity, images=by_name, pairs=pairs_without(pairs, skipped)
+        )
+        matched, lost = photos.match(seconds)
         skipped |= lost
         good = [image for image in usable if image.name not in skipped]
         _check_enough(images, good, skipped)
@@ -128,37 +122,21 @@ def reconstruct_folder(
             options=options,
             seconds=seconds,
         )
-        matched = MatchedPairs(Looks(look.store), look.config, counts)
-        mapped = stages.map(matched, again=False)
-        looks = UsedLooks(first_px=first.max_size) if first else None
-        again = mapped.unsettled(counts) if first else None
-        if looks is not None and again is not None:
-            logger.info("%s", again.in_words())
-            matched_again = match_again(job, by_name, matched, again, seconds)
-            mapped_again = stages.map(matched_again, again=True)
-            looks = dataclasses.replace(
-                looks,
-                photos=again.photos,
-                again=again.pairs,
-                whole=again.whole,
-                in_vain=mapped.better_than(mapped_again),
-            )
-            if not looks.in_vain:
-                matched, mapped = matched_again, mapped_again
+        mapped = map_in_looks(photos.without(lost), matched, stages)
         with folder.publish() as target:
-            made = stages.refine(mapped, target)
+            made = stages.refine(mapped.mapped, target)
             report = run_report(
                 StageResults(
                     folder=images,
-                    identity=identity,
+                    identity=mapped.identity,
                     usable=good,
                     skipped=skipped,
-                    results=matched.counts,
-                    handed_on=mapped.handed_on,
+                    results=mapped.matched.counts,
+                    handed_on=mapped.mapped.handed_on,
                     external=external,
                     reconstructed=made,
                     weights=from_json(UsedWeights, weights.described(config)),
-                    looks=looks,
+                    looks=mapped.looks,
                     seconds=seconds,
                 ),
                 config=config,

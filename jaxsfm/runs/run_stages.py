@@ -91,13 +91,11 @@ class RunStages:
     options: RunOptions
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds; the stages add theirs."""
+    look: str = ""
+    """The end of the names of the stages' folders, so that several looks lie beside each other."""
 
-    def map(self, matched: MatchedPairs, *, again: bool) -> MappedRun:
-        """Map the pairs with inliers.
-
-        Args:
-          again: whether this is after the second look.
-        """
+    def map(self, matched: MatchedPairs) -> MappedRun:
+        """Map the pairs with inliers."""
         chosen = matched.with_inliers(self.options.best_pairs)
         ours = SavedMatches(matched.looks, chosen)
         matches = JoinedMatches(ours, self.external, {image.name for image in self.images})
@@ -119,7 +117,7 @@ class RunStages:
                 threads=options.threads,
             ),
         )
-        cache = StageCache(self.folder, key, "-again" if again else "")
+        cache = StageCache(self.folder, key, self.look)
         total, quiet = len(self.images), not options.progress
         with (
             timed(self.seconds, "mapping"),

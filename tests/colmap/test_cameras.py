@@ -75,12 +75,13 @@ def test_auto_separates_what_exif_tells_apart(tmp_path, other):
 
 
 def test_photos_without_exif_and_of_several_sizes_have_cameras_of_their_own(tmp_path, four):
-    names = [image.name for image in four]
-    assert shared([*four, photo(tmp_path / "e.jpg", size=(64, 96))]) == [
-        *([name] for name in names[:3]),
-        ["e.jpg"],
-        ["sub/d.jpg"],
-    ]
+    cameras = shared([*four, photo(tmp_path / "e.jpg", size=(100, 64))])
+    assert cameras == [["a.jpg"], ["b.jpg"], ["c.jpg"], ["e.jpg"], ["sub/d.jpg"]]
+
+
+def test_turned_photos_without_exif_share_a_camera_of_their_own(tmp_path, four):
+    cameras = shared([*four, photo(tmp_path / "e.jpg", size=SIZE[::-1])])
+    assert cameras == [["a.jpg", "b.jpg", "c.jpg", "sub/d.jpg"], ["e.jpg"]]
 
 
 def test_a_shared_camera_takes_its_focal_length_from_any_of_its_photos(tmp_path):
@@ -176,9 +177,7 @@ def test_turned_photos_fit_the_camera_of_the_others(tmp_path):
 def test_a_camera_that_cannot_be_turned_is_refused(tmp_path):
     known = Intrinsics(model="FOV", params=(90.0, 90.0, 48.0, 32.0, 0.5))
     image = photo(tmp_path / "a.jpg", {0x0112: 6}, size=SIZE[::-1])
-    with pytest.raises(
-        UserError, match="--intrinsics FOV: .*omega of this camera cannot be"
-    ):
+    with pytest.raises(UserError, match="--intrinsics FOV: .*omega of this camera cannot be"):
         Cameras(known=known).assigned([image])
 
 
