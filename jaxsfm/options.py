@@ -102,6 +102,8 @@ class ReconstructionChoice:
         the centre of the top-left pixel is (0, 0). MODEL:p1,p2,..: a COLMAP camera model with its
         parameters, in COLMAP's pixels, in which that centre is (0.5, 0.5). Without it, cameras are
         estimated.
+      masks: Folder with masks, images of the size of the photos. Black pixels are not used. The
+        mask of sub/a.jpg is sub/a.jpg.png.
       cameras: Which photos share a camera. single: all photos. folder: the photos of each
         sub-folder. photo: none. auto: those whose EXIF names the same camera, lens and focal
         length; photos of one size without any EXIF share one camera, too.
@@ -128,6 +130,7 @@ class ReconstructionChoice:
     retrieval: Retrieval = "vlad"
     best_pairs: int | None = None
     intrinsics: str | None = None
+    masks: Path | None = None
     cameras: CameraSharing = "auto"
     camera_model: str = "SIMPLE_RADIAL"
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto"

@@ -20,6 +20,7 @@ from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, shown_name, working_size
+from jaxsfm.io.masks import used_cells
 from jaxsfm.io.orientation import to_stored
 from jaxsfm.io.pixels import Pixels
 
@@ -116,6 +117,25 @@ def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
         fine=pad_octaves(dense.fine, 4 * num_coarse),
         keypoints=pad(dense.keypoints, 4 * num_coarse),
     )
+
+
+def without_unused(dense: DenseFeatures, used: np.ndarray) -> DenseFeatures:
+    """Features without those of unused pixels, whose descriptors become zero: they never match.
+
+    A fine cell goes if its keypoint is unused, a coarse cell if all its fine cells are.
+
+    Args:
+      dense: numpy arrays.
+      used: bool (h, w), of the image that was described.
+    """
+    (rows, columns), (coarse_rows, coarse_columns) = dense.fine_grid, dense.coarse_grid
+    cells = int(rows) * int(columns)
+    fine = used_cells(used, np.asarray(dense.keypoints[:cells])).reshape(rows, columns)
+    parts = fine[: 2 * coarse_rows, : 2 * coarse_columns]
+    coarse = parts.reshape(coarse_rows, 2, coarse_columns, 2).any((1, 3)).reshape(-1)
+    for keep, octaves in ((fine.reshape(-1), dense.fine), (coarse, dense.coarse)):
+        octaves[0][: len(keep)][~keep] = 0
+    return dense
 
 
 def total_memory() -> int | None:

@@ -24,6 +24,14 @@ from PIL import ExifTags, Image
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 from jaxsfm.io import orientation
+from jaxsfm.io.masks import (
+    MaskFile,
+    mask_path,
+    missing_masks,
+    open_mask,
+    read_mask,
+    without_blank_border,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -65,11 +73,13 @@ class ImageFile:
     taken_with: str = ""
     """The camera, its lens and its focal length, as EXIF names them; empty if EXIF names no camera.
     Photos of one zoom lens differ in the focal length."""
+    mask: MaskFile | None = None
+    """Says which pixels are used; None: all but a blank border."""
 
     @property
     def content(self) -> str:
-        """What the features of the photo depend on: its bytes, and how it is turned."""
-        return orientation.content(self.sha256, self.orientation)
+        """What the features of the photo depend on: its bytes, how it is turned, and its mask."""
+        return content(self.sha256, self.orientation, self.mask and self.mask.sha256)
 
     @property
     def upright_size(self) -> tuple[int, int]:
@@ -88,6 +98,46 @@ def orientations(images: Iterable[ImageFile]) -> dict[str, int]:
     return {i.name: i.orientation for i in images if i.orientation != upright}
 
 
+def content(sha256: str, turned: int, mask: str | None) -> str:
+    """What describes the used pixels of an upright photo.
+
+    Args:
+      sha256: of the photo's file.
+      turned: its orientation.
+      mask: the SHA-256 of the mask's file; None: no mask.
+    """
+    parts = [sha256]
+    if turned != orientation.UPRIGHT:
+        parts.append(f"turned {turned}")
+    if mask is not None:
+        parts.append(f"masked by {mask}")
+    return " ".join(parts)
+
+
+def masks_of(images: Iterable[ImageFile]) -> dict[str, str]:
+    """The SHA-256 of the images' masks, by the names of the images."""
+    return {image.name: image.mask.sha256 for image in images if image.mask is not None}
+
+
+def with_masks(images: Iterable[ImageFile], folder: Path) -> tuple[list[ImageFile], list[str]]:
+    """The images with their masks, and the names of those that have none.
+
+    Raises:
+      UserError: the folder has no mask of any image, or a mask cannot be used.
+    """
+    images = list(images)
+    bare = missing_masks(folder, [image.name for image in images])
+
+    paths = {i.name: None if i.name in set(bare) else mask_path(folder, i.name) for i in images}
+    return [with_mask(image, paths[image.name]) for image in images], bare
+
+
+def with_mask(image: ImageFile, path: Path | None) -> ImageFile:
+    """The image with the mask at a path, if there is one; UserError if it cannot be used."""
+    mask = None if path is None else open_mask(path, image.size)
+    return dataclasses.replace(image, mask=mask)
+
+
 class WorkingImage(NamedTuple):
     """The pixels of an image at working size."""
 
@@ -96,6 +146,8 @@ class WorkingImage(NamedTuple):
     scale: tuple[float, float]
     """Original pixels per working pixel, (x, y); of an upright photo, in pixels of the upright
     original."""
+    used: np.ndarray | None = None
+    """bool (height, width): the pixels that are used; None: all."""
 
 
 def find_images(folder: Path) -> list[str]:
@@ -325,8 +377,10 @@ def read_image(
     ImageError if the file cannot be decoded, or a side would be shorter than `MIN_SIDE`.
     """
     rgb, size = _decode(image), image.size
+    used = _mask_of(image)
     if upright:
         rgb, size = orientation.upright(rgb, image.orientation), image.upright_size
+        used = None if used is None else orientation.upright(used, image.orientation)
     width, height = working_size(size, max_size, enlarge)
     if min(width, height) < MIN_SIDE:
         raise ImageError(
@@ -337,4 +391,30 @@ def read_image(
         larger = width > size[0]
         how = cv2.INTER_CUBIC if larger else cv2.INTER_AREA
         rgb = cv2.resize(rgb, (width, height), interpolation=how)
-    return WorkingImage(rgb=np.ascontiguousarray(rgb), scale=(size[0] / width, size[1] / height))
+    return WorkingImage(
+        rgb=np.ascontiguousarray(rgb),
+        scale=(size[0] / width, size[1] / height),
+        used=_used(rgb, used),
+    )
+
+
+def _mask_of(image: ImageFile) -> np.ndarray | None:
+    try:
+        return None if image.mask is None else read_mask(image.mask)
+    except UserError as error:
+        raise ImageError(f"{shown_name(image.name)}: {error}") from error
+
+
+def _used(rgb: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
+    """The used pixels of a working image.
+
+    Args:
+      mask: bool, the used pixels of the original. A working pixel is used if all of its part is.
+    """
+    inside = without_blank_border(rgb)
+    if mask is None:
+        return inside
+    height, width = rgb.shape[:2]
+    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    whole = share > 0.999
+    return whole if inside is None else whole & inside

@@ -75,8 +75,3 @@ def quarters_between(before: int, after: int) -> int:
         if turned(before, quarters) == after:
             return quarters
     raise ValueError(f"codes must differ by a turn; got {before} and {after}")
-
-
-def content(sha256: str, orientation: int) -> str:
-    """What describes the pixels of an upright photo: its file's SHA-256 and how it is turned."""
-    return sha256 if orientation == UPRIGHT else f"{sha256} turned {orientation}"

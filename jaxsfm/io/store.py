@@ -17,14 +17,15 @@ from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, read_json, save_arrays, write_atomic
 from jaxsfm.io.features import ImageFeatures
-from jaxsfm.io.images import DamagedImage, ImageError, ImageFile
-from jaxsfm.io.orientation import checked, content
+from jaxsfm.io.images import DamagedImage, ImageError, ImageFile, content
+from jaxsfm.io.orientation import checked
 from jaxsfm.io.pairs import Pair, PairResult
 
 Identity = Mapping[str, Json]
 """What the matches of a run depend on: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
-`config` (`Config.matching`), `seed`, `images` (name -> SHA-256), and `orientations` of those that
-are not stored upright (name -> code of `jaxsfm.io.orientation`)."""
+`config` (`Config.matching`), `seed`, `images` (name -> SHA-256), `orientations` of those that are
+not stored upright (name -> code of `jaxsfm.io.orientation`), and `masks` (name of the photo ->
+SHA-256)."""
 
 _OCTAVES = ("coarse", "fine")
 """The fields of DenseFeatures that hold one array for each octave."""
@@ -156,8 +157,11 @@ class Store:
 
     def _match_path(self, pair: Pair) -> Path:
         images = self._setting("images")
-        turned = self._setting("orientations")
-        contents = [content(str(images.get(n)), checked(turned.get(n))) for n in pair]
+        turned, masks = self._setting("orientations"), self._setting("masks")
+        contents = [
+            content(str(images.get(name)), checked(turned.get(name)), _text(masks.get(name)))
+            for name in pair
+        ]
         return self._file(
             "matches", self.identity.get("config"), self.identity.get("seed"), contents
         )
@@ -187,6 +191,10 @@ class Store:
         except (KeyError, ValueError, TypeError):
             return None
         return result if _are_matches(result) else None
+
+
+def _text(value: Json) -> str | None:
+    return value if isinstance(value, str) else None
 
 
 def _is(array: Array | np.ndarray, dtype: type, *shape: int) -> bool:

@@ -17,7 +17,13 @@ from jaxsfm.core.features import Extraction, Walk
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.io.compiled_programs import announce_compilation
-from jaxsfm.io.features import ImageFeatures, check_memory, feature_capacity, padded_size
+from jaxsfm.io.features import (
+    ImageFeatures,
+    check_memory,
+    feature_capacity,
+    padded_size,
+    without_unused,
+)
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import (
@@ -147,6 +153,8 @@ def _results(
             yield image, each
         else:
             own = jax.tree.map(lambda x, k=k: x[k].copy(), dense)  # not a view of the whole batch
+            if each.used is not None:
+                own = without_unused(own, each.used)
             yield image, ImageFeatures(image, each.scale, own)
             k += 1
 

@@ -222,8 +222,9 @@ def _now() -> str:
 def _recorded_options(config: Config, options: RunOptions) -> RecordedOptions:
     plain = dataclasses.asdict(options) | {"config": dataclasses.asdict(config)}
     del plain["progress"]
-    if options.reference is not None:  # to be found from any working directory
-        plain["reference"] = options.reference.absolute()
+    for name in ("reference", "masks"):  # to be found from any working directory
+        path = getattr(options, name)
+        plain[name] = path and path.absolute()
     return from_json(RecordedOptions, json.loads(json.dumps(plain, default=str)))
 
 

@@ -14,7 +14,7 @@ from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageFile, orientations
+from jaxsfm.io.images import ImageFile, masks_of, named, orientations, with_masks
 from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.weights import chosen_weights
@@ -72,6 +72,10 @@ def reconstruct_folder(
     selection = parse_pair_selection(options.pairs)
     pairs = selected_pairs(selection, (image.name for image in usable), names)
     _check_enough(images, usable, skipped)
+    if options.masks is not None:
+        usable, bare = with_masks(usable, options.masks)
+        if bare:
+            logger.warning("%s: no mask in %s, so all of it is used", named(bare), options.masks)
     cameras = Cameras(known=intrinsics, sharing=options.cameras, model=options.camera_model)
     cameras.check_fits(usable)
     external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
@@ -87,6 +91,7 @@ def reconstruct_folder(
         seed=options.seed,
         images={image.name: image.sha256 for image in usable},
         orientations=orientations(usable),
+        masks=masks_of(usable),
     )
     seconds: dict[str, float] = {}
     with open_folder(out, to_json(identity)) as folder:

@@ -11,6 +11,7 @@ from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.mapper import MapOptions
 from jaxsfm.colmap.model_folders import colour_points, write_models
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.io.images import WorkingImage
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)
 
@@ -60,7 +61,7 @@ def test_a_point_has_the_colour_of_the_pixels_under_it(scene, scale):
             for shared in ids if len(ids) > 1 else ():
                 lone[shared] = False  # two points on one pixel
     model = pycolmap.Reconstruction(scene.truth)
-    colour_points(model, lambda name: (photos[name], scale))
+    colour_points(model, lambda name: WorkingImage(photos[name], scale))
     checked = [p for p in model.points3D if lone.get(p, True)]
     assert len(checked) > 100
     for point_id in checked:
