@@ -126,7 +126,7 @@ def test_a_mask_that_is_gone_or_has_changed_is_an_error_of_its_photo(tmp_path, c
         read_image(image, max_size=90)
 
 
-# -- blank borders ----------------------------------------------------------------------------------
+# -- blank borders ---------------------------------------------------------------------------------
 
 
 def rectified(value: int = 0) -> np.ndarray:
