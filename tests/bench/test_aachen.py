@@ -123,7 +123,12 @@ def test_databases_hold_the_known_camera_of_each_photo(folder, tmp_path):
     write_database(tmp_path / "ours.db", images, {}, Cameras(known=made.camera))
     verification = VerificationOptions(threads=1)
     write_rootsift_database(
-        tmp_path / "rootsift.db", made.folder, images, made.camera, verification, pairs=[]
+        tmp_path / "rootsift.db",
+        made.folder,
+        images,
+        Cameras(known=made.camera),
+        verification,
+        pairs=[],
     )
     for name in ("ours.db", "rootsift.db"):
         found = read_images(tmp_path / name)
