@@ -17,10 +17,12 @@ from jaxsfm.colmap.intrinsics import (
     camera_of,
     check_fits,
     check_one_size,
+    is_turned,
     sizes_of,
 )
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, shown_name
+from jaxsfm.io.orientation import QUARTERS
 from jaxsfm.options import CameraSharing
 
 GUESSED_FOCAL = 1.2
@@ -58,16 +60,17 @@ class Cameras:
           UserError: a known camera does not fit its photos, or COLMAP does not accept it.
         """
         ordered = sorted(images, key=lambda image: image.name)
-        one_source = _from_one_source(ordered)
+        one_source, upright = _from_one_source(ordered), _pixels_were_turned(ordered)
         together: dict[object, list[ImageFile]] = {}
         for image in ordered:
-            together.setdefault(self._key(image, one_source), []).append(image)
-        return [(self._camera(group), group) for group in together.values()]
+            key = self._key(image, one_source), image.orientation if upright else None
+            together.setdefault(key, []).append(image)
+        return [(self._camera(group, upright), group) for group in together.values()]
 
     def _key(self, image: ImageFile, one_source: bool) -> object:
-        """Photos with equal keys share a camera."""
+        """Photos with equal keys share a camera, unless their pixels were turned differently."""
         if isinstance(self.known, Intrinsics):
-            return camera_of(self.known, image), image.size
+            return image.size, image.orientation if is_turned(self.known, image) else None
         if self.known is not None:
             return image.name
         match self.sharing:
@@ -81,11 +84,24 @@ class Cameras:
                 told = image.taken_with or one_source
                 return (image.taken_with, image.size) if told else image.name
 
-    def _camera(self, group: Sequence[ImageFile]) -> pycolmap.Camera:
+    def _camera(self, group: Sequence[ImageFile], upright: bool) -> pycolmap.Camera:
         """The camera of photos that share it: from EXIF if one of them has a focal length."""
         if self.known is not None:
-            return accepted(camera_of(self.known, group[0]).camera(group[0].size), group[0])
+            known = camera_of(self.known, group[0], upright=upright)
+            return accepted(known.camera(group[0].size), group[0])
         return estimated_camera(group, self.model)
+
+
+def _pixels_were_turned(images: Sequence[ImageFile]) -> bool:
+    """Whether a program has turned the pixels of some photos of one camera, and noted it.
+
+    A camera stores the rows of its sensor, however it is held. Then all photos have one size as
+    they are stored, and a known camera is that of the stored pixels. If they have one size only
+    when they are upright, it is that of the upright photos.
+    """
+    stored, upright = {i.size for i in images}, {i.upright_size for i in images}
+    codes = {image.orientation for image in images}
+    return len(upright) == 1 < len(stored) and codes <= set(QUARTERS)
 
 
 def _from_one_source(images: Sequence[ImageFile]) -> bool:

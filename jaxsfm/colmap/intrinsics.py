@@ -74,21 +74,21 @@ KnownCameras = Intrinsics | Mapping[str, Intrinsics]
 """One camera of all images, or the cameras of all images by their names."""
 
 
-def camera_of(known: KnownCameras, image: ImageFile) -> Intrinsics:
-    """The known camera of the pixels of an image as they are stored."""
+def camera_of(known: KnownCameras, image: ImageFile, *, upright: bool = False) -> Intrinsics:
+    """The known camera of the pixels of an image as they are stored.
+
+    Args:
+      upright: whether one known camera is that of the upright image, in any case.
+    """
     if not isinstance(known, Intrinsics):
         return known[image.name]
-    if _is_turned(known, image):
+    if upright or is_turned(known, image):
         return known.turned(image.size, image.orientation)
     return known
 
 
-def _is_turned(camera: Intrinsics, image: ImageFile) -> bool:
-    """Whether the image has the camera's size only when it is upright.
-
-    Cameras store the rows of their sensor, so that the known camera is that of the stored pixels.
-    But some programs turn the pixels of a photo and note how to turn them back.
-    """
+def is_turned(camera: Intrinsics, image: ImageFile) -> bool:
+    """Whether the image has the camera's size only when it is upright."""
     if image.orientation not in QUARTERS or image.upright_size == image.size:
         return False
     known = camera.camera(image.size)
@@ -103,7 +103,7 @@ def sizes_of(known: KnownCameras, images: Iterable[ImageFile]) -> dict[str, tupl
     """(width, height) of images as their known cameras saw them, by name."""
     return {
         image.name: image.upright_size
-        if isinstance(known, Intrinsics) and _is_turned(known, image)
+        if isinstance(known, Intrinsics) and is_turned(known, image)
         else image.size
         for image in images
     }

@@ -161,6 +161,19 @@ def test_a_known_camera_is_that_of_the_stored_pixels(tmp_path, code):
     assert tuple(camera.params) == TANGENTIAL.params
 
 
+def test_where_pixels_were_turned_the_camera_is_that_of_the_upright_photos(tmp_path):
+    """A photo that was turned by 180 degrees has the size of the others."""
+    images = [
+        photo(tmp_path / "a.jpg"),
+        photo(tmp_path / "b.jpg", {0x0112: 6}, size=SIZE[::-1]),
+        photo(tmp_path / "c.jpg", {0x0112: 3}),
+    ]
+    assert shared(images, known=TANGENTIAL) == [["a.jpg"], ["b.jpg"], ["c.jpg"]]
+    assert shared(images) == [["a.jpg"], ["b.jpg"], ["c.jpg"]]
+    cameras = [camera for camera, _ in Cameras(known=TANGENTIAL).assigned(images)]
+    assert tuple(cameras[2].params) == TANGENTIAL.turned(SIZE, 3).params != TANGENTIAL.params
+
+
 def test_turned_photos_fit_the_camera_of_the_others(tmp_path):
     images = [
         photo(tmp_path / "a.jpg"),
