@@ -28,6 +28,7 @@ from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
+from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.runs.job import Job, pairs_without
 from jaxsfm.runs.matching_looks import (
     MatchedPairs,
@@ -80,6 +81,7 @@ def reconstruct_folder(
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
+    measured = measured_positions(options.georeference, usable)
     external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
     weights = chosen_weights(options.network, config.backbone)
     if selection.retrieval:
@@ -124,6 +126,7 @@ def reconstruct_folder(
             external=external,
             config=config,
             options=options,
+            measured=measured,
             seconds=seconds,
         )
         matched = MatchedPairs(Looks(look.store), look.config, counts)
@@ -144,7 +147,7 @@ def reconstruct_folder(
             if not looks.in_vain:
                 matched, mapped = matched_again, mapped_again
         with folder.publish() as target:
-            made = stages.refine(mapped, target)
+            made, moved = stages.refine(mapped, target)
             report = run_report(
                 StageResults(
                     folder=images,
@@ -155,6 +158,7 @@ def reconstruct_folder(
                     handed_on=mapped.handed_on,
                     external=external,
                     reconstructed=made,
+                    georeference=moved,
                     weights=from_json(UsedWeights, weights.described(config)),
                     looks=looks,
                     seconds=seconds,
