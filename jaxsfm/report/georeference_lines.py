@@ -65,12 +65,15 @@ def _model_lines(found: Georeference, best: Placement) -> list[str]:
             + "; the direction is not certain"
             * (sigma.turn_deg > MAX_TURN_DEG)
         )
-    for row in [row for row in best.anchors if not row.used][:MAX_NAMED]:
+    wrong = [row for row in best.anchors if not row.used]
+    for row in wrong[:MAX_NAMED]:
         x, y, z = row.residual
         lines.append(
             f"outlier          {shown_name(row.name)}: {(x * x + y * y + z * z) ** 0.5:.2f} m from "
             "where the others put it; not used"
         )
+    if len(wrong) > MAX_NAMED:
+        lines.append(f"outliers         {len(wrong) - MAX_NAMED} more are in report.json")
     for row in best.anchors:
         for photo, px in row.errors_px.items():
             if px > FAR_PX:
