@@ -19,6 +19,7 @@ from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import model_poses, read_model, read_poses
 from jaxsfm.io.images import inspect_image
 from jaxsfm.report.finished_run import read_run
+from jaxsfm.report.page.write import page
 from jaxsfm.report.scene import shown_scene
 from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.sfm import reconstruction
@@ -82,8 +83,8 @@ def test_the_report_says_how_and_how_well(placed):
     assert [row["name"] for row in model["anchors"]] == sorted(placed.report["models"][0]["images"])
     assert 0 < model["residual"]["total"] < METRES * POSITION
     assert model["held_out"] is None  # two positions determine no move
-    page = (placed.run / "report.html").read_text()
-    assert 'id="where"' in page and "Moved onto: 3 of 3 positions" in page
+    shown = (placed.run / "report.html").read_text()
+    assert 'id="where"' in shown and "Moved onto: 3 of 3 positions" in shown
 
 
 def test_the_errors_against_a_reference_do_not_depend_on_the_move(placed, plain, scene, tmp_path):
@@ -122,6 +123,7 @@ def test_the_page_shows_the_model_as_it_stands(placed):
     stands = np.asarray([view.centre for view in run.model.views])
     shown = np.asarray([camera.pose.centre for camera in shown_scene(run).cameras])
     np.testing.assert_allclose(shown - shown[0], stands - stands[0], atol=1e-9)
+    assert "in metres, and the third one points up" in page(run)
 
 
 @pytest.mark.parametrize("to", ["colmap", "colmap-text", "nerfstudio", "bundler", "openmvg"])
