@@ -117,6 +117,10 @@ class ReconstructionChoice:
         same command gives the same model, byte for byte.
       reference: Reference poses (Strecha .camera files or a COLMAP model) that the model is
         compared with.
+      georeference: What the model is moved onto, so that it is in metres (east, north, up). gps:
+        the GPS positions in the photos. FILE: a table of camera positions or of ground control
+        points (docs/guide/georeference.md). off: nothing. auto: gps, if at least three photos of
+        the model have a position, and these positions determine the move well.
       with_database: COLMAP database of the same photos, made by another tool. Its matches are
         mapped together with those of jaxsfm.
       with_hloc: The features.h5 and matches.h5 that hloc wrote for the same photos. Its matches
@@ -138,6 +142,7 @@ class ReconstructionChoice:
     seed: int = 0
     threads: int = -1
     reference: Path | None = None
+    georeference: str = "auto"
     with_database: Path | None = None
     with_hloc: tuple[Path, Path] | None = None
     keep_features: bool = False

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 Format = Literal["hloc", "colmap", "colmap-text", "ply", "bundler", "nvm", "openmvg", "nerfstudio"]
 FILES = {"ply": ".ply", "nvm": ".nvm"}
 """The formats that are a single file, and how its name ends. The others are folders."""
+GEOREFERENCE = "georeference.json"
+"""The file beside an exported model that says where it is: report.json's `georeference`."""
 
 
 def export(
@@ -72,6 +74,8 @@ def export(
             _write_nerfstudio(fresh, _model(run), images, copy_images)
         else:
             _write_model(fresh, _model(run), to)
+        if to not in FILES and to != "hloc":
+            _write_georeference(fresh, run)
     print(f"{to}: {out}")
     return 0
 
@@ -155,6 +159,23 @@ def _write_model(
         model.write_text(fresh)
     else:
         assert_never(to)
+
+
+def _write_georeference(folder: Path, run: Path) -> None:
+    """Write where the model is on the Earth beside it, if the run says so."""
+    import json
+
+    from jaxsfm.report.run_report import read_part
+    from jaxsfm.report.typed_json import to_json
+    from jaxsfm.sfm.georeference.georeference import Georeference
+
+    try:
+        found = read_part(run, Georeference, "georeference")
+    except UserError:  # the folder is not a run's, or the run was not moved
+        return
+    if found.models and found.models[0].similarity is not None:
+        text = json.dumps(to_json(found) | {"models": [to_json(found.models[0])]}, indent=1)
+        (folder / GEOREFERENCE).write_text(text, encoding="utf-8")
 
 
 def _write_hloc(folder: Path, run: Path, matches: Literal["all", "verified"]) -> None:

@@ -61,6 +61,7 @@ def reconstruct(
     For example
         $ jaxsfm reconstruct PHOTOS --out OUT
         $ jaxsfm reconstruct PHOTOS --out OUT --intrinsics K.txt --preset robust
+        $ jaxsfm reconstruct PHOTOS --out OUT --georeference gcp_list.txt
 
     The exit status is 0 for a model, 1 if no model could be built, and 3 for a model that may be
     wrong: its verdict, in the summary and in the report, is amber or red.

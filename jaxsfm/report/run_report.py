@@ -30,6 +30,7 @@ from jaxsfm.report.run_results import (
 )
 from jaxsfm.report.typed_json import OMITTED, Count, Misfit, Number, Range, T, from_json, to_json
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck, VerdictColour
+from jaxsfm.sfm.georeference.georeference import Georeference
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 FILE = "report.json"
@@ -85,6 +86,9 @@ class RunReport:
     """One for each model; None for a model that was not refined."""
     checks: list[ModelCheck | None] = field(default_factory=list)
     """One for each model; None for a model that was not checked. Empty after `jaxsfm extend`."""
+    georeference: Georeference | None = field(default=None, metadata=OMITTED)
+    """How the models were moved into metres; None if nothing was measured, or it was not asked
+    for."""
     view_graph: ViewGraph = field(default_factory=ViewGraph)
     lost: list[LostPhoto]
     """Sorted by name."""
@@ -98,6 +102,12 @@ class RunReport:
     """Why the model could not be compared with the reference poses."""
     extended: list[Extension] | None = field(default=None, metadata=OMITTED)
     """Calls of `jaxsfm extend` since the run."""
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether the best model was moved into metres."""
+        found = self.georeference
+        return found is not None and bool(found.models) and found.models[0].similarity is not None
 
     @property
     def checked(self) -> list[tuple[int, ModelCheck]]:

@@ -1,6 +1,7 @@
 """A model as it is shown: upright and without far points.
 
-If there are reference poses, the model is in their units.
+If there are reference poses, the model is in their units. A model that was moved into metres keeps
+its directions.
 """
 
 from typing import NamedTuple
@@ -101,7 +102,8 @@ def shown_scene(run: FinishedRun) -> Scene:
     to_reference = run.reference.similarity if run.reference else own
     poses = [_moved(CameraPose(v.rotation, v.centre), to_reference) for v in model.views]
     # The float32 of a browser has too few digits for geographic coordinates: move to the origin.
-    upright = _upright(poses)
+    known = run.report.in_metres and run.reference is None
+    upright = np.eye(3) if known else _upright(poses)
     turn = Similarity(1.0, upright, -upright @ np.mean([p.centre for p in poses], axis=0))
     corners = [_corners(view) for view in model.views]
 

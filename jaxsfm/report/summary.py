@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from jaxsfm.io.images import named, shown_name
 from jaxsfm.io.pairs import describe
+from jaxsfm.report.georeference_lines import georeference_lines
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import EvaluationReport, LostPhoto, ViewGraph
 from jaxsfm.report.verdict import model_verdicts, verdict_lines
@@ -136,6 +137,7 @@ def summary_lines(report: RunReport) -> list[str]:
     refinement = report.refinement[0] if report.refinement else None
     if refinement and refinement.passes:
         lines += refinement_lines(refinement)
+    lines += georeference_lines(report.georeference)
     lines += verdict_lines(model_verdicts(report.checked))
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in report.seconds.items()))
     if pairs.overflowed:

@@ -31,6 +31,7 @@ from jaxsfm.report.run_results import ModelRow, PairRow, TriedPairs
 from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.runs.working_model import CameraPrior
+from jaxsfm.sfm.georeference.georeference import Georeference
 from jaxsfm.sfm.reconstruction import Reconstructed
 from jaxsfm.sfm.register.grow import ExtendedModel
 from jaxsfm.sfm.view_graph import Verdict
@@ -56,6 +57,8 @@ class StageResults:
     external: ExternalMatches
     """The matches of another tool, mapped together with ours."""
     reconstructed: Reconstructed
+    georeference: Georeference | None
+    """How the models were moved into metres."""
     weights: UsedWeights
     looks: UsedLooks | None
     seconds: dict[str, float]
@@ -107,6 +110,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         mapping=made.mapping.attempts,
         refinement=made.refinement,
         checks=made.mapping.checks,
+        georeference=stages.georeference,
         lost=[],
         seconds=stages.seconds,
     )

@@ -28,6 +28,7 @@ from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
+from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.runs.job import Job, pairs_without
 from jaxsfm.runs.mapping_looks import RunPhotos, map_in_looks
 from jaxsfm.runs.matching_looks import timed
@@ -78,6 +79,7 @@ def reconstruct_folder(
             logger.warning("%s: no mask in %s, so all of it is used", named(bare), options.masks)
     cameras = Cameras(known=intrinsics, sharing=options.cameras, model=options.camera_model)
     cameras.check_fits(usable)
+    measured = measured_positions(options.georeference, usable)
     external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
     weights = chosen_weights(options.network, config.backbone)
     if selection.retrieval:
@@ -125,11 +127,12 @@ def reconstruct_folder(
             external=external,
             config=config,
             options=options,
+            measured=measured,
             seconds=seconds,
         )
         mapped = map_in_looks(photos.without(lost), matched, stages)
         with folder.publish() as target:
-            made = stages.refine(mapped.mapped, target)
+            made, moved = stages.refine(mapped.mapped, target)
             report = run_report(
                 StageResults(
                     folder=images,
@@ -140,6 +143,7 @@ def reconstruct_folder(
                     handed_on=mapped.mapped.handed_on,
                     external=external,
                     reconstructed=made,
+                    georeference=moved,
                     weights=from_json(UsedWeights, weights.described(config)),
                     looks=mapped.looks,
                     seconds=seconds,

@@ -11,6 +11,7 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import ExternalMatches, JoinedMatches
 from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.colmap.pose_priors import write_pose_priors
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.looks import SavedMatches
@@ -19,6 +20,7 @@ from jaxsfm.io.store import digest
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.runs.matching_looks import MatchedPairs, timed
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.georeference.georeference import Georeference, MeasuredPositions, move_models
 from jaxsfm.sfm.mapping import green
 from jaxsfm.sfm.reconstruction import (
     MappedStage,
@@ -89,6 +91,8 @@ class RunStages:
     external: ExternalMatches
     config: Config
     options: RunOptions
+    measured: MeasuredPositions | None
+    """What the models are moved onto after the refinement; None: they are not moved."""
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds; the stages add theirs."""
     look: str = ""
@@ -132,8 +136,8 @@ class RunStages:
             bar.update(max(map(len, mapped.photos), default=0) - bar.n)
         return mapped
 
-    def refine(self, mapped: MappedRun, target: Path) -> Reconstructed:
-        """Refine the models, and write the database and the models into `target`."""
+    def refine(self, mapped: MappedRun, target: Path) -> tuple[Reconstructed, Georeference | None]:
+        """Refine and move the models, and write the database and the models into `target`."""
         passes = self.config.refinement.passes if self.config.refinement else 0
         quiet = not (self.options.progress and passes)
         taken: dict[str, float] = {}
@@ -149,6 +153,21 @@ class RunStages:
             made = refine_mapped(mapped.given, mapped.stage, database, mapped.cache, on_pass)
         if passes:
             self.seconds.update(taken)
+        moved = self._move(made, database)
         write_models(made.models, target / "sparse")
         write_models(made.alternative, target / "alternative")
-        return made
+        return made, moved
+
+    def _move(self, made: Reconstructed, database: Path) -> Georeference | None:
+        """Move the models onto the measured positions, which become COLMAP's pose priors.
+
+        This is the last step: the stages before it keep their models in the frame of the mapper, so
+        they hold for other positions too.
+        """
+        measured = self.measured
+        if measured is None:
+            return None
+        geographic = measured.system.kind == "geographic"
+        priors = measured.positions if geographic else measured.local(measured.frame())
+        write_pose_priors(database, priors, geographic=geographic)
+        return move_models(made.models, measured) if made.models else None

@@ -139,8 +139,14 @@ class Similarity(NamedTuple):
         centre = self.scale * self.rotation @ pose.centre + self.translation
         return CameraPose(pose.rotation @ self.rotation.T, centre)
 
+    def moved_points(self, points: np.ndarray) -> np.ndarray:
+        """Points (n, 3) after the map."""
+        return self.scale * points @ self.rotation.T + self.translation
 
-def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
+
+def umeyama(
+    source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
+) -> Similarity:
     """The similarity that takes `source` to `target` with the least squared error.
 
     It is computed here because `estimate_sim3d` of pycolmap 4.2 gives nothing for points on a plane
@@ -150,14 +156,17 @@ def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity:
 
     Args:
       source, target: float64 (n, 3), not on one line.
+      weights: float64 (n,), of the squared errors; default: all 1.
     """
-    mean0, mean1 = source.mean(0), target.mean(0)
+    share = np.ones(len(source)) if weights is None else weights
+    share = (share / share.sum())[:, None]
+    mean0, mean1 = (share * source).sum(0), (share * target).sum(0)
     a, b = source - mean0, target - mean1
-    u, d, vt = np.linalg.svd(b.T @ a)
+    u, d, vt = np.linalg.svd((share * b).T @ a)
     sign = np.ones(3)
     sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     rotation = (u * sign) @ vt
-    scale = float((d * sign).sum() / (a**2).sum())
+    scale = float((d * sign).sum() / (share * a**2).sum())
     return Similarity(scale, rotation, mean1 - scale * rotation @ mean0)
 
 

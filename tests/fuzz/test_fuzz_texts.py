@@ -10,6 +10,7 @@ from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.io.pairs import read_pairs
+from jaxsfm.io.position_tables import read_position_table
 
 NAMES = ["a.jpg", "b c.jpg", "sub/d.jpg", "\u65e5.png", "#e.jpg"]
 PAIRS = "# pairs\na.jpg sub/d.jpg\na.jpg b c.jpg\n\u65e5.png\ta.jpg\n\nb c.jpg\tsub/d.jpg\n"
@@ -31,6 +32,12 @@ SUBSETS = "# subsets\nquery/night/n.jpg db/1.jpg db/2.jpg\n"
 NVM = (
     "NVM_V3\n\n2\ndb/1.jpg 600 0.8 0.6 0 0 1.5 -2 0.25 0 0\n"
     "db/2.jpg 600 1 0 0 0 2.5 -2 0.25 -0.1 0\n\n0\n"
+)
+TABLES = (
+    "image,lat,lon,alt\na.jpg,46.5,-91.25,198\nb c.jpg,46.6,-91.5,200.5\n",
+    "point;x;y;z;image;px;py\nA;1;2;3;a.jpg;4;5\nA;1;2;3;b c.jpg;6;7.5\n",
+    "WGS84 UTM 32N\n500010.5 5000020.25 312 100.5 200 a.jpg P1\n500010 5000020 nan 1 2 b.jpg\n",
+    "EPSG:4326\na.jpg -91.9942 46.8425 198.6 0 0 0 0.03\nb.jpg 7 45\n",
 )
 TURN = "0.8 0.6 0\n-0.6 0.8 0\n0 0 1"
 CAMERA = f"{K}\n0 0 0\n{TURN}\n1.5 -2 0.25\n640 480\n"
@@ -105,9 +112,27 @@ def aachen_file(rng, folder) -> str:
     return how
 
 
+def position_table(rng, folder) -> str:
+    path = folder / "positions.txt"
+    path.write_bytes(damaged_text(TABLES[rng.integers(len(TABLES))], rng))
+    how, found = outcome(lambda: read_position_table(path), "--georeference")
+    if how == "read":
+        given = [*found.positions.values(), *(point.position for point in found.points)]
+        assert all(np.isfinite([at.x, at.y, at.z or 0, at.deviation or 1]).all() for at in given)
+        assert all(np.isfinite([s.x, s.y]).all() for point in found.points for s in point.seen)
+    return how
+
+
 def text(rng, folder) -> str:
-    """One of the five kinds."""
-    kinds = [pairs, intrinsics_file, intrinsics_option, camera_file, aachen_file]
+    """One of the six kinds."""
+    kinds = [
+        pairs,
+        intrinsics_file,
+        intrinsics_option,
+        camera_file,
+        aachen_file,
+        position_table,
+    ]
     return kinds[rng.integers(len(kinds))](rng, folder)
 
 

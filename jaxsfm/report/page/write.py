@@ -14,6 +14,7 @@ from jaxsfm.io.images import MOST_NAMED, named, shown_name
 from jaxsfm.io.pairs import describe
 from jaxsfm.io.work_folder import PAGE
 from jaxsfm.report.finished_run import FinishedRun, read_run
+from jaxsfm.report.georeference_lines import georeference_lines, words_of
 from jaxsfm.report.page.close_ups import SIDE, close_ups
 from jaxsfm.report.page.error_figures import cumulative_figure, reprojection_figure, track_figure
 from jaxsfm.report.page.figures import BLUE, GREEN, Figure, count, duration, figures3
@@ -27,10 +28,13 @@ from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.scene import shown_scene
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.report.verdict import model_verdicts
+from jaxsfm.sfm.georeference.placement import AnchorRow
 
 MAX_FINDINGS = 5
 """The number of findings of each kind that the page lists for each model. Fifteen second places of
 a rendered box filled the first screen."""
+MAX_ANCHORS = 60
+"""The number of measured positions in the table, those that are the furthest off."""
 _ENVIRONMENT = jinja2.Environment(
     loader=jinja2.PackageLoader("jaxsfm.report.page", "."),
     autoescape=True,
@@ -85,11 +89,19 @@ def _options(options: object, prefix: str = "") -> list[tuple[str, str]]:
     return [(prefix.removesuffix("."), "-" if options is None else str(options))]
 
 
+def _anchors(report: RunReport) -> list[AnchorRow]:
+    """The measured positions of the best model, those that are the furthest off first."""
+    found = report.georeference
+    rows = found.models[0].anchors if found and found.models else []
+    return sorted(rows, key=lambda row: -sum(each * each for each in row.residual))
+
+
 def page(run: FinishedRun) -> str:
     """The report as HTML that needs nothing from outside."""
     report, images = run.report, run.photos.folder
     names = photo_names(report)
     pictures, photos = pair_pictures(run)
+    anchors = _anchors(report)
     return _ENVIRONMENT.get_template("page.html").render(
         title=shown_name(run.folder.absolute().name),
         plotly=Markup(plotly.offline.get_plotlyjs()),
@@ -98,6 +110,9 @@ def page(run: FinishedRun) -> str:
         most_findings=MAX_FINDINGS,
         named_photos=MOST_NAMED,
         reference=run.reference,
+        georeference=[words_of(line) for line in georeference_lines(report.georeference)],
+        anchors=anchors[:MAX_ANCHORS],
+        anchors_left_out=len(anchors[MAX_ANCHORS:]),
         figures=dict(_figures(run, names)),
         pictures=pictures,
         photos=photos,

@@ -1,0 +1,247 @@
+"""Files of measured positions: where cameras stood, or where points on the ground are.
+
+Two layouts are read. OpenDroneMap's text files (gcp_list.txt, geo.txt) begin with a line that names
+the coordinate system; fields are separated by blanks. A CSV file begins with the names of its
+columns; a line that names the coordinate system may come before them. See docs/formats.md.
+
+Source: https://docs.opendronemap.org/gcp/ and https://docs.opendronemap.org/geo/.
+"""
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import shown_name
+from jaxsfm.io.pairs import listed_lines
+
+OPTION = "--georeference"
+WGS84 = "EPSG:4326"
+"""The coordinate system of latitude and longitude that GPS uses."""
+_DELIMITERS = ",;\t"
+
+
+class Position(NamedTuple):
+    """A measured position of a camera."""
+
+    x: float
+    """East: metres, or the longitude in degrees."""
+    y: float
+    """North: metres, or the latitude in degrees."""
+    z: float | None
+    """Up, metres; None if it was not measured."""
+    deviation: float | None = None
+    """The expected horizontal error, metres; None if it is not known."""
+
+    @property
+    def full(self) -> bool:
+        """Whether the height was measured."""
+        return self.z is not None
+
+
+class Measurement(NamedTuple):
+    """Where a photo shows a control point."""
+
+    image: str
+    """The name of the photo, as the file writes it."""
+    x: float
+    """Original pixels; the centre of the top-left pixel is (0, 0)."""
+    y: float
+    line: int
+    """The line of the file, for messages."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlPoint:
+    """A point with a measured position, and the photos that show it."""
+
+    name: str
+    position: Position
+    seen: list[Measurement] = field(default_factory=list)
+
+    @property
+    def photos(self) -> list[str]:
+        """The names of the photos that show it."""
+        return [each.image for each in self.seen]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionTable:
+    """What a file of positions holds: positions of photos, or control points."""
+
+    system: str | None
+    """The coordinate system as the file names it; None for metres along any three axes."""
+    positions: dict[str, Position] = field(default_factory=dict)
+    """By the name of the photo, as the file writes it."""
+    points: list[ControlPoint] = field(default_factory=list)
+
+
+class _Row(NamedTuple):
+    """A line of a table, its fields by the name of their column."""
+
+    where: str
+    line: int
+    fields: dict[str, str]
+
+    def number(self, name: str) -> float:
+        """The number in a column; UserError if there is none."""
+        text = self.fields.get(name, "").strip()
+        try:
+            value = float(text)
+        except ValueError:
+            raise UserError(f"{self.where}: {name} must be a number; got {text!r}") from None
+        if not math.isfinite(value):
+            raise UserError(f"{self.where}: {name} must be finite; got {text!r}")
+        return value
+
+    def optional(self, name: str) -> float | None:
+        """The number in a column; None if it is empty, nan, or not there."""
+        text = self.fields.get(name, "").strip()
+        return None if text.lower() in ("", "nan") else self.number(name)
+
+    def position(self) -> Position:
+        """The position in the row, with longitude and latitude as x and y."""
+        geographic = "lat" in self.fields
+        x, y, z = ("lon", "lat", "alt") if geographic else ("x", "y", "z")
+        found = Position(
+            self.number(x), self.number(y), self.optional(z), self.optional("deviation")
+        )
+        if found.deviation is not None and found.deviation <= 0:
+            raise UserError(f"{self.where}: deviation must be positive; got {found.deviation:g}")
+        return found
+
+
+def read_position_table(path: Path) -> PositionTable:
+    """Read a file of camera positions or of ground control points.
+
+    Raises:
+      UserError: the file cannot be read, or a line of it is not what the layout asks for.
+    """
+    where = f"{OPTION} {path}"
+    lines = listed_lines(path, OPTION)
+    if not lines:
+        raise UserError(f"{where}: the file is empty")
+    system = None
+    if lines[0][1].lower().startswith(("epsg:", "+proj", "+init", "wgs84")):
+        system, lines = lines[0][1], lines[1:]
+        if not lines:
+            raise UserError(f"{where}: there is nothing below the coordinate system")
+    columns = _columns(lines[0][1])
+    if columns is not None:
+        return _read_csv(lines, columns, system, where)
+    if system is None:
+        raise UserError(
+            f"{where}: the first line must name a coordinate system (EPSG:4326, WGS84 UTM 32N, "
+            "+proj=...) or the columns image,lat,lon,alt or image,x,y,z or "
+            "point,x,y,z,image,px,py"
+        )
+    return _read_blanks(lines, system, where)
+
+
+def _columns(line: str) -> Sequence[str] | None:
+    """The names of the columns that a line lists; None if it does not."""
+    names = [name.strip().lower() for name in next(csv.reader([line], delimiter=_delimiter(line)))]
+    return names if "image" in names else None
+
+
+def _delimiter(line: str) -> str:
+    return next((each for each in _DELIMITERS if each in line), ",")
+
+
+def _read_csv(
+    lines: list[tuple[int, str]], columns: Sequence[str], system: str | None, where: str
+) -> PositionTable:
+    geographic = {"lat", "lon"} <= set(columns)
+    if not geographic and not {"x", "y"} <= set(columns):
+        raise UserError(f"{where}: needs the columns lat, lon, alt or x, y, z; got {columns}")
+    if geographic:
+        system = system or WGS84
+    delimiter = _delimiter(lines[0][1])
+    rows = []
+    for number, line in lines[1:]:
+        fields = next(csv.reader([line], delimiter=delimiter))
+        if len(fields) != len(columns):
+            raise UserError(
+                f"{where}, line {number}: must have {len(columns)} fields, as its first line; got "
+                f"{len(fields)}"
+            )
+        named = dict(zip(columns, fields, strict=True))
+        rows.append(_Row(f"{where}, line {number}", number, named))
+    if "point" in columns:
+        if not {"px", "py"} <= set(columns):
+            raise UserError(f"{where}: control points need the columns px and py; got {columns}")
+        return PositionTable(system=system, points=_points(rows))
+    return PositionTable(system=system, positions=_positions(rows))
+
+
+def _read_blanks(lines: list[tuple[int, str]], system: str, where: str) -> PositionTable:
+    """OpenDroneMap's files: a line begins with a number in gcp_list.txt, and with a photo in
+    geo.txt."""
+    points, cameras = [], []
+    for number, line in lines:
+        at, fields = f"{where}, line {number}", line.split()
+        if not _is_number(fields[0]):
+            names = ("image", "x", "y", "z", "yaw", "pitch", "roll", "deviation")
+            if len(fields) < 3:
+                raise UserError(f"{at}: must be image x y [z ...]; got {shown_name(line)!r}")
+            named = dict[str, str](zip(names, fields, strict=False))
+            if _is_number(named.get("deviation", "")) and float(named["deviation"]) <= 0:
+                del named["deviation"]
+            cameras.append(_Row(at, number, named))
+            continue
+        if len(fields) < 6:
+            raise UserError(
+                f"{at}: must be x y z px py image [name]; got {len(fields)} fields: "
+                f"{shown_name(line)!r}"
+            )
+        names = ("x", "y", "z", "px", "py", "image")
+        named = dict[str, str](zip(names, fields, strict=False))
+        # Without a name, a point is known by its coordinates.
+        named["point"] = fields[6] if len(fields) > 6 else " ".join(fields[:3])
+        points.append(_Row(at, number, named))
+    if points and cameras:
+        raise UserError(
+            f"{where}: lines must all begin with a number (control points) or all with a photo "
+            f"(camera positions); got {len(points)} and {len(cameras)}"
+        )
+    return PositionTable(system=system, positions=_positions(cameras), points=_points(points))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _positions(rows: list[_Row]) -> dict[str, Position]:
+    found: dict[str, Position] = {}
+    for row in rows:
+        name = row.fields["image"].strip()
+        if name in found:
+            raise UserError(f"{row.where}: {shown_name(name)} has a position already")
+        found[name] = row.position()
+    return found
+
+
+def _points(rows: list[_Row]) -> list[ControlPoint]:
+    found: dict[str, ControlPoint] = {}
+    for row in rows:
+        name, position = row.fields["point"].strip(), row.position()
+        point = found.setdefault(name, ControlPoint(name=name, position=position))
+        if point.position != position:
+            raise UserError(
+                f"{row.where}: the point {shown_name(name)} has another position in an earlier line"
+            )
+        image = row.fields["image"].strip()
+        if image in point.photos:
+            raise UserError(
+                f"{row.where}: the point {shown_name(name)} is measured twice in "
+                f"{shown_name(image)}"
+            )
+        point.seen.append(Measurement(image, row.number("px"), row.number("py"), row.line))
+    return list(found.values())

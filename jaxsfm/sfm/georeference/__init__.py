@@ -1,0 +1,1 @@
+"""Models in metres: GPS, tables of positions and ground control points."""

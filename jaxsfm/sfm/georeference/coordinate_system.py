@@ -1,0 +1,134 @@
+"""The coordinate systems of measured positions, and the frame of metres that models get.
+
+Longitude and latitude of WGS 84 need nothing beyond COLMAP. Every other system of the Earth is
+looked up with pyproj, which is an optional package.
+"""
+
+import dataclasses
+import re
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from jaxsfm.colmap.geodesy import east_north_up
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import shown_name
+
+if TYPE_CHECKING:
+    import pyproj
+
+Kind = Literal["geographic", "projected", "local"]
+FAR = 10_000.0
+"""Local coordinates beyond this many metres get an offset. There float32, in which many formats
+store points, has steps of a millimetre."""
+_GEOGRAPHIC = ("epsg:4326", "epsg:4979", "wgs84", "wgs 84")
+_UTM = re.compile(r"WGS\s?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Frame:
+    """The frame of a model in metres: its axes, and where its origin lies."""
+
+    axes: Literal["east, north, up", "easting, northing, height", "x, y, z"]
+    system: str | None
+    """The coordinate system of the measured positions; None if they are metres along any axes."""
+    origin: tuple[float, float, float] | None
+    """Latitude, longitude (degrees, WGS 84) and height (metres) of the model's origin; None if it
+    is not known. The height is of the kind that was measured: above sea level, or the ellipsoid."""
+    offset: tuple[float, float, float]
+    """What was subtracted from easting, northing and height, or from x, y and z, metres."""
+
+
+class CoordinateSystem(NamedTuple):
+    """The coordinate system of measured positions."""
+
+    kind: Kind
+    name: str | None
+    """As the user wrote it."""
+    crs: "pyproj.CRS | None"
+    """Its definition, if it needs pyproj."""
+
+    def frame(self, xyz: np.ndarray) -> Frame:
+        """The frame whose origin lies amid positions float64 (n, 3), n >= 1, in this system."""
+        middle = np.median(xyz, axis=0)
+        if self.kind == "geographic":
+            lon, lat, height = self._wgs84(middle[None])[0].tolist()
+            origin = (lat, lon, height)
+            return Frame(axes="east, north, up", system=self.name, origin=origin, offset=(0, 0, 0))
+        if self.kind == "projected":
+            east, north, height = np.round(middle).tolist()
+            lon, lat, _ = self._wgs84(np.asarray([[east, north, height]]))[0].tolist()
+            return Frame(
+                axes="easting, northing, height",
+                system=self.name,
+                origin=(lat, lon, height),
+                offset=(east, north, height),
+            )
+        far = np.abs(xyz).max() > FAR
+        x, y, z = np.round(middle).tolist() if far else (0.0, 0.0, 0.0)
+        return Frame(axes="x, y, z", system=None, origin=None, offset=(x, y, z))
+
+    def into(self, frame: Frame, xyz: np.ndarray) -> np.ndarray:
+        """Positions float64 (n, 3) of this system in a frame that `frame` made, metres."""
+        if self.kind == "geographic":
+            assert frame.origin is not None
+            return east_north_up(self._wgs84(xyz), frame.origin)
+        return xyz - np.asarray(frame.offset)
+
+    def _wgs84(self, xyz: np.ndarray) -> np.ndarray:
+        """Positions as longitude, latitude and height of WGS 84."""
+        if self.crs is None:
+            return xyz
+        import pyproj
+
+        to = pyproj.Transformer.from_crs(self.crs, pyproj.CRS("EPSG:4979"), always_xy=True)
+        return np.stack(to.transform(*xyz.T), axis=1)
+
+
+LOCAL = CoordinateSystem("local", None, None)
+"""Metres along any three axes at right angles."""
+GPS = CoordinateSystem("geographic", "EPSG:4326", None)
+"""Longitude and latitude of WGS 84."""
+
+
+def coordinate_system(text: str | None, where: str) -> CoordinateSystem:
+    """The coordinate system that a text names; None stands for metres along any axes.
+
+    Args:
+      text: EPSG:code, `WGS84 UTM 32N`, or a string of PROJ.
+      where: the option and the file, for messages.
+
+    Raises:
+      UserError: pyproj is needed and not installed, it does not know the system, or the system is
+        not one of longitude and latitude or of metres.
+    """
+    if text is None:
+        return LOCAL
+    tokens = set(text.lower().split())
+    plain_wgs84 = {"+proj=longlat", "+proj=latlong"} & tokens and "+datum=wgs84" in tokens
+    if text.strip().lower() in _GEOGRAPHIC or plain_wgs84:
+        return CoordinateSystem("geographic", text, None)
+    try:
+        import pyproj
+        from pyproj.exceptions import CRSError
+    except ImportError as error:
+        raise UserError(
+            f"{where}: the coordinate system {shown_name(text)} needs pyproj; "
+            "pip install 'jaxsfm[geo]'"
+        ) from error
+    utm = _UTM.fullmatch(text.strip())
+    code = f"EPSG:{32600 + int(utm[1]) + 100 * (utm[2].upper() == 'S')}" if utm else text
+    try:
+        crs = pyproj.CRS(code)
+    except CRSError as error:
+        raise UserError(f"{where}: {shown_name(text)} is no known coordinate system") from error
+    kind: Kind = "geographic" if crs.is_geographic else "projected"
+    if not (crs.is_geographic or crs.is_projected):
+        raise UserError(f"{where}: {shown_name(text)} is not a projection")
+    units = {axis.unit_name for axis in crs.axis_info}
+    if kind == "projected" and units != {"metre"}:
+        raise UserError(
+            f"{where}: the unit of {shown_name(text)} must be the metre; got "
+            f"{', '.join(sorted(units))}"
+        )
+    return CoordinateSystem(kind, text, crs)

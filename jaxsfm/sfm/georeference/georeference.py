@@ -1,0 +1,130 @@
+"""Models moved onto measured positions of their photos, or onto ground control points."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from jaxsfm.colmap.move_model import move_model
+from jaxsfm.colmap.poses import model_poses
+from jaxsfm.io.position_tables import ControlPoint, Position
+from jaxsfm.sfm.georeference.control_points import triangulated, views_by_name
+from jaxsfm.sfm.georeference.coordinate_system import CoordinateSystem, Frame
+from jaxsfm.sfm.georeference.placement import NamedAnchors, Placement, placement
+from jaxsfm.sfm.georeference.robust_similarity import Anchors
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Source = Literal["gps", "positions", "control points"]
+_WORDS = {
+    "gps": "photos with a GPS position and height",
+    "positions": "photos with a position and height",
+    "control points": "control points that two photos show",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredPositions:
+    """What models are moved onto."""
+
+    source: Source
+    file: str | None
+    """The file that they were read from; None for the GPS positions of photos."""
+    system: CoordinateSystem
+    positions: Mapping[str, Position]
+    """Positions of cameras, by the name of the photo. With control points they play no part."""
+    points: list[ControlPoint] = field(default_factory=list)
+    """Control points, whose measurements name photos of the run."""
+    sure: bool
+    """Whether a model is left as it is if its move would not be certain."""
+
+    def frame(self) -> Frame | None:
+        """The frame of the moved models; None if no position has a height."""
+        given = [point.position for point in self.points] or self.positions.values()
+        full = [(at.x, at.y, at.z) for at in given if at.z is not None]
+        return self.system.frame(np.asarray(full, np.float64)) if full else None
+
+    def local(self, frame: Frame | None) -> dict[str, Position]:
+        """The positions of cameras that have a height, in a frame."""
+        known = [] if frame is None else self.positions.items()
+        return {name: self._moved(at, frame) for name, at in known if frame and at.full}
+
+    def _moved(self, at: Position, frame: Frame) -> Position:
+        x, y, z = self.system.into(frame, np.asarray([[at.x, at.y, at.z]], np.float64))[0].tolist()
+        return Position(x, y, z, at.deviation)
+
+    def anchors(self, model: "pycolmap.Reconstruction", frame: Frame | None) -> NamedAnchors:
+        """What a model, in the frame of the mapper, has of the measured positions."""
+        if self.points and frame is not None:
+            return self._points_in(model, frame)
+        return self._photos_in(model, frame)
+
+    def _photos_in(self, model: "pycolmap.Reconstruction", frame: Frame | None) -> NamedAnchors:
+        poses = model_poses(model)
+        known = self.local(frame)
+        names = sorted(poses.keys() & known.keys())
+        flat = sorted(poses.keys() & self.positions.keys() - known.keys())
+        deviations = [known[name].deviation for name in names]
+        usual = np.median([each for each in deviations if each is not None] or [1.0])
+        return NamedAnchors(
+            names,
+            Anchors(
+                np.asarray([poses[name].centre for name in names]).reshape(-1, 3),
+                np.asarray([known[name][:3] for name in names]).reshape(-1, 3),
+                np.asarray([float(usual if each is None else each) for each in deviations]),
+            ),
+            deviations,
+            [{} for _ in names],
+            {name: "its position has no height" for name in flat},
+        )
+
+    def _points_in(self, model: "pycolmap.Reconstruction", frame: Frame) -> NamedAnchors:
+        views, names, found, unused = views_by_name(model), [], [], {}
+        targets = []
+        for point in sorted(self.points, key=lambda point: point.name):
+            seen = {each.image: (each.x, each.y) for each in point.seen}
+            in_model = triangulated(views, seen)
+            if in_model is None:
+                shown = len(seen.keys() & views.keys())
+                unused[point.name] = (
+                    f"{shown} photos of the model show it; at least 2 are needed"
+                    if shown < 2
+                    else "the photos see it along one line"
+                )
+                continue
+            names.append(point.name)
+            found.append(in_model)
+            targets.append(self._moved(point.position, frame)[:3])
+        source = np.asarray([each.xyz for each in found]).reshape(-1, 3)
+        target = np.asarray(targets, np.float64).reshape(-1, 3)
+        anchors = Anchors(source, target, np.ones(len(names)))
+        errors = [each.errors_px for each in found]
+        return NamedAnchors(names, anchors, [None] * len(names), errors, unused)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Georeference:
+    """How the models of a run were moved into metres."""
+
+    source: Source
+    file: str | None = None
+    frame: Frame | None
+    """None if no position has a height."""
+    models: list[Placement]
+    """One for each model."""
+
+
+def move_models(
+    models: "list[pycolmap.Reconstruction]", measured: MeasuredPositions
+) -> Georeference:
+    """Move models, each by itself, onto measured positions. The models change in place."""
+    frame, placed = measured.frame(), []
+    for model in models:
+        given = measured.anchors(model, frame)
+        figures, similarity = placement(given, _WORDS[measured.source], sure=measured.sure)
+        if similarity is not None:
+            move_model(model, *similarity)
+        placed.append(figures)
+    return Georeference(source=measured.source, file=measured.file, frame=frame, models=placed)
