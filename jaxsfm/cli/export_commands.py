@@ -127,6 +127,8 @@ def _fresh(path: Path, suffix: str | None) -> Iterator[Path]:
         if suffix is None:
             fresh.mkdir()
         yield fresh
+        if path.is_dir():
+            path.rmdir()  # it is empty; Windows puts no folder in the place of another
         os.replace(fresh, path)
 
 

@@ -28,3 +28,10 @@ def limit_threads(count: int) -> None:
             os.environ[variable] = str(count)
     cv2 = importlib.import_module("cv2")  # only now, because it imports NumPy
     cv2.setNumThreads(count)
+
+
+def usable_cores() -> int:
+    """The number of cores that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -182,7 +182,7 @@ def test_what_is_there_is_not_overwritten_and_what_cannot_be_written_is_said(
         assert "must end in" in refusal(capsys, run, to, tmp_path / "made")
         (tmp_path / suffix).mkdir()
         assert "cannot be written" in refusal(capsys, run, to, tmp_path / suffix)
-    if os.geteuid():  # root may write anywhere
+    if getattr(os, "geteuid", lambda: 0)():  # root may write anywhere
         (tmp_path / "locked").mkdir(mode=0o500)
         assert "cannot be written" in refusal(capsys, run, to, tmp_path / "locked" / suffix)
     assert not list(tmp_path.glob(".jaxsfm-*"))

@@ -1,4 +1,4 @@
-"""`jaxsfm export --to undistorted` finds the photos of a run, and writes all of a folder or none."""
+"""`jaxsfm export --to undistorted` finds the photos of a run, and writes a whole folder or none."""
 
 import json
 
