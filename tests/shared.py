@@ -1,12 +1,12 @@
 """Folders that several tests read: each is made once in a session and stays as it was made."""
 
 import contextlib
-import fcntl
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 
 @contextlib.contextmanager
@@ -25,8 +25,7 @@ def once(
     base = factory.getbasetemp()
     root = base.parent if base.name.startswith("popen-") else base  # of all workers
     folder, made = root / name, root / f"{name}.made"
-    with (root / f"{name}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(root / f"{name}.lock"):
         if not made.exists():
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()

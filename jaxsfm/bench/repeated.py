@@ -188,4 +188,4 @@ def write_repeated(folder: Path, name: str, seed: int, size: tuple[int, int]) ->
         for i, pose in enumerate(scene.poses):
             photo = f"view{i:02d}.png"
             write_photo(images / photo, render(scene.planes, pose, size))
-            (cameras / f"{photo}.camera").write_text(camera_text(k, pose, size))
+            (cameras / f"{photo}.camera").write_text(camera_text(k, pose, size), encoding="ascii")

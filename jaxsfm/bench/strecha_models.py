@@ -221,7 +221,7 @@ def _matching_seconds(work: Path, stages: dict[str, float]) -> dict[str, float]:
     """
     path = work / SECONDS
     try:
-        before = json.loads(path.read_text())
+        before = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         before = {}
     spent = {

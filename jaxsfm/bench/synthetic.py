@@ -172,9 +172,9 @@ def camera_text(k: np.ndarray, pose: CameraPose, size: tuple[int, int]) -> str:
 
 
 def write_photo(path: Path, rgb: np.ndarray) -> None:
-    """Write an image, uint8 RGB; OSError if it cannot be written, which OpenCV does not raise."""
-    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path} cannot be written")
+    """Write an image, uint8 RGB, in the format of the file's suffix."""
+    # OpenCV is not given the path: on Windows it cannot write every name.
+    path.write_bytes(cv2.imencode(path.suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
 def write_scene(
@@ -197,7 +197,7 @@ def write_scene(
         if dark:
             rgb = night(rgb, seed=seed)
         write_photo(images / name, rgb)
-        (reference / f"{name}.camera").write_text(camera_text(k, pose, size))
+        (reference / f"{name}.camera").write_text(camera_text(k, pose, size), encoding="ascii")
         poses[name] = pose
     np.savetxt(folder / "K.txt", k, fmt="%.9g")
     return poses

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal, assert_never
 import tyro
 
 from jaxsfm.cli.run_commands import check_writable
+from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 
 if TYPE_CHECKING:
@@ -18,7 +19,17 @@ if TYPE_CHECKING:
 
     from jaxsfm.colmap.formats.tables import Tables
 
-Format = Literal["hloc", "colmap", "colmap-text", "ply", "bundler", "nvm", "openmvg", "nerfstudio"]
+Format = Literal[
+    "hloc",
+    "colmap",
+    "colmap-text",
+    "ply",
+    "bundler",
+    "nvm",
+    "openmvg",
+    "nerfstudio",
+    "undistorted",
+]
 FILES = {"ply": ".ply", "nvm": ".nvm"}
 """The formats that are a single file, and how its name ends. The others are folders."""
 GEOREFERENCE = "georeference.json"
@@ -33,27 +44,36 @@ def export(
     images: Path | None = None,
     copy_images: bool = False,
     matches: Literal["all", "verified"] = "all",
+    max_size: int | None = None,
 ) -> int:
     """Write the model or the matches of a run in the format of another tool (docs/formats.md).
 
     For example
         $ jaxsfm export OUT --to nerfstudio --out NERF --copy-images
         $ jaxsfm export OUT --to hloc --out HLOC
+        $ jaxsfm export OUT --to undistorted --out DENSE --max-size 2000
 
     Args:
       run: The folder of a run. For formats that hold a model, it can also be the folder of a COLMAP
         model.
       to: The format. hloc: features.h5, matches.h5 and pairs.txt. colmap, colmap-text: the model.
         ply: the points of the model. bundler, nvm: cameras, points and observations. openmvg:
-        sfm_data.json, features and matches. nerfstudio: transforms.json and points.
+        sfm_data.json, features and matches. nerfstudio: transforms.json and points. undistorted:
+        photos without lens distortion and their model, for dense stereo and Gaussian splatting.
       out: The file (for ply and nvm) or the new folder to write.
-      images: The folder of the photos, to which the files of nerfstudio and openmvg refer. Without
-        it, the folder in which the run found them, if it still exists.
+      images: The folder of the photos, which are undistorted, or to which the files of nerfstudio
+        and openmvg refer. Without it, the folder in which the run found them, if it still exists.
       copy_images: For nerfstudio: copy the photos into a folder named images, next to
         transforms.json.
       matches: Which matches are written for hloc. all: those that were handed to COLMAP. verified:
         those of trusted pairs that COLMAP verified.
+      max_size: For undistorted: the longer side of the new photos has at most this many pixels.
+        Without it, they are about as large as the photos.
     """
+    if max_size is not None and to != "undistorted":
+        raise UserError("--max-size: goes with --to undistorted")
+    if max_size is not None and max_size < MIN_SIDE:
+        raise UserError(f"--max-size {max_size}: must be at least {MIN_SIDE}")
     if copy_images and to != "nerfstudio":
         raise UserError("--copy-images: goes with --to nerfstudio")
     if images is not None and not images.is_dir():
@@ -61,9 +81,10 @@ def export(
     if not run.is_dir():
         raise UserError(f"{run}: no such folder")
     images = images or _recorded_photos(run)
-    if copy_images and images is None:
+    if images is None and (copy_images or to == "undistorted"):
+        option = "--copy-images" if copy_images else f"--to {to}"
         raise UserError(
-            f"--copy-images: {run} does not say where its photos are; name them with --images"
+            f"{option}: {run} does not say where its photos are; name them with --images"
         )
     with _fresh(out, FILES.get(to)) as fresh:
         if to == "hloc":
@@ -72,6 +93,8 @@ def export(
             _write_openmvg(fresh, run, images)
         elif to == "nerfstudio":
             _write_nerfstudio(fresh, _model(run), images, copy_images)
+        elif to == "undistorted":
+            _write_undistorted(fresh, run, images, max_size)
         else:
             _write_model(fresh, _model(run), to)
         if to not in FILES and to != "hloc":
@@ -108,6 +131,8 @@ def _fresh(path: Path, suffix: str | None) -> Iterator[Path]:
         if suffix is None:
             fresh.mkdir()
         yield fresh
+        if path.is_dir():
+            path.rmdir()  # it is empty; Windows puts no folder in the place of another
         os.replace(fresh, path)
 
 
@@ -236,3 +261,13 @@ def _write_nerfstudio(
             raise UserError(f"--images {images}: no {image.name} in it")
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
+
+
+def _write_undistorted(folder: Path, run: Path, images: Path | None, max_size: int | None) -> None:
+    from jaxsfm.colmap.formats.undistorted import write_undistorted
+    from jaxsfm.colmap.poses import find_model, read_model
+
+    if images is None:
+        raise ValueError("undistorted images are made from photos, whose folder is not given")
+    found = find_model(run)
+    write_undistorted(folder, found, read_model(found), images, max_size or -1)

@@ -1,5 +1,6 @@
 """The command line: it parses arguments, runs a command, and reports a failure in one sentence."""
 
+import io
 import logging
 import os
 import sys
@@ -75,6 +76,16 @@ def version_lines() -> list[str]:
     return lines + [f"  {name} {version}" for name, version in found.items()]
 
 
+def _print_any_name() -> None:
+    """Print characters that the terminal cannot show as escapes, and not raise an error.
+
+    Where output goes into a file or a pipe, Windows's own encoding lacks most letters of the world.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one command.
 
@@ -88,6 +99,7 @@ def main(argv: list[str] | None = None) -> int:
     if (sys.argv[1:] if argv is None else argv) == ["--version"]:
         print("\n".join(version_lines()))
         return 0
+    _print_any_name()
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("jaxsfm: %(message)s"))
     logger = logging.getLogger("jaxsfm")

@@ -5,9 +5,9 @@ that they cannot write outside their folder.
 """
 
 import contextlib
-import fcntl
 import lzma
 import os
+import sys
 import tarfile
 import tempfile
 import zipfile
@@ -21,6 +21,7 @@ import requests
 from tqdm import tqdm
 
 from jaxsfm.errors import UserError, writing
+from jaxsfm.io.locks import only_process
 
 CHUNK = 1 << 16
 TIMEOUT = (10, 60)
@@ -52,20 +53,21 @@ class _Resuming:
         self, url: str, output_file: str | Path, pooch: object, check_only: bool | None = False
     ) -> None:
         known = self.part.with_name(self.part.name + ".etag")
-        with self.part.open("ab") as file:
+        lock = self.part.with_name(self.part.name + ".lock")
+        with only_process(lock, f"{self.part}: another process is downloading it"):
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise UserError(f"{self.part}: another process is downloading it") from error
-            try:
-                while not self._received(url, file, known):  # the part belongs to another file
-                    file.truncate(0)
-            except BaseException:
-                if not file.seek(0, os.SEEK_END):
+                with self.part.open("ab") as file:
+                    while not self._received(url, file, known):  # it is a part of another file
+                        file.truncate(0)
+                known.unlink(missing_ok=True)
+                os.replace(self.part, output_file)  # Windows moves no file that is open
+            finally:
+                if self.part.is_file() and not self.part.stat().st_size:
                     self.part.unlink()
-                raise
-            known.unlink(missing_ok=True)
-            os.replace(self.part, output_file)
+                # A process that has opened the lock's file before finds that it is gone, and makes
+                # a new one. On Windows, filelock deletes the file by itself.
+                if sys.platform != "win32":
+                    lock.unlink(missing_ok=True)
 
     def _received(self, url: str, file: BinaryIO, known: Path) -> bool:
         """Receive the rest of the file, or all of it.

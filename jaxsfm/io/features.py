@@ -6,12 +6,12 @@ capacities. Both depend on the size of the image alone, so the features of an im
 the other images.
 """
 
-import os
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
+import psutil
 from jaxtyping import Array
 
 from jaxsfm.config import Config
@@ -138,16 +138,13 @@ def without_unused(dense: DenseFeatures, used: np.ndarray) -> DenseFeatures:
     return dense
 
 
-def total_memory() -> int | None:
-    """The memory that this process may use, bytes; None if the system does not say.
+def total_memory() -> int:
+    """The memory that this process may use, bytes.
 
     This is the total and not what is free at the moment, because a result must not depend on other
     processes.
     """
-    try:
-        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError):
-        return None
+    total = psutil.virtual_memory().total
     try:
         total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
     except (OSError, ValueError):  # there is no limit ("max"), or the system is not Linux

@@ -27,3 +27,10 @@ def limit_threads(count: int) -> None:
     for library, variable in READ_ONCE.items():
         if library not in sys.modules:
             os.environ[variable] = str(count)
+
+
+def usable_cores() -> int:
+    """The number of cores that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

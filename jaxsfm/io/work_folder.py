@@ -4,18 +4,17 @@ Commands that reconstruct or extend open it here; only one process at a time can
 """
 
 import contextlib
-import fcntl
 import json
 import logging
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TextIO
 
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import PARTIAL, Json, atomic_folder, read_json, write_atomic
 from jaxsfm.io.hashes import rows_sha256, sha256_of
+from jaxsfm.io.locks import only_process
 from jaxsfm.io.store import Identity, Store, digest
 
 logger = logging.getLogger(__name__)
@@ -25,7 +24,7 @@ RECORD = "run.json"
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")
-_MOVES, _KEY = "moves.json", "key"
+_MOVES, _KEY, _LOCK = "moves.json", "key", ".lock"
 
 
 class WorkFolder(Store):
@@ -171,21 +170,20 @@ def _short(value: Json) -> Json:
     return f"{value[:8]}.." if isinstance(value, str) and len(value) == 64 else value
 
 
-def _prepare(path: Path) -> TextIO:
-    """Make the folder, or check that it is a work folder; return its lock file, open."""
+def _prepare(path: Path) -> None:
+    """Make the folder, or check that it is a work folder."""
     with writing(f"--out {path}"):
         if path.exists() and not path.is_dir():
             raise UserError(f"--out {path}: this is a file and not a folder")
         if path.is_dir() and not (path / RECORD).exists():
             begun = set(path.glob(f"{RECORD}.*{PARTIAL}"))
-            strangers = sorted(p.name for p in {*path.iterdir()} - begun if p.name != ".lock")
+            strangers = sorted(p.name for p in {*path.iterdir()} - begun if p.name != _LOCK)
             if strangers:
                 raise UserError(
                     f"--out {path}: the folder is not empty and not a jaxsfm run (it holds "
                     f"{strangers[0]!r}); choose an empty or new folder"
                 )
         path.mkdir(parents=True, exist_ok=True)
-        return (path / ".lock").open("w")
 
 
 def _former(path: Path) -> Identity | None:
@@ -230,12 +228,11 @@ def lock_folder(path: Path) -> Iterator[None]:
     If a run was killed while it moved its results into place, the rest is moved first. Raises
     UserError if `path` is a file or a folder of something else, cannot be written, or is in use.
     """
-    with _prepare(path) as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise UserError(f"--out {path}: another run is using this folder") from error
+    _prepare(path)
+    with contextlib.ExitStack() as stack:
         with writing(f"--out {path}"):
+            in_use = f"--out {path}: another run is using this folder"
+            stack.enter_context(only_process(path / _LOCK, in_use))
             WorkFolder(path, {}).finish_publishing()
         yield
 

@@ -109,7 +109,7 @@ def cached_images(execution: Execution, mesh: Mesh, num_coarse: int, *, config: 
     elif memory is not None:
         most = DEVICE_SHARE * memory / each
     else:
-        budget = min(HOST_BYTES, HOST_SHARE * (total_memory() or HOST_BYTES / HOST_SHARE))
+        budget = min(HOST_BYTES, HOST_SHARE * total_memory())
         most = min(budget / mesh.size / each, HOST_IMAGES)
     return max(2, int(most))
 

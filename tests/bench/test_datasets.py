@@ -1,7 +1,6 @@
 """Data sets: downloads from a local server that breaks off, changes its mind or goes away."""
 
 import dataclasses
-import fcntl
 import hashlib
 import io
 import json
@@ -18,6 +17,7 @@ from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io import download as downloads
 from jaxsfm.io.download import download
+from jaxsfm.io.locks import only_process
 
 
 def sha(content):
@@ -95,12 +95,12 @@ def test_no_server_no_file_no_folder_are_one_sentence(server, tmp_path):
 
 
 def test_two_processes_do_not_write_one_file(server, tmp_path):
-    with (tmp_path / "file.part").open("ab") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
+    with only_process(tmp_path / "file.part.lock", "held"):
         with pytest.raises(UserError, match="another process"):
             download(url(server), tmp_path / "file", known_hash=None)
     download(url(server), tmp_path / "file", known_hash=None)
     assert (tmp_path / "file").read_bytes() == CONTENT
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_server_that_says_nothing_is_not_waited_for_forever(tmp_path, monkeypatch):

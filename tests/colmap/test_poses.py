@@ -1,5 +1,6 @@
 """Reference poses: Strecha's .camera files and COLMAP models."""
 
+import re
 import subprocess
 import sys
 
@@ -122,7 +123,7 @@ def test_only_registered_images_have_poses():
 
 def test_a_folder_with_neither_is_refused_naming_the_option(tmp_path):
     (tmp_path / "images").mkdir()
-    with pytest.raises(UserError, match=f"--reference {tmp_path}: neither Strecha"):
+    with pytest.raises(UserError, match=f"--reference {re.escape(str(tmp_path))}: neither Strecha"):
         read_poses(tmp_path)
     with pytest.raises(UserError, match="--other .*none: no such folder"):
         read_poses(tmp_path / "none", option="--other")
@@ -145,7 +146,9 @@ def test_a_damaged_model_is_refused_by_name(tmp_path, damage):
             {"empty images": b"", "half images": data[: len(data) // 2], "words": b"words"}[damage]
         )
     for read in (read_poses, read_model):
-        with pytest.raises(UserError, match=f"{tmp_path}: not a readable COLMAP model"):
+        with pytest.raises(
+            UserError, match=f"{re.escape(str(tmp_path))}: not a readable COLMAP model"
+        ):
             read(tmp_path)
 
 
@@ -164,6 +167,7 @@ print(status.split("VmHWM:")[1].split()[0])
 """
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits and shows memory so")
 def test_a_model_with_an_empty_points_file_is_refused_at_once(tmp_path):
     """COLMAP's reader does not look at the end of points3D.bin: it allocates until memory ends."""
     write_model(tmp_path)

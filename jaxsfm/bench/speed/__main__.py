@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
 
+from jaxsfm.io.threads import usable_cores
+
 # Set before JAX starts: both sides of every comparison use the cores that this process may use.
-os.environ.setdefault("OMP_NUM_THREADS", str(len(os.sched_getaffinity(0))))
+os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))
 os.environ.setdefault("GLOG_minloglevel", "2")  # COLMAP prints every step otherwise
 
 import tyro
@@ -81,7 +83,7 @@ def main(
     figures = {metric.name: metric.value for metric in metrics}
     if json_file is not None:
         write_json(json_file, {"metrics": [metric._asdict() for metric in metrics]})
-    baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
+    baseline = json.loads(BASELINE.read_text(encoding="utf-8")) if BASELINE.exists() else {}
     if update:
         write_json(BASELINE, baseline | figures)
         return 0

@@ -1,6 +1,5 @@
 """Speed of VGG-16 up to pool4 at 1536 x 1024, next to PyTorch and the machine's matrix products."""
 
-import os
 from collections.abc import Callable, Iterator
 
 import jax
@@ -11,6 +10,7 @@ from jaxsfm.bench.speed import machine
 from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
 from jaxsfm.core.types import Levels
 from jaxsfm.core.vgg import BLOCKS, LAYERS, VGG16
+from jaxsfm.io.threads import usable_cores
 from jaxsfm.io.weights import load_weights
 
 HEIGHT, WIDTH = 1024, 1536
@@ -43,7 +43,7 @@ def _torch_pool4(params: dict, image: np.ndarray) -> Callable[[], np.ndarray] | 
         import torch  # pyright: ignore[reportMissingImports] # optional: the extra `bench`
     except ImportError:
         return None
-    torch.set_num_threads(len(os.sched_getaffinity(0)))
+    torch.set_num_threads(usable_cores())
     layers: list[torch.nn.Module] = []
     for block, widths in enumerate(BLOCKS[:POOL4], start=1):
         for conv in range(1, len(widths) + 1):

@@ -1,6 +1,5 @@
 """The rates of the machine, which the stages are compared with."""
 
-import os
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 from jaxsfm.bench.speed.timing import Metric, median, seconds
 from jaxsfm.core.numerics import descriptor_products
 from jaxsfm.core.pair_shape import Products
+from jaxsfm.io.threads import usable_cores
 
 SIDE = 3072
 STREAM_ENTRIES = 1 << 26
@@ -44,7 +44,7 @@ def measure() -> Iterator[Metric]:
     a = jnp.zeros(STREAM_ENTRIES, jnp.float32)
     product = matrix_product()
     times, stream = seconds(product.compute, lambda: add_one(a))
-    yield Metric("machine.cores", len(os.sched_getaffinity(0)), "", "higher")
+    yield Metric("machine.cores", usable_cores(), "", "higher")
     rate = product.operations / median(times)
     yield Metric("machine.matrix_products", rate / 1e9, "GFLOP/s", "higher")
     yield Metric("machine.memory", 2 * a.nbytes / median(stream) / 1e9, "GB/s", "higher")

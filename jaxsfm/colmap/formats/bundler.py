@@ -45,6 +45,6 @@ def write_bundler(folder: Path, model: pycolmap.Reconstruction) -> None:
             x, y = xy - centres[k]
             seen.append(f"{k} {keypoint} {row_of([x, -y])}")
         lines += [row_of(point.xyz), " ".join(map(str, point.color)), " ".join(seen)]
-    (folder / BUNDLE).write_text("\n".join([*lines, ""]), encoding="utf-8")
+    (folder / BUNDLE).write_text("\n".join([*lines, ""]), encoding="utf-8", newline="\n")
     listed = "".join(f"{image.name}\n" for image in images)
-    (folder / LIST).write_text(listed, encoding="utf-8")
+    (folder / LIST).write_text(listed, encoding="utf-8", newline="\n")

@@ -72,7 +72,7 @@ def write_hloc(
             group.create_dataset("matches0", data=second)
             group.create_dataset("matching_scores0", data=(second >= 0).astype(np.float16))
     lines = "".join(f"{a} {b}\n" for a, b in sorted(matches))
-    (folder / PAIRS).write_text(lines, encoding="utf-8")
+    (folder / PAIRS).write_text(lines, encoding="utf-8", newline="\n")
 
 
 def _check_names(names: Iterable[str]) -> None:

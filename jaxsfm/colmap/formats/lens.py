@@ -1,7 +1,7 @@
 """COLMAP's cameras and tracks in the terms of other formats, and what those can express."""
 
 from collections.abc import Iterable, Iterator
-from pathlib import PurePosixPath
+from pathlib import PurePath
 from typing import NamedTuple
 
 import numpy as np
@@ -125,12 +125,22 @@ Observed = list[tuple[int, int, np.ndarray]]
 COLMAP's pixels. Each image occurs once."""
 
 
+def leads_out(name: str, path_type: type[PurePath] = PurePath) -> bool:
+    """Whether a name, joined to a folder, gives a path that is not below the folder.
+
+    Args:
+      path_type: the kind of paths of the system. On Windows, drives (`C:a.jpg`) and the separator
+        `\\` lead out as well.
+    """
+    path = path_type(name)
+    return bool(path.anchor) or ".." in path.parts
+
+
 def registered_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """The images with a pose, by name; UserError if a name leads out of the photos' folder."""
     images = [model.image(image_id) for image_id in model.reg_image_ids()]
     for image in images:
-        path = PurePosixPath(image.name)
-        if path.is_absolute() or ".." in path.parts:
+        if leads_out(image.name):
             raise UserError(f"{shown_name(image.name)}: an image outside the photos' folder")
     return sorted(images, key=lambda image: image.name)
 

@@ -65,7 +65,7 @@ def write_nerfstudio(folder: Path, model: pycolmap.Reconstruction, images: Path 
         "applied_transform": APPLIED.tolist(),
         "ply_file_path": POINTS,
     }
-    (folder / TRANSFORMS).write_text(json.dumps(record, indent=1), encoding="utf-8")
+    (folder / TRANSFORMS).write_text(json.dumps(record, indent=1), encoding="utf-8", newline="\n")
     turned = pycolmap.Reconstruction(model)
     turned.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(APPLIED[:, :3]), np.zeros(3)))
     turned.export_PLY(folder / POINTS)

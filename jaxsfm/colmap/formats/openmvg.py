@@ -138,14 +138,14 @@ def write_features(folder: Path, tables: Tables) -> None:
             )
         xy = tables.keypoints.get(name, np.zeros((0, 2), np.float32))
         lines = "".join(f"{x:.9g} {y:.9g} 1 0\n" for x, y in xy.tolist())
-        (folder / f"{stem}.feat").write_text(lines, encoding="utf-8")
+        (folder / f"{stem}.feat").write_text(lines, encoding="utf-8", newline="\n")
     for kind, found in (("putative", tables.matches), ("f", tables.inliers)):
         _write_matches(folder / f"matches.{kind}.txt", names, found)
 
 
 def _write_matches(path: Path, names: list[str], found: Mapping[Pair, np.ndarray]) -> None:
     number = {name: k for k, name in enumerate(names)}
-    with path.open("w", encoding="utf-8") as file:
+    with path.open("w", encoding="utf-8", newline="\n") as file:
         for (a, b), rows in sorted(found.items()):
             file.write(f"{number[a]} {number[b]}\n{len(rows)}\n")
             file.writelines(f"{i} {j}\n" for i, j in rows.tolist())
@@ -157,7 +157,7 @@ def write_openmvg(folder: Path, record: dict[str, object], tables: Tables | None
     `id_feat` counts the keypoints of the model, which refinement has moved. The features and the
     matches are those of the database.
     """
-    (folder / SFM_DATA).write_text(json.dumps(record, indent=1), encoding="utf-8")
+    (folder / SFM_DATA).write_text(json.dumps(record, indent=1), encoding="utf-8", newline="\n")
     if tables is not None:
         (folder / MATCHES).mkdir()
         write_features(folder / MATCHES, tables)

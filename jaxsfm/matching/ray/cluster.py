@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from jaxsfm.errors import UserError
+from jaxsfm.io.threads import usable_cores
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -90,7 +91,7 @@ def xla_threads() -> int:
     given = os.environ.get("NPROC", "")
     if given.isdecimal():
         return int(given)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return usable_cores()
 
 
 def share_cpus(cpus: Sequence[int], workers: int | None, usual: int) -> tuple[int, int]:
