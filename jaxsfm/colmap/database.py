@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, camera_of
+from jaxsfm.colmap.stand_in import readable_by_colmap
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile, shown_name
@@ -75,7 +76,8 @@ def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Came
         camera = intrinsics.camera(image.size)
     else:
         try:
-            camera = pycolmap.infer_camera_from_image(image.path)
+            with readable_by_colmap(image) as path:
+                camera = pycolmap.infer_camera_from_image(path)
         except Exception:  # COLMAP reads fewer formats, and raises various errors
             camera = None
         if camera is None or (camera.width, camera.height) != image.size:

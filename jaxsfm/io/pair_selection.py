@@ -21,8 +21,8 @@ MANY = "retrieval:20+sequential:3"
 
 
 SHARED = 0.4
-"""Frames of a video that share at least this part of their views are neighbours: they are matched
-whatever they look like. A pair that shares less is left to retrieval."""
+"""Frames of a video that share about this part of their views, or more, are matched as neighbours.
+Pairs that share less are left to retrieval."""
 MOST_NEIGHBOURS = 10
 
 
@@ -46,7 +46,7 @@ def many_frames(common: float) -> str:
     Args:
       common: the part of a view that neighbouring frames have in common.
     """
-    steps = int((1 - SHARED) / max(1 - common, 1e-6) + 1e-6)
+    steps = round((1 - SHARED) / max(1 - common, 1e-6))
     return f"retrieval:20+sequential:{min(max(steps, 2), MOST_NEIGHBOURS)}"
 
 

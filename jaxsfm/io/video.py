@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,8 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 FEWER = 0.95
 """If a smaller share of the frames that the file announces can be decoded, a warning says so. Many
 files announce a few frames too many."""
+_CONTROL = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
+"""Bytes that no text has, and the first 4 kB of any video have."""
 
 
 class Video:
@@ -74,13 +77,17 @@ def open_video(path: Path) -> Iterator[Video]:
         if not path.is_file():
             raise UserError(f"{shown}: not a file; frames are chosen from a video file")
         with path.open("rb") as file:
-            if not file.read(1):
-                raise UserError(f"{shown}: the file is empty")
+            head = file.read(4096)
     except OSError as error:
         raise UserError(f"{shown}: cannot be read ({error.strerror})") from error
+    if not head:
+        raise UserError(f"{shown}: the file is empty")
     # OpenCV would open a photo as a video of one frame, or with all photos numbered after it.
     if path.suffix.lower() in SUFFIXES:
         raise UserError(f"{shown}: this is a photo and not a video")
+    # FFmpeg would show a text as a film of a terminal, and open the files that a playlist names.
+    if not _CONTROL.search(head):
+        raise UserError(f"{shown}: this is a text and not a video")
     # The absolute path keeps FFmpeg from reading a name with a colon as the name of a protocol.
     capture = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
     try:

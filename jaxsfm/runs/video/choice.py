@@ -32,7 +32,7 @@ stays the same, so that the errors of many small motions do not add up."""
 PATIENCE = 15
 """After so many blurred frames whose motion is unknown, half a second, a new stretch begins."""
 BLURRED = 0.5
-"""A frame with a smaller share of the detail of the frame before is blurred."""
+"""A frame with a smaller share of another frame's detail is blurred, compared with it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +68,8 @@ class _Way:
 
     def __init__(self, overlap: float) -> None:
         self.overlap = overlap
-        self.chosen = False
-        """Whether the way starts at a chosen frame and not at the beginning of a stretch."""
+        self.start: Frame | None = None
+        """The last chosen frame; None at the beginning of a stretch."""
         self.base: Frame | None = None
         """The frame from which points are followed."""
         self.last: Frame | None = None
@@ -102,11 +102,19 @@ class _Way:
         yield from self._walked_to(frame)
 
     def restart(self, frame: Frame | None) -> Iterator[ChosenFrame]:
-        """End the stretch, and begin a new one with a frame that has no known place, if given."""
-        if self.best is not None and self.followed:
+        """End the stretch, and begin a new one with a frame that has no known place, if given.
+
+        The last step of a stretch is seldom whole, and a blurred frame is not worth it.
+        """
+        if self.best is not None and self.followed and not self._is_blurred(self.best):
             yield self._chosen(self.best)
         self.base = self.last = self.best = frame
-        self.chosen, self.followed, self.lost = False, False, 0
+        self.start, self.followed, self.lost = None, False, 0
+
+    def _is_blurred(self, frame: Frame) -> bool:
+        """Whether a frame is much less sharp than the last chosen one."""
+        start = self.start
+        return start is not None and detail_ratio(start.small, frame.small, frame.way) < BLURRED
 
     def _way_to(self, small: SmallFrame) -> np.ndarray | None:
         """The motion from the start of the way to a frame; None if it cannot be measured."""
@@ -124,7 +132,7 @@ class _Way:
 
     def _walked_to(self, frame: Frame) -> Iterator[ChosenFrame]:
         while True:
-            nearest, farthest = (FROM, TO) if self.chosen else (0.0, FIRST)
+            nearest, farthest = (FROM, TO) if self.start else (0.0, FIRST)
             steps = (1 - common_area(frame.way, frame.small.size)) / (1 - self.overlap)
             if steps <= farthest:
                 if steps >= nearest and self._is_sharpest(frame):
@@ -143,7 +151,7 @@ class _Way:
         return best is None or detail_ratio(best.small, frame.small, _between(best, frame)) > 1
 
     def _chosen(self, frame: Frame) -> ChosenFrame:
-        motion = frame.way if self.chosen else None
+        motion = frame.way if self.start else None
         return ChosenFrame(frame.index, frame.pixels, motion, frame.small.size)
 
     def _start_at(self, chosen: Frame) -> None:
@@ -152,7 +160,7 @@ class _Way:
         assert self.base is not None and self.last is not None
         self.base = dataclasses.replace(self.base, way=self.base.way @ back)
         self.last = dataclasses.replace(self.last, way=self.last.way @ back)
-        self.best, self.chosen = None, True
+        self.best, self.start = None, dataclasses.replace(chosen, way=np.eye(3))
 
 
 def _between(first: Frame, second: Frame) -> np.ndarray:
