@@ -97,7 +97,11 @@ def picture(planes: list[TexturedPlane], frame: VideoFrame) -> np.ndarray:
     # The pictures of a real exposure are dense; a small blur closes the gaps between these.
     gap = SIZE[0] * np.radians(SHAKE_DEG) / (EXPOSURES - 1)
     pictures = [
-        render(planes, CameraPose(turned([0, t, 0]) @ frame.pose.rotation, frame.pose.centre), SIZE)
+        render(
+            planes,
+            CameraPose(turned(np.asarray([0, t, 0])) @ frame.pose.rotation, frame.pose.centre),
+            SIZE,
+        )
         for t in turns
     ]
     mean = np.mean(pictures, axis=0).astype(np.uint8)
@@ -160,8 +164,7 @@ def main(folder: Path) -> None:
         numbers = [int(Path(name).stem.rpartition("-")[2]) for name in found.names]
         chosen = [frames[number] for number in numbers]
         exact = [
-            exact_overlap(planes, a.pose, b.pose)
-            for a, b in zip(chosen, chosen[1:], strict=False)
+            exact_overlap(planes, a.pose, b.pose) for a, b in zip(chosen, chosen[1:], strict=False)
         ]
         by_part = {part: sum(f.part == part for f in chosen) for part in PARTS}
         print(

@@ -172,9 +172,8 @@ def _raw(data: bytes) -> "rawpy.RawPy":
 def _raw_header(data: bytes) -> Iterator[_RawHeader]:
     with _raw(data) as raw:
         sizes = raw.sizes
-        size = sizes.iwidth, sizes.iheight
-        if sizes.flip & SIDEWAYS:
-            size = size[::-1]
+        width, height = sizes.iwidth, sizes.iheight
+        size = (height, width) if sizes.flip & SIDEWAYS else (width, height)
         yield _RawHeader(size, _raw_exif(data, raw))
 
 
@@ -189,7 +188,8 @@ def _raw_exif(data: bytes, raw: "rawpy.RawPy") -> Image.Exif:
             exif.load(data)
             exif.get_ifd(ExifTags.IFD.Exif)
         else:
-            with any_size(), Image.open(io.BytesIO(raw.extract_thumb().data)) as preview:
+            jpeg = bytes(raw.extract_thumb().data)
+            with any_size(), Image.open(io.BytesIO(jpeg)) as preview:
                 exif = preview.getexif()
                 exif.get_ifd(ExifTags.IFD.Exif)  # read now, while the preview is open
     exif.pop(ExifTags.Base.Orientation, None)

@@ -56,7 +56,9 @@ class Video:
             yield frame
         shown = shown_name(str(self.path))
         if count == 0:
-            raise UserError(f"{shown}: no frame of this video can be decoded")
+            raise UserError(
+                f"{shown}: no frame of this video can be decoded; convert it to H.264 first"
+            )
         if count < FEWER * self.announced:
             logger.warning(
                 "%s: only the first %d of %d frames can be decoded", shown, count, self.announced

@@ -37,13 +37,17 @@ def test_a_motion_is_that_of_the_picture():
 
 def test_no_motion_is_found_where_there_is_nothing_to_follow():
     black = SmallFrame.of(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    noise = [np.random.default_rng(i).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8) for i in (0, 1)]
+    noise = [
+        np.random.default_rng(i).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8) for i in (0, 1)
+    ]
     for first, second in ((black, black), [SmallFrame.of(n) for n in noise]):
         assert followed_motion(first, second) is None
         assert matched_motion(first, second) is None
 
 
-@pytest.mark.parametrize("turn, scale, shift", [(0, 1, (40, -30)), (30, 1, (5, 9)), (10, 1.7, (-60, 20))])
+@pytest.mark.parametrize(
+    "turn, scale, shift", [(0, 1, (40, -30)), (30, 1, (5, 9)), (10, 1.7, (-60, 20))]
+)
 def test_the_common_area_is_that_of_counted_pixels(turn, scale, shift):
     angle = np.radians(turn)
     motion = np.eye(3)

@@ -143,9 +143,7 @@ def test_frames_that_share_enough_are_neighbours():
     assert chosen_pairs("sequential:7", FEW + 1, many_frames(0.9)) == "sequential:7"
 
 
-def test_a_video_is_reconstructed_from_the_frames_in_the_work_folder(
-    tmp_path, video, monkeypatch
-):
+def test_a_video_is_reconstructed_from_the_frames_in_the_work_folder(tmp_path, video, monkeypatch):
     calls = []
 
     def instead(images, out, *, config, options):

@@ -60,7 +60,6 @@ class _Written(NamedTuple):
     """A frame that has been written, without its pixels."""
 
     name: str
-    index: int
     motion: np.ndarray | None
     size: tuple[int, int]
 
@@ -128,11 +127,16 @@ def _finished(
             "delete this one"
         )
     # Frames that the user has deleted since then stay away.
-    return _as_found({name: frames[name] for name in inside if name in frames}, there=True)
+    left = {name: _part(frames[name]) for name in inside if name in frames}
+    return _as_found(left, there=True)
+
+
+def _part(value: Json) -> float | None:
+    return value if isinstance(value, float) and 0 <= value <= 1 else None
 
 
 def _as_found(frames: dict[str, float | None], *, there: bool) -> FramesFolder:
-    common = [part for part in frames.values() if isinstance(part, (int, float))]
+    common = [part for part in frames.values() if part is not None]
     return FramesFolder(list(frames), float(np.median(common)) if common else 0.0, there)
 
 
@@ -146,7 +150,7 @@ def _write_frames(
     for frame in choose_frames(frames, options.overlap):
         name = f"frame-{frame.index:06d}.jpg"
         (folder / name).write_bytes(_jpeg(frame))
-        written.append(_Written(name, frame.index, frame.motion, frame.size))
+        written.append(_Written(name, frame.motion, frame.size))
     if options.most is None or len(written) <= options.most:
         return written
     # The chosen frames lie at equal steps, so the remaining ones do too.
@@ -174,7 +178,7 @@ def _with_common(written: list[_Written]) -> dict[str, float | None]:
     """The part that each frame has in common with the frame before it, by name."""
     return {
         name: None if motion is None else round(common_area(motion, size), 4)
-        for name, _, motion, size in written
+        for name, motion, size in written
     }
 
 

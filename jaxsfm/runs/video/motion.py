@@ -70,8 +70,10 @@ def followed_motion(first: SmallFrame, second: SmallFrame) -> np.ndarray | None:
     if start is None or len(start) < LEAST:
         return None
     follow = {"winSize": WINDOW, "maxLevel": LEVELS}
-    end, there, _ = cv2.calcOpticalFlowPyrLK(first.grey, second.grey, start, None, **follow)
-    back, again, _ = cv2.calcOpticalFlowPyrLK(second.grey, first.grey, end, None, **follow)
+    room = np.empty_like(start)
+    end, there, _ = cv2.calcOpticalFlowPyrLK(first.grey, second.grey, start, room, **follow)
+    room = np.empty_like(start)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(second.grey, first.grey, end, room, **follow)
     error = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
     good = (there.ravel() == 1) & (again.ravel() == 1) & (error < BACK_PX)
     return _similarity(start[good].reshape(-1, 2), end[good].reshape(-1, 2))

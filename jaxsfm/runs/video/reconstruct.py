@@ -15,9 +15,7 @@ from jaxsfm.runs.video.frames import frames_folder
 logger = logging.getLogger("jaxsfm")
 
 
-def reconstruct_video(
-    video: Path, out: Path, *, config: Config, options: RunOptions
-) -> RunReport:
+def reconstruct_video(video: Path, out: Path, *, config: Config, options: RunOptions) -> RunReport:
     """Reconstruct a video; otherwise as `jaxsfm.runs.reconstruct.reconstruct_folder`.
 
     The frames are chosen once and kept in `out`/frames, which is the run's folder of photos. Frames
