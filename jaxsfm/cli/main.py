@@ -11,6 +11,7 @@ import tyro
 from jaxsfm.cli.bench_commands import ambiguous, daynight, homography, planes, strecha, warps, wxbs
 from jaxsfm.cli.data_commands import data
 from jaxsfm.cli.export_commands import export
+from jaxsfm.cli.frames_command import frames
 from jaxsfm.cli.localize_commands import extend, localize
 from jaxsfm.cli.pairs_command import pairs
 from jaxsfm.cli.result_commands import evaluate, report, view
@@ -51,6 +52,7 @@ jaxsfm --tyro-print-completion bash (or zsh, tcsh) prints a script that lets you
 commands and options."""
 COMMANDS = {
     "reconstruct": reconstruct,
+    "frames": frames,
     "match": match,
     "pairs": pairs,
     "localize": localize,

@@ -56,18 +56,20 @@ def reconstruct(
     execution: ExecutionChoice,
     engine: EngineChoice,
 ) -> int:
-    """Build a COLMAP model from a folder of photos.
+    """Build a COLMAP model from a folder of photos, or from a video.
 
     For example
         $ jaxsfm reconstruct PHOTOS --out OUT
         $ jaxsfm reconstruct PHOTOS --out OUT --intrinsics K.txt --preset robust
         $ jaxsfm reconstruct PHOTOS --out OUT --georeference gcp_list.txt
+        $ jaxsfm reconstruct VIDEO.mp4 --out OUT
 
     The exit status is 0 for a model, 1 if no model could be built, and 3 for a model that may be
     wrong: its verdict, in the summary and in the report, is amber or red.
 
     Args:
-      images: Folder with the photos; sub-folders are included.
+      images: Folder with the photos; sub-folders are included. If it is a video file, frames are
+        chosen and kept in OUT/frames, as jaxsfm frames chooses them.
       out: Folder for the results. If a run there was interrupted, the same command continues it.
     """
     chosen = config.config(network.relocalizer)
@@ -76,13 +78,15 @@ def reconstruct(
     from jaxsfm.report.summary import summary_lines
     from jaxsfm.runs.reconstruct import reconstruct_folder
     from jaxsfm.runs.run_options import RunOptions
+    from jaxsfm.runs.video.reconstruct import reconstruct_video
 
     with named_options():
         checked = Execution(**vars(execution))
     options = RunOptions(
         **vars(run), network=network, execution=checked, engine=engine, progress=True
     )
-    report = reconstruct_folder(images, out, config=chosen, options=options)
+    work = reconstruct_video if images.is_file() else reconstruct_folder
+    report = work(images, out, config=chosen, options=options)
     print("\n".join(summary_lines(report)))
     if not report.models:
         where = out / "failed" if (out / "sparse").exists() else out

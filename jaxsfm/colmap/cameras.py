@@ -20,6 +20,7 @@ from jaxsfm.colmap.intrinsics import (
     is_turned,
     sizes_of,
 )
+from jaxsfm.colmap.stand_in import readable_by_colmap
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, shown_name
 from jaxsfm.io.orientation import QUARTERS
@@ -129,7 +130,8 @@ def estimated_camera(group: Sequence[ImageFile], model: str = "SIMPLE_RADIAL") -
     options.camera_model = model
     for image in group if group[0].taken_with else group[:1]:
         try:
-            camera = pycolmap.infer_camera_from_image(image.path, options)
+            with readable_by_colmap(image) as path:
+                camera = pycolmap.infer_camera_from_image(path, options)
         except Exception:  # COLMAP reads fewer formats, and raises various errors
             continue
         if camera.has_prior_focal_length and (camera.width, camera.height) == size:

@@ -122,11 +122,15 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Make an empty folder; it takes the place of `path` when the block ends.
 
     The old folder is removed before the new one is renamed, so a process that is killed between
-    the two leaves neither.
+    the two leaves neither. If the block fails, nothing is left of the new folder.
     """
     partial = path.with_name(path.name + PARTIAL)
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    yield partial
+    try:
+        yield partial
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
     shutil.rmtree(path, ignore_errors=True)
     partial.rename(path)

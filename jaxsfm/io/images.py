@@ -5,25 +5,23 @@ that are written are those of the stored pixels. COLMAP 4.2 does the same (measu
 and intrinsics agree with COLMAP's own tools.
 """
 
-import contextlib
 import dataclasses
 import hashlib
-import io
 import logging
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
-from jaxsfm.io import orientation
+from jaxsfm.io import decoders, orientation
 from jaxsfm.io.masks import (
     MaskFile,
     mask_path,
@@ -35,7 +33,9 @@ from jaxsfm.io.masks import (
 
 logger = logging.getLogger(__name__)
 
-SUFFIXES = frozenset(".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split())
+SUFFIXES = frozenset(
+    (*".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split(), *decoders.SUFFIXES)
+)
 MAX_DECODED_PIXELS = 250_000_000
 """Larger images (0.75 GB) are refused, or decoded at reduced size if their format allows it."""
 MOST_NAMED = 3
@@ -153,6 +153,10 @@ class WorkingImage(NamedTuple):
 def find_images(folder: Path) -> list[str]:
     """The names of the image files in a folder and its sub-folders, sorted, without hidden ones.
 
+    Cameras and phones store a photo in two formats, and people convert photos. Of files that differ
+    in their suffix alone, a RAW file is left out if there is another one, and a HEIC or AVIF file
+    if there is one in a usual format.
+
     Raises:
       UserError: there is no such folder, it cannot be read, or it holds no images.
     """
@@ -179,7 +183,19 @@ def find_images(folder: Path) -> list[str]:
     if not names:
         suffixes = ", ".join(sorted(SUFFIXES))
         raise UserError(f"{folder}: there are no images in this folder (looked for {suffixes})")
-    return sorted(names)
+    return _without_doubles(sorted(names))
+
+
+def _without_doubles(names: list[str]) -> list[str]:
+    rank = {name: decoders.RANK[decoders.SUFFIXES.get(Path(name).suffix.lower())] for name in names}
+    least: dict[str, int] = {}
+    for name in names:
+        stem = name.removesuffix(Path(name).suffix)
+        least[stem] = min(rank[name], least.get(stem, rank[name]))
+    doubles = [n for n in names if rank[n] > least[n.removesuffix(Path(n).suffix)]]
+    if doubles:
+        logger.info("left out, as the same photo is there in another format: %s", named(doubles))
+    return sorted({*names} - {*doubles})
 
 
 def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
@@ -206,11 +222,13 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     if not data:
         raise ImageError(f"{shown}: the file is empty")
     try:
-        with warnings.catch_warnings(), _any_size():
+        with warnings.catch_warnings(), decoders.any_size():
             warnings.simplefilter("ignore")  # about odd metadata; only the size is needed
             # Pillow is not given the path: reading from a file, it allocates what the header says.
-            with Image.open(io.BytesIO(data)) as header:
+            with decoders.open_header(data, path.suffix) as header:
                 size, exif = header.size, _exif(header)
+    except decoders.MissingReader as error:
+        raise ImageError(f"{shown}: {error}") from error
     except Exception as error:  # Pillow's readers can raise almost anything
         raise ImageError(f"{shown}: not a readable image") from error
     if min(size) < MIN_SIDE:
@@ -235,7 +253,7 @@ _CAMERA = ("Make", "Model", "BodySerialNumber", "LensModel", "FocalLength", "Dig
 """The tags that tell cameras apart."""
 
 
-def _exif(header: Image.Image) -> dict[int, object]:
+def _exif(header: decoders.Header) -> dict[int, object]:
     """The EXIF data of a photo; empty if there is none or it is damaged."""
     try:
         exif = header.getexif()
@@ -291,17 +309,6 @@ def _jpeg_is_complete(data: bytes) -> bool:
     return data[position : position + 2] == b"\xff\xd9"
 
 
-@contextlib.contextmanager
-def _any_size() -> Iterator[None]:
-    """Let Pillow read the header of an image of any size; `_decode` has a limit of its own."""
-    limit = Image.MAX_IMAGE_PIXELS
-    Image.MAX_IMAGE_PIXELS = None
-    try:
-        yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
-
-
 def image_bytes(image: ImageFile) -> bytes:
     """Read the bytes of an image file, which must be those that were inspected.
 
@@ -334,7 +341,9 @@ def _decode(image: ImageFile) -> np.ndarray:
         )
         flags = _REDUCED[factors[0]] | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        bgr = cv2.imdecode(np.frombuffer(image_bytes(image), np.uint8), flags)
+        bgr = decoders.decoded(image_bytes(image), image.path.suffix, flags)
+    except decoders.MissingReader as error:
+        raise ImageError(f"{shown}: {error}") from error
     except MemoryError as error:
         raise ImageError(f"{shown}: there is not enough memory to decode it") from error
     except cv2.error as error:

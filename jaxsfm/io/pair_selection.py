@@ -20,15 +20,34 @@ MANY = "retrieval:20+sequential:3"
 """What `auto` tries of more photos: similar ones, and neighbours by name."""
 
 
-def chosen_pairs(text: str, photos: int) -> str:
+SHARED = 0.4
+"""Frames of a video that share about this part of their views, or more, are matched as neighbours.
+Pairs that share less are left to retrieval."""
+MOST_NEIGHBOURS = 10
+
+
+def chosen_pairs(text: str, photos: int, many: str = MANY) -> str:
     """A value of `--pairs` with what `auto` stands for, unless a file of this name exists.
 
     Args:
       photos: their number.
+      many: what `auto` stands for if they are many.
     """
     if text != "auto" or os.path.isfile(text):
         return text
-    return "exhaustive" if photos <= FEW else MANY
+    return "exhaustive" if photos <= FEW else many
+
+
+def many_frames(common: float) -> str:
+    """What `auto` stands for with many frames of a video.
+
+    Retrieval finds the frames of a place to which the camera comes back.
+
+    Args:
+      common: the part of a view that neighbouring frames have in common.
+    """
+    steps = round((1 - SHARED) / max(1 - common, 1e-6))
+    return f"retrieval:20+sequential:{min(max(steps, 2), MOST_NEIGHBOURS)}"
 
 
 class PairSelection(NamedTuple):

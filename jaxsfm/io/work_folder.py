@@ -21,6 +21,10 @@ logger = logging.getLogger(__name__)
 
 RECORD = "run.json"
 """The file with the identity of the last run. A folder without it is not a work folder."""
+FRAMES = "frames"
+"""The folder with the frames of a video. It is there before the first run begins."""
+FRAMES_RECORD = "frames.json"
+"""The file in it that says what the frames were made from."""
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")
@@ -176,8 +180,12 @@ def _prepare(path: Path) -> None:
         if path.exists() and not path.is_dir():
             raise UserError(f"--out {path}: this is a file and not a folder")
         if path.is_dir() and not (path / RECORD).exists():
-            begun = set(path.glob(f"{RECORD}.*{PARTIAL}"))
-            strangers = sorted(p.name for p in {*path.iterdir()} - begun if p.name != _LOCK)
+            begun = {*path.glob(f"{RECORD}.*{PARTIAL}"), path / _LOCK}
+            if (path / _LOCK).exists():
+                begun.add(path / (FRAMES + PARTIAL))
+            if (path / FRAMES / FRAMES_RECORD).is_file():
+                begun.add(path / FRAMES)
+            strangers = sorted(p.name for p in {*path.iterdir()} - begun)
             if strangers:
                 raise UserError(
                     f"--out {path}: the folder is not empty and not a jaxsfm run (it holds "

@@ -1,12 +1,16 @@
 """Damaged image files: pixels, or one sentence that names the file."""
 
+import io
 import struct
 import zlib
 
 import cv2
 import numpy as np
+import pillow_heif
 from fuzz_children import run_cases
 from mutations import damaged, outcome
+from PIL import Image
+from raw_files import dng
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.io.images import inspect_image, read_image
@@ -14,15 +18,34 @@ from jaxsfm.io.images import inspect_image, read_image
 FORMATS = ("jpg", "png", "tif", "bmp", "webp", "ppm", "pgm", "jp2")
 
 
+SPECIAL = ("heic", "avif", "dng")
+"""The formats that OpenCV does not decode."""
+
+
 def whole(suffix: str) -> bytes:
     """A small photo-like image in a format."""
     ramp = np.add.outer(np.arange(80), 2 * np.arange(96))[..., None] * [1, 0.5, 0.25]
     pixels = (ramp % 256).astype(np.uint8)
+    if suffix == "dng":
+        return dng(pixels)
+    if suffix in SPECIAL:
+        pillow_heif.register_heif_opener()
+        file = io.BytesIO()
+        Image.fromarray(pixels).save(file, {"heic": "HEIF"}.get(suffix, suffix))
+        return file.getvalue()
     return cv2.imencode(f".{suffix}", pixels[..., 0] if suffix == "pgm" else pixels)[1].tobytes()
 
 
 def image(rng, folder) -> str:
-    suffix = FORMATS[rng.integers(len(FORMATS))]
+    return one_of(FORMATS, rng, folder)
+
+
+def special(rng, folder) -> str:
+    return one_of(SPECIAL, rng, folder)
+
+
+def one_of(formats, rng, folder) -> str:
+    suffix = formats[rng.integers(len(formats))]
     path = folder / f"photo.{suffix}"
     path.write_bytes(damaged(whole(suffix), rng))
 
@@ -62,6 +85,11 @@ def absurd_size(rng, folder) -> str:
 def test_a_damaged_image_is_read_or_refused_by_name(tmp_path, share, least):
     found = run_cases("test_fuzz_images", "image", round(600 * share), tmp_path)
     assert found["read"] > 100 * least and found["refused"] > 100 * least
+
+
+def test_a_damaged_heic_avif_or_raw_is_read_or_refused_by_name(tmp_path, share, least):
+    found = run_cases("test_fuzz_images", "special", round(300 * share), tmp_path)
+    assert found["read"] > 30 * least and found["refused"] > 50 * least
 
 
 def test_what_a_header_claims_is_not_allocated(tmp_path, share, least):

@@ -28,6 +28,8 @@ PAGES = (
 )
 LONG = (
     "jaxsfm.runs.reconstruct.reconstruct_folder",
+    "jaxsfm.runs.video.reconstruct.reconstruct_video",
+    "jaxsfm.runs.video.frames.frames_folder",
     "jaxsfm.bench.demo.run_demo",
     "jaxsfm.matching.retrieval.shortlist",
     "jaxsfm.runs.localize.localize_photos",
@@ -49,7 +51,7 @@ INDENTED = re.compile(r"^ {4}(?:\.venv/bin/)?(jaxsfm [a-z-].*)$", re.MULTILINE)
 INLINE = re.compile(r"`(jaxsfm [a-z]+ [^`]*--[^`]*)`")
 FOLDERS = (
     *("PHOTOS", "OTHER_PHOTOS", "images", "FOLDER", "DIR", "SETS", "SCENES"),
-    *("OXFORD", "PAIRS", "SEQUENCES", "POINTS"),
+    *("FRAMES", "OXFORD", "PAIRS", "SEQUENCES", "POINTS"),
 )
 """Names of folders in the documentation."""
 SHELL = {
@@ -92,6 +94,7 @@ def home(plain, scene, tmp_path, monkeypatch):
         shutil.copy(photo, tmp_path / name)
     for folder in (tmp_path, tmp_path / "images"):
         shutil.copy(scene / "K.txt", folder)
+    (tmp_path / "VIDEO.mp4").touch()
     (tmp_path / "pairs.txt").write_text(f"{photos[0].name} {photos[1].name}\n")
     shutil.copy(ROOT / "jaxsfm/relocalizer.safetensors", tmp_path / "mine.safetensors")
     monkeypatch.chdir(tmp_path)

@@ -1,0 +1,1 @@
+"""Chooses frames of a video, and reconstructs them."""
