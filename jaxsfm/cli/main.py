@@ -12,6 +12,7 @@ from jaxsfm.cli.data_commands import data
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.localize_commands import extend, localize
 from jaxsfm.cli.pairs_command import pairs
+from jaxsfm.cli.refine_command import refine
 from jaxsfm.cli.result_commands import evaluate, report, view
 from jaxsfm.cli.run_commands import demo, match, reconstruct
 from jaxsfm.cli.subcommands import one_of, unwrapped
@@ -54,6 +55,7 @@ COMMANDS = {
     "pairs": pairs,
     "localize": localize,
     "extend": extend,
+    "refine": refine,
     "evaluate": evaluate,
     "report": report,
     "view": view,
