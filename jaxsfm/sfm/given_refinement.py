@@ -25,8 +25,10 @@ GOOD_ERROR_PX = 1.0
 times this, working pixels."""
 MAX_OCTAVE = 3
 """It starts at an eighth of the working size at most."""
-FAR = 3.0
-"""Cameras that moved more than so many times the median do not say where the model lies."""
+STAYED, ROUNDS = 2 / 3, 10
+"""The share of the cameras that say where the model lies, and how often it is chosen anew which.
+The others moved most: their poses were wrong, and must not turn the model when they are
+corrected."""
 
 
 class GivenRefinement(NamedTuple):
@@ -99,14 +101,14 @@ def _move_back(model: "pycolmap.Reconstruction", before: Poses) -> None:
     names = sorted(after)
     own = np.asarray([after[name].centre for name in names])
     wanted = np.asarray([before[name].centre for name in names])
-    try:
-        found = align(own, wanted)
-        # A camera whose pose was wrong, and is corrected, must not turn the others.
+    chosen = np.arange(len(names))
+    for _ in range(ROUNDS):
+        try:
+            found = align(own[chosen], wanted[chosen])
+        except UserError:
+            return
         left = np.linalg.norm(
             found.scale * own @ found.rotation.T + found.translation - wanted, axis=1
         )
-        near = left <= FAR * np.median(left)
-        found = align(own[near], wanted[near])
-    except UserError:
-        return
+        chosen = np.argsort(left, kind="stable")[: max(3, math.ceil(STAYED * len(names)))]
     move(model, *found)

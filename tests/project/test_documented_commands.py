@@ -32,6 +32,7 @@ LONG = (
     "jaxsfm.matching.retrieval.shortlist",
     "jaxsfm.runs.localize.localize_photos",
     "jaxsfm.runs.extend.extend_run",
+    "jaxsfm.runs.refine.refine_folder",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.matching.extraction.image_features",
     "jaxsfm.bench.datasets.fetch",
