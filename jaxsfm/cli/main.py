@@ -11,8 +11,8 @@ from jaxsfm.cli.bench_commands import ambiguous, daynight, homography, planes, s
 from jaxsfm.cli.data_commands import data
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.localize_commands import extend, localize
+from jaxsfm.cli.model_commands import merge, refine
 from jaxsfm.cli.pairs_command import pairs
-from jaxsfm.cli.refine_command import refine
 from jaxsfm.cli.result_commands import evaluate, report, view
 from jaxsfm.cli.run_commands import demo, match, reconstruct
 from jaxsfm.cli.subcommands import one_of, unwrapped
@@ -56,6 +56,7 @@ COMMANDS = {
     "localize": localize,
     "extend": extend,
     "refine": refine,
+    "merge": merge,
     "evaluate": evaluate,
     "report": report,
     "view": view,

@@ -86,13 +86,21 @@ def looks_calibrated(model: pycolmap.Reconstruction) -> bool:
     COLMAP puts the principal point of a camera that it guesses into the image's centre, and its
     mapper leaves it there. So a principal point beside the centre comes from a calibration.
     """
-    used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
-    cameras = [model.camera(camera_id) for camera_id in used]
     return not any(
         camera.principal_point_x == camera.width / 2
         and camera.principal_point_y == camera.height / 2
-        for camera in cameras
+        for camera in _used_cameras(model)
     )
+
+
+def shares_cameras(model: pycolmap.Reconstruction) -> bool:
+    """Whether a camera has two images or more in the mean, of the images with a pose."""
+    return model.num_reg_images() >= 2 * len(_used_cameras(model))
+
+
+def _used_cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
+    used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+    return [model.camera(camera_id) for camera_id in sorted(used)]
 
 
 def _check_names(path: Path) -> None:

@@ -9,12 +9,11 @@ import numpy as np
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.model_folders import colour_points
-from jaxsfm.colmap.poses import Poses, model_poses
-from jaxsfm.colmap.updated_model import has_rigs, move, updated
+from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.updated_model import has_rigs, updated
 from jaxsfm.config import Refinement
-from jaxsfm.errors import UserError
-from jaxsfm.sfm.evaluation import align
 from jaxsfm.sfm.model_photos import ModelPhotos
+from jaxsfm.sfm.old_frame import move_back
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 
 if TYPE_CHECKING:
@@ -25,10 +24,6 @@ GOOD_ERROR_PX = 1.0
 times this, working pixels."""
 MAX_OCTAVE = 3
 """It starts at an eighth of the working size at most."""
-STAYED, ROUNDS = 2 / 3, 10
-"""The share of the cameras that say where the model lies, and how often it is chosen anew which.
-The others moved most: their poses were wrong, and must not turn the model when they are
-corrected."""
 
 
 class GivenRefinement(NamedTuple):
@@ -70,7 +65,7 @@ def refine_given(
     model = updated(given, refined)
     if has_rigs(model):
         bundle_adjust(model, loss_px=1.0, refine_intrinsics=refine_intrinsics, threads=threads)
-    _move_back(model, model_poses(given))
+    move_back(model, model_poses(given))
     return GivenRefinement(model, figures)
 
 
@@ -88,27 +83,3 @@ def _described_px(given: "pycolmap.Reconstruction", photos: ModelPhotos) -> int:
     errors = Model.from_colmap(given, sizes).errors_px()
     octave = round(math.log2(max(1.0, float(np.median(errors)) / GOOD_ERROR_PX)))
     return 2 ** min(octave, MAX_OCTAVE)
-
-
-def _move_back(model: "pycolmap.Reconstruction", before: Poses) -> None:
-    """Move a model so that its cameras lie as they did before, in place.
-
-    Bundle adjustment holds one camera, and the others turn about it. What else the user has in the
-    frame of the given model, such as a mesh or a georeference, shall still fit. Cameras on one line
-    do not say how the model lies; then it stays.
-    """
-    after = model_poses(model)
-    names = sorted(after)
-    own = np.asarray([after[name].centre for name in names])
-    wanted = np.asarray([before[name].centre for name in names])
-    chosen = np.arange(len(names))
-    for _ in range(ROUNDS):
-        try:
-            found = align(own[chosen], wanted[chosen])
-        except UserError:
-            return
-        left = np.linalg.norm(
-            found.scale * own @ found.rotation.T + found.translation - wanted, axis=1
-        )
-        chosen = np.argsort(left, kind="stable")[: max(3, math.ceil(STAYED * len(names)))]
-    move(model, *found)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 from room_scene import SIZE, Room, arrays, errors, exact_tracks, noisy_model, other_scene
 
 from jaxsfm.cli.main import main
@@ -250,6 +251,37 @@ def test_a_photo_that_is_missing_keeps_its_place(tmp_path, rendered, noisy, phot
     image = next(image for image in after.images.values() if image.name == "2.png")
     assert image.num_points3D > 100
     assert errors(after, rendered)[0] < errors(read_model(noisy), rendered)[0]
+
+
+def test_a_camera_of_one_photo_keeps_its_intrinsics(tmp_path, rendered, photos):
+    model = noisy_model(rendered, 1.0)
+    own = arrays(model, rendered)
+    views = [
+        dataclasses.replace(v, camera=pycolmap.Camera({**v.camera.todict(), "camera_id": k}))
+        for k, v in enumerate(own.views, 1)
+    ]
+    write(tmp_path / "in", dataclasses.replace(own, views=views, cameras={}).to_colmap())
+    options = RefineOptions(config=ONE_PASS.config, threads=1)
+    after, report = refined(tmp_path / "in", photos, tmp_path / "out", options)
+    assert not report.refined_intrinsics and len(after.cameras) == 5
+    assert all(np.array_equal(c.params, model.camera(1).params) for c in after.cameras.values())
+
+
+def test_the_orientation_in_the_exif_data_changes_nothing(tmp_path, rendered, noisy):
+    """The model counts the pixels of the photos as they are stored."""
+    plain, tagged = tmp_path / "plain", tmp_path / "tagged"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for folder, more in ((plain, {}), (tagged, {"exif": exif})):
+        folder.mkdir()
+        for name, image in rendered.images.items():
+            pixels = Image.fromarray(np.uint8(np.clip(np.round(image), 0, 255)))
+            pixels.save(folder / name, **more)
+    one, other = (
+        refined(noisy, folder, tmp_path / f"out {folder.name}")[0] for folder in (plain, tagged)
+    )
+    for name, pose in model_poses(one).items():
+        np.testing.assert_array_equal(model_poses(other)[name].centre, pose.centre)
 
 
 def test_intrinsics_are_refined_unless_they_look_calibrated(tmp_path, rendered, photos):

@@ -7,7 +7,8 @@ from room_scene import SIZE, noisy_model
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.colmap.updated_model import move
-from jaxsfm.sfm.given_refinement import _described_px, _move_back
+from jaxsfm.sfm.given_refinement import _described_px
+from jaxsfm.sfm.old_frame import move_back
 
 
 class Photos:
@@ -29,7 +30,7 @@ def test_a_corrected_camera_does_not_move_the_others(rendered):
     before = truth | {"4.png": CameraPose(wrong.rotation, wrong.centre + [0.5, -0.2, 0.3])}
     turn = np.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     move(model, 1.3, turn, np.asarray([1.0, 2.0, 3.0]))
-    _move_back(model, before)
+    move_back(model, before)
     after = model_poses(model)
     for name, pose in truth.items():
         np.testing.assert_allclose(after[name].centre, pose.centre, atol=1e-9)
@@ -41,9 +42,7 @@ def test_two_cameras_stay_where_the_adjustment_put_them(rendered):
     whole = Model.from_colmap(noisy_model(rendered, 0.0), sizes)
     model = whole.part({"0.png", "1.png"})[0].to_colmap()
     before = model_poses(model)
-    _move_back(
-        model, {name: pose._replace(centre=2 * pose.centre) for name, pose in before.items()}
-    )
+    move_back(model, {name: pose._replace(centre=2 * pose.centre) for name, pose in before.items()})
     for name, pose in model_poses(model).items():
         np.testing.assert_allclose(pose.centre, before[name].centre, atol=1e-12)
 

@@ -1,4 +1,4 @@
-"""The command `jaxsfm refine`: a model of any tool, refined to a fraction of a pixel."""
+"""The commands `jaxsfm refine` and `jaxsfm merge`, which work on COLMAP models of any tool."""
 
 import sys
 from pathlib import Path
@@ -38,9 +38,9 @@ def refine(
       out: New folder for the refined model and refine.json.
       max_size: Limit for the longer side of a photo, in pixels. Larger photos are reduced to it.
       passes: How many times observations are aligned and the model is adjusted.
-      refine_intrinsics: Whether focal lengths and distortion are refined too. auto: unless the
-        cameras look calibrated, because their principal points lie beside the centres of the
-        photos.
+      refine_intrinsics: Whether focal lengths and distortion are refined too. auto: if photos share
+        cameras, unless these look calibrated, because their principal points lie beside the centres
+        of the photos.
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores. With 1 thread, the
         same command gives the same model, byte for byte.
     """
@@ -63,4 +63,39 @@ def refine(
         )
         return 1
     print("\n".join([*refine_lines(report), f"refined model: {out}"]))
+    return 0
+
+
+def merge(
+    first: Positional[Path],
+    second: Positional[Path],
+    *,
+    out: Path,
+    refine_intrinsics: Literal["auto", "yes", "no"] = "auto",
+    threads: int = -1,
+) -> int:
+    """Join two COLMAP models that share photos.
+
+    The second model is moved into the frame of the first one, points that both have become one, and
+    all is adjusted together. Photos are the same if their names are. The models must share at least
+    two photos and the keypoints in them, so both need the same features.
+
+    For example
+        $ jaxsfm merge A B --out BOTH
+
+    Args:
+      first: Folder of a model, binary or text, or of a run.
+      second: Folder of the other one.
+      out: New folder for the joined model and merge.json.
+      refine_intrinsics: Whether focal lengths and distortion are adjusted too. auto: unless the
+        cameras of both models look calibrated.
+      threads: Number of threads of COLMAP and all else; -1 uses all cores. With 1 thread, the same
+        command gives the same model, byte for byte.
+    """
+    check_threads(threads)
+    limit_threads(threads)
+    from jaxsfm.runs.merge import merge_folders, merge_lines
+
+    report = merge_folders(first, second, out, refine_intrinsics=refine_intrinsics, threads=threads)
+    print("\n".join([*merge_lines(report), f"joined model: {out}"]))
     return 0
