@@ -51,5 +51,6 @@ def coloured(model: pycolmap.Reconstruction, points: np.ndarray, colours: np.nda
     """
     ids = sorted(model.point3D_ids())
     own = np.asarray([model.point3D(i).xyz for i in ids]).reshape(-1, 3)
-    for i, row in zip(ids, KDTree(points).query(own)[1], strict=True):
+    nearest = np.asarray(KDTree(points).query(own)[1])
+    for i, row in zip(ids, nearest, strict=True):
         model.point3D(i).color = colours[row]

@@ -25,7 +25,7 @@ def updated(
         model.image(image_id).points2D = pycolmap.Point2DList(points)
     for camera_id in model.cameras:
         if refined.exists_camera(camera_id):
-            model.camera(camera_id).params = refined.camera(camera_id).params
+            model.camera(camera_id).params = refined.camera(camera_id).params.tolist()
     left = set(refined.reg_image_ids())
     for frame_id in sorted(model.reg_frame_ids()):
         frame = model.frame(frame_id)

@@ -80,7 +80,9 @@ def reconstruct_folder(
     _check_enough(images, usable, skipped)
     if intrinsics is not None:
         check_fits(intrinsics, {image.name: image.size for image in usable})
-    external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
+    external = read_external_matches(
+        options.with_database, options.with_hloc, usable, intrinsics, dense=options.with_dense
+    )
     weights = chosen_weights(options.network, config.backbone)
     if selection.retrieval:
         check_retrieval(options.retrieval, weights)

@@ -106,13 +106,17 @@ def refine_folder(
         and not looks_calibrated(given)
     )
     with tqdm(desc="refining", unit="pass", disable=not options.progress, delay=2) as bar:
+
+        def passed() -> None:
+            bar.update()
+
         found = refine_given(
             given,
             photos,
             refinement=settings,
             refine_intrinsics=refines,
             threads=options.threads,
-            on_pass=lambda: bar.update() and None,
+            on_pass=passed,
         )
     if found is None:
         return None
@@ -189,7 +193,7 @@ def refine_lines(report: RefineReport) -> list[str]:
     lines += [f"{name:24s}{old:>12s}{new:>12s}" for name, old, new in rows]
     for number, done in enumerate(passes, 1):
         lines.append(
-            f"pass {number}: {done.kept} observations agreed and moved by {done.shift_px:.2f} px "
+            f"pass {number}: {done.kept} observations agreed and moved by {done.shift_px or 0:.2f} px "
             f"on average, {done.dropped} were dropped, {done.added} added"
             + ("" if done.accepted else "; too few agreed, so this pass was taken back")
         )

@@ -58,8 +58,8 @@ def common_points(first: Model, second: Model, shared: Sequence[str]) -> CommonP
         (point0, xy0), (point1, xy1) = sides
         if not len(xy0) or not len(xy1):
             continue
-        distance, to = KDTree(xy1).query(xy0)
-        back = KDTree(xy0).query(xy1)[1]
+        distance, to = map(np.asarray, KDTree(xy1).query(xy0))
+        back = np.asarray(KDTree(xy0).query(xy1)[1])
         mutual = np.flatnonzero((distance <= REACH_PX) & (back[to] == np.arange(len(to))))
         met.append(np.stack([point0[mutual], point1[to[mutual]]], axis=1))
     rows, times = np.unique(np.concatenate(met), axis=0, return_counts=True)

@@ -165,10 +165,13 @@ def _adjusted(
     model: Model, limit_px: float, refine_intrinsics: bool, threads: int
 ) -> "pycolmap.Reconstruction":
     """Filter the observations and adjust the bundle, twice; the first filter is coarse."""
-    for slack in (4.0, 1.0):
+
+    def once(slack: float) -> "pycolmap.Reconstruction":
         made = model.select(model.errors_px() < slack * limit_px).to_colmap()
         bundle_adjust(
             made, loss_px=limit_px / 4, refine_intrinsics=refine_intrinsics, threads=threads
         )
-        model = Model.from_colmap(made, model.sizes)
-    return made
+        return made
+
+    model = Model.from_colmap(once(4.0), model.sizes)
+    return once(1.0)

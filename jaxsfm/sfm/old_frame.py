@@ -30,14 +30,13 @@ def move_back(model: "pycolmap.Reconstruction", before: Poses) -> None:
     names = sorted(after.keys() & before.keys())
     own = np.asarray([after[name].centre for name in names])
     wanted = np.asarray([before[name].centre for name in names])
-    chosen = np.arange(len(names))
-    for _ in range(ROUNDS):
-        try:
-            found = align(own[chosen], wanted[chosen])
-        except UserError:
-            return
-        left = np.linalg.norm(
-            found.scale * own @ found.rotation.T + found.translation - wanted, axis=1
-        )
-        chosen = np.argsort(left, kind="stable")[: max(3, math.ceil(STAYED * len(names)))]
-    move(model, *found)
+    count = max(3, math.ceil(STAYED * len(names)))
+    try:
+        found = align(own, wanted)
+        for _ in range(ROUNDS):
+            at = found.scale * own @ found.rotation.T + found.translation
+            nearest = np.argsort(np.linalg.norm(at - wanted, axis=1), kind="stable")[:count]
+            found = align(own[nearest], wanted[nearest])
+    except UserError:
+        return
+    move(model, found.scale, found.rotation, found.translation)
