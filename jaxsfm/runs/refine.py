@@ -192,8 +192,9 @@ def refine_lines(report: RefineReport) -> list[str]:
     lines = [f"{'':24s}{'before':>12s}{'after':>12s}"]
     lines += [f"{name:24s}{old:>12s}{new:>12s}" for name, old, new in rows]
     for number, done in enumerate(passes, 1):
+        shift = done.shift_px or 0.0
         lines.append(
-            f"pass {number}: {done.kept} observations agreed and moved by {done.shift_px or 0:.2f} px "
+            f"pass {number}: {done.kept} observations agreed and moved by {shift:.2f} px "
             f"on average, {done.dropped} were dropped, {done.added} added"
             + ("" if done.accepted else "; too few agreed, so this pass was taken back")
         )
