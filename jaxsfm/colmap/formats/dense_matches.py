@@ -48,8 +48,8 @@ def read_dense_matches(path: Path, sizes: Mapping[str, tuple[int, int]], *, wher
     try:
         with h5py.File(path, "r") as file:
             pairs = [
-                _points(group, names, sizes, f"{where}: {describe(names)}")
-                for *names, group in pairs_in(file, known, "keypoints0")
+                _points(group, (name0, name1), sizes, f"{where}: {describe((name0, name1))}")
+                for name0, name1, group in pairs_in(file, known, "keypoints0")
             ]
     except DAMAGED as error:
         raise UserError(f"{where}: not a readable file of matches ({error})") from error
@@ -74,16 +74,15 @@ def _once(pairs: Iterable[PairPoints], where: str) -> list[PairPoints]:
 
 def _points(
     group: h5py.Group,
-    names: Iterable[str],
+    names: tuple[str, str],
     sizes: Mapping[str, tuple[int, int]],
     where: str,
 ) -> PairPoints:
-    name0, name1 = names
     xy0, xy1 = (
         checked_keypoints(dataset(group, key, where, MAX_KEYPOINTS), where)
         for key in ("keypoints0", "keypoints1")
     )
-    for name, xy in ((name0, xy0), (name1, xy1)):
+    for name, xy in zip(names, (xy0, xy1), strict=True):
         if (np.abs(xy - np.clip(xy, 0, np.asarray(sizes[name]) - 1)) > BORDER_PX).any():
             width, height = sizes[name]
             raise UserError(
@@ -97,4 +96,4 @@ def _points(
             f"{where}: keypoints0, keypoints1 and scores must be of the same matches; got "
             f"{len(xy0)}, {len(xy1)} and {len(scores)}"
         )
-    return PairPoints((name0, name1), xy0, xy1, np.maximum(scores, LEAST_SCORE))
+    return PairPoints(names, xy0, xy1, np.maximum(scores, LEAST_SCORE))
