@@ -125,6 +125,9 @@ class ReconstructionChoice:
         mapped together with those of jaxsfm.
       with_hloc: The features.h5 and matches.h5 that hloc wrote for the same photos. Its matches
         are mapped together with those of jaxsfm.
+      with_dense: File of a detector-free matcher (LoFTR, RoMa, DKM) with keypoints0 and keypoints1
+        of each pair, as hloc stores it. Its points are gathered to keypoints that pairs share, and
+        its matches are mapped together with those of jaxsfm.
       keep_features: Keep the features in the folder (25 MB for a photo of 1536 x 1024), so that
         localize and extend need not compute them again. They use features of full size, so this
         helps them with --first-look 0.
@@ -145,6 +148,7 @@ class ReconstructionChoice:
     georeference: str = "auto"
     with_database: Path | None = None
     with_hloc: tuple[Path, Path] | None = None
+    with_dense: Path | None = None
     keep_features: bool = False
 
     @property

@@ -13,6 +13,7 @@ from jaxsfm.cli.data_commands import data
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.frames_command import frames
 from jaxsfm.cli.localize_commands import extend, localize
+from jaxsfm.cli.model_commands import merge, refine
 from jaxsfm.cli.pairs_command import pairs
 from jaxsfm.cli.result_commands import evaluate, report, view
 from jaxsfm.cli.run_commands import demo, match, reconstruct
@@ -57,6 +58,8 @@ COMMANDS = {
     "pairs": pairs,
     "localize": localize,
     "extend": extend,
+    "refine": refine,
+    "merge": merge,
     "evaluate": evaluate,
     "report": report,
     "view": view,

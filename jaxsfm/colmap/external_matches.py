@@ -66,8 +66,11 @@ def read_external_matches(
     hloc: tuple[Path, Path] | None,
     images: Collection[ImageFile],
     intrinsics: Intrinsics | None,
+    *,
+    dense: Path | None = None,
 ) -> ExternalMatches:
-    """Read the matches of `--with-database` or `--with-hloc`, and check them against the photos.
+    """Read the matches of `--with-database`, `--with-hloc` or `--with-dense`, and check them
+    against the photos.
 
     If the file holds two-view inliers, these are used; otherwise its matches. Cameras are not
     taken over.
@@ -76,8 +79,8 @@ def read_external_matches(
       UserError: the files cannot be read, are inconsistent, or are of other photos, sizes or
         cameras.
     """
-    if database is not None and hloc is not None:
-        raise UserError("--with-database and --with-hloc: give only one of them")
+    if sum(each is not None for each in (database, hloc, dense)) > 1:
+        raise UserError("--with-database, --with-hloc and --with-dense: give only one of them")
     if database is not None:
         where, files = f"--with-database {database}", [database]
         tables = read_database(database, where=where)
@@ -86,6 +89,11 @@ def read_external_matches(
 
         where, files = "--with-hloc", list(hloc)
         tables = read_hloc(*hloc, [image.name for image in images], where=where)
+    elif dense is not None:
+        from jaxsfm.colmap.formats.dense_matches import read_dense_matches  # loads h5py
+
+        where, files = f"--with-dense {dense}", [dense]
+        tables = read_dense_matches(dense, {each.name: each.size for each in images}, where=where)
     else:
         return NO_EXTERNAL_MATCHES
     return _checked(tables, images, intrinsics, where, files)

@@ -21,6 +21,9 @@ class CameraPose(NamedTuple):
 
 Poses = dict[str, CameraPose]
 _SUBFOLDERS = ("", "gt_dense_cameras", "sparse/0", "sparse")
+_MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "sfm")
+"""Where models lie in a folder: COLMAP's and ours, nerfstudio's, hloc's."""
+_FILES = ("cameras", "images", "points3D")
 
 
 def model_poses(model: pycolmap.Reconstruction) -> Poses:
@@ -49,6 +52,11 @@ def _read_strecha(path: Path) -> CameraPose:
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """Read the COLMAP model (binary or text) in a folder. Raises UserError if there is none."""
+    suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
+    if path.is_dir():
+        for name in _FILES:
+            if not (path / (name + suffix)).is_file():
+                raise UserError(f"{path}: not a readable COLMAP model ({name}{suffix} is missing)")
     try:
         if (path / "images.bin").is_file():
             check_binary(path)
@@ -69,8 +77,12 @@ def _has_model(path: Path) -> bool:
 
 
 def find_model(path: Path) -> Path:
-    """The model's folder: this one, or one in a run's results; UserError if there is none."""
-    for sub in ("", "sparse/0", "sparse"):
+    """The model's folder: this one, or one in the results of a run, of nerfstudio or of hloc.
+
+    Raises:
+      UserError: there is none.
+    """
+    for sub in _MODELS:
         if _has_model(path / sub):
             return path / sub
     raise UserError(f"{path}: no COLMAP model here (looked for sparse/0/images.bin)")

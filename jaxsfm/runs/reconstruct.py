@@ -80,7 +80,9 @@ def reconstruct_folder(
     cameras = Cameras(known=intrinsics, sharing=options.cameras, model=options.camera_model)
     cameras.check_fits(usable)
     measured = measured_positions(options.georeference, usable)
-    external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
+    external = read_external_matches(
+        options.with_database, options.with_hloc, usable, intrinsics, dense=options.with_dense
+    )
     weights = chosen_weights(options.network, config.backbone)
     if selection.retrieval:
         check_retrieval(options.retrieval, weights)

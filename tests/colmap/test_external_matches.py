@@ -215,7 +215,9 @@ def test_keypoints_on_the_border_are_pulled_in_and_beyond_refused(
 
 
 def test_one_source_at_a_time(tmp_path):
-    with pytest.raises(UserError, match="--with-database and --with-hloc: give only one of them"):
+    with pytest.raises(
+        UserError, match="--with-database, --with-hloc and --with-dense: give only one"
+    ):
         read_external_matches(tmp_path, (tmp_path, tmp_path), IMAGES, None)
 
 

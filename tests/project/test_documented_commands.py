@@ -34,6 +34,8 @@ LONG = (
     "jaxsfm.matching.retrieval.shortlist",
     "jaxsfm.runs.localize.localize_photos",
     "jaxsfm.runs.extend.extend_run",
+    "jaxsfm.runs.refine.refine_folder",
+    "jaxsfm.runs.merge.merge_folders",
     "jaxsfm.training.relocalizer.train_relocalizer",
     "jaxsfm.matching.extraction.image_features",
     "jaxsfm.bench.datasets.fetch",

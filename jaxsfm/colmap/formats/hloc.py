@@ -31,7 +31,7 @@ FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 MAX_COLUMNS = 16
 """Columns of a keypoint. A file that claims more is damaged."""
 # h5py raises various errors for damaged files, SystemError if a read fails half-way.
-_DAMAGED = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, SystemError)
+DAMAGED = (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, SystemError)
 
 
 def pair_key(name0: str, name1: str) -> str:
@@ -86,7 +86,8 @@ def _check_names(names: Iterable[str]) -> None:
             )
 
 
-def _dataset(group: h5py.Group, key: str, where: str, max_rows: int) -> np.ndarray:
+def dataset(group: h5py.Group, key: str, where: str, max_rows: int) -> np.ndarray:
+    """The numbers of a data set; UserError if there are none, or more than a file can have."""
     found = group.get(key)
     if not isinstance(found, h5py.Dataset) or found.dtype.kind not in "fiu":
         raise UserError(f"{where}: no numbers {key!r}")
@@ -96,12 +97,19 @@ def _dataset(group: h5py.Group, key: str, where: str, max_rows: int) -> np.ndarr
     return np.asarray(found)
 
 
-def _pairs_in(file: h5py.Group, names: Mapping[str, str]) -> Iterator[tuple[str, str, h5py.Group]]:
-    """Find every pair of known images, and its group. `names`: shortened name -> name."""
+def pairs_in(
+    file: h5py.Group, names: Mapping[str, str], holds: str
+) -> Iterator[tuple[str, str, h5py.Group]]:
+    """Find every pair of known images, and its group.
+
+    Args:
+      names: shortened name -> name.
+      holds: a data set that the group of a pair has.
+    """
     for key, group in file.items():
         if not isinstance(group, h5py.Group):
             continue
-        if "matches0" in group:  # the older layout
+        if holds in group:  # the older layout
             for cut in (k for k, char in enumerate(key) if char == "_"):
                 if key[:cut] in names and key[cut + 1 :] in names:
                     yield names[key[:cut]], names[key[cut + 1 :]], group
@@ -133,10 +141,10 @@ def read_hloc(features: Path, matches: Path, names: Iterable[str], *, where: str
                 if not isinstance(group, h5py.Group) or "keypoints" not in group:
                     continue
                 own = f"{at}: {shown_name(name)}"
-                values = _dataset(group, "keypoints", own, MAX_KEYPOINTS)
+                values = dataset(group, "keypoints", own, MAX_KEYPOINTS)
                 tables.keypoints[name] = checked_keypoints(values, own)
                 if "image_size" in group:
-                    size = _dataset(group, "image_size", own, 2).astype(np.float64)
+                    size = dataset(group, "image_size", own, 2).astype(np.float64)
                     if size.shape != (2,) or not np.isfinite(size).all():
                         raise UserError(f"{own}: image_size must be two numbers")
                     tables.sizes[name] = (int(size[0]), int(size[1]))
@@ -147,11 +155,11 @@ def read_hloc(features: Path, matches: Path, names: Iterable[str], *, where: str
             if known.setdefault(short, name) != name:
                 raise UserError(f"{at}: cannot tell {shown_name(name)} from {known[short]}")
         with h5py.File(matches, "r") as file:
-            for name0, name1, group in _pairs_in(file, known):
+            for name0, name1, group in pairs_in(file, known, "matches0"):
                 pair, rows = _matches_of(group, (name0, name1), tables.keypoints, at)
                 if len(rows):
                     tables.matches[pair] = rows
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise UserError(f"{at}: not a readable file of hloc ({error})") from error
     return tables
 
@@ -160,7 +168,7 @@ def _matches_of(
     group: h5py.Group, names: tuple[str, str], keypoints: dict[str, np.ndarray], where: str
 ) -> tuple[Pair, np.ndarray]:
     own = f"{where}: {describe(names)}"
-    second = _dataset(group, "matches0", own, MAX_KEYPOINTS)
+    second = dataset(group, "matches0", own, MAX_KEYPOINTS)
     count = len(keypoints[names[0]])
     if second.shape != (count,) or second.dtype.kind not in "iu":
         raise UserError(

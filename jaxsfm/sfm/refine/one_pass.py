@@ -46,6 +46,10 @@ class PassFigures:
     """After the pass."""
     reprojection_error_px: float
     """Mean over the points, original pixels."""
+    shift_px: float | None = None
+    """How far the observations that agreed were moved, the mean in original pixels. The reference
+    keypoints of the points, which stay where they are, do not count. None: there are none, or an
+    earlier version did not measure it."""
 
 
 DOUBTFUL_SHARE = 1 / 3
@@ -113,7 +117,20 @@ def run_pass(
         doubtful_views=sorted(view.name for view in _doubtful(before.model.views, blocks)),
         points=after.reconstruction.num_points3D(),
         reprojection_error_px=after.reconstruction.compute_mean_reprojection_error(),
+        shift_px=_mean_shift(start.views, blocks),
     )
+
+
+def _mean_shift(views: Sequence[View], blocks: Sequence[AlignedBlock]) -> float | None:
+    """How far the observations that agree were moved, the mean in original pixels."""
+    scale = np.asarray([view.pixels.scale for view in views])
+    shifts = [np.zeros(0)]
+    for block in blocks:
+        rows = np.flatnonzero(block.agrees & block.tracked)
+        moved = (block.moved[rows] - block.before[rows]) * scale[block.found.view[rows]]
+        shifts.append(np.linalg.norm(moved, axis=1))
+    every = np.concatenate(shifts)
+    return float(every.mean()) if len(every) else None
 
 
 def _doubtful(views: Sequence[View], blocks: Sequence[AlignedBlock]) -> list[View]:

@@ -55,6 +55,8 @@ class AlignedBlock(NamedTuple):
     """bool (m,): which candidates agree with their patches."""
     tracked: np.ndarray
     """bool (m,): which candidates are observations of the old tracks."""
+    before: np.ndarray
+    """float64 (m, 2): where these observations were, working pixels; NaN for the others."""
 
     @property
     def confirmed(self) -> np.ndarray:
@@ -220,5 +222,5 @@ def align_blocks(
         )
         # Otherwise they would stay on the device beside those of the next block.
         del templates
-        tracked = seen.tracked[found.point, found.view]
-        yield AlignedBlock(rows, patches, found, moved, score, agrees, tracked)
+        tracked, before = (each[found.point, found.view] for each in (seen.tracked, seen.xy))
+        yield AlignedBlock(rows, patches, found, moved, score, agrees, tracked, before)
