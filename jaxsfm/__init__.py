@@ -8,6 +8,7 @@ import zlib  # noqa: F401  before anyone loads pycolmap, whose own zlib else cor
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxsfm.colmap.cameras import Cameras as Cameras
     from jaxsfm.colmap.intrinsics import parse_intrinsics as parse_intrinsics
     from jaxsfm.colmap.mapper import MapOptions as MapOptions
     from jaxsfm.colmap.poses import model_poses as model_poses
@@ -41,6 +42,7 @@ _HOME = {
     "Evaluation": "sfm.evaluation",
     "evaluate": "sfm.evaluation",
     "Execution": "matching.execution",
+    "Cameras": "colmap.cameras",
     "MapOptions": "colmap.mapper",
     "parse_intrinsics": "colmap.intrinsics",
     "PairResult": "io.pairs",

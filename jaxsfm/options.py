@@ -14,6 +14,8 @@ from jaxsfm.errors import UserError
 EngineName = Literal["local", "ray"]
 Mapper = Literal["incremental", "global"]
 """COLMAP's mappers."""
+CameraSharing = Literal["auto", "single", "folder", "photo"]
+"""Which photos share one camera (`jaxsfm.colmap.cameras`)."""
 Retrieval = Literal["gem", "vlad", "netvlad"]
 """How a photo is described as a whole (`jaxsfm.core.pooling`)."""
 
@@ -98,8 +100,15 @@ class ReconstructionChoice:
       best_pairs: Map only the N pairs of each image that have the most inliers.
       intrinsics: The known camera of all photos. FILE: a text file with a 3 x 3 matrix, in which
         the centre of the top-left pixel is (0, 0). MODEL:p1,p2,..: a COLMAP camera model with its
-        parameters, in COLMAP's pixels, in which that centre is (0.5, 0.5). Without it, every photo
-        has its own camera.
+        parameters, in COLMAP's pixels, in which that centre is (0.5, 0.5). Without it, cameras are
+        estimated.
+      masks: Folder with masks, images of the size of the photos. Black pixels are not used. The
+        mask of sub/a.jpg is sub/a.jpg.png.
+      cameras: Which photos share a camera. single: all photos. folder: the photos of each
+        sub-folder. photo: none. auto: those whose EXIF names the same camera, lens and focal
+        length; photos of one size without any EXIF share one camera, too.
+      camera_model: COLMAP camera model of cameras that are not known, for example OPENCV or
+        SIMPLE_RADIAL_FISHEYE.
       refine_intrinsics: Whether mapping refines the intrinsics. auto: only if --intrinsics is not
         given.
       mapper: Which of COLMAP's mappers computes the model.
@@ -121,6 +130,9 @@ class ReconstructionChoice:
     retrieval: Retrieval = "vlad"
     best_pairs: int | None = None
     intrinsics: str | None = None
+    masks: Path | None = None
+    cameras: CameraSharing = "auto"
+    camera_model: str = "SIMPLE_RADIAL"
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto"
     mapper: Mapper = "incremental"
     seed: int = 0

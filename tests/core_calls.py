@@ -440,7 +440,6 @@ def calls() -> dict[str, Call]:
             slow=True,
         ),
         "grid.cell_to_px": Call(_bind(grid.cell_to_px, stride=8), (few.xy0,), (0,)),
-        "grid.rescale": Call(grid.rescale, (few.xy0, np.float32([1.5, 0.7])), (0,)),
         "grid.cell_rows_cols": Call(lambda c: grid.cell_rows_cols(40, c), (n(7),)),
         "homography.homogeneous": Call(hg.homogeneous, (xy0,), (0,)),
         "homography.normalisation": Call(hg.normalisation, (few.xy0, np.abs(few.xy1[:, 0]))),

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageFile
@@ -111,7 +112,7 @@ def write_run(folder: Path, model: pycolmap.Reconstruction, *, with_model: bool 
     names = sorted(image.name for image in model.images.values())
     results = results_of(model)
     path = folder / "database.db"
-    write_database(path, image_files(names, folder), results, None)
+    write_database(path, image_files(names, folder), results, Cameras(sharing="photo"))
     with pycolmap.Database.open(path) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         a, b = (ids[name] for name in min(results))

@@ -15,6 +15,7 @@ from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
+from jaxsfm.io.images import WorkingImage
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.photos import intensities
 from jaxsfm.sfm.evaluation import Similarity
@@ -115,7 +116,9 @@ def scene(seen_by: Sequence[tuple[Sequence[TexturedPlane], Sequence[CameraPose]]
         for pose in poses:
             view = view_of(pose, len(views))
             views.append(view)
-            photos[view.name] = intensities(render(list(some), pose, SIZE))
+            photos[view.name] = intensities(
+                WorkingImage(render(list(some), pose, SIZE), (1.0, 1.0))
+            )
             xy, _ = view.project(points)
             with np.errstate(invalid="ignore"):
                 inside = (xy > 9).all(1) & (xy < np.asarray(SIZE) - 10).all(1)

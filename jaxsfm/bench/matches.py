@@ -11,6 +11,7 @@ import numpy as np
 from jaxsfm.bench.methods import NAIVE, method_config
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.options import PairOptions
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions
@@ -105,7 +106,7 @@ def _rootsift(image0: ImageFile, image1: ImageFile) -> tuple[np.ndarray, np.ndar
             database,
             image0.path.parent,
             [image0, image1],
-            None,
+            Cameras(),
             VerificationOptions(min_inliers=8),
         )
         return read_matches(database, (image0.name, image1.name), verified=False)

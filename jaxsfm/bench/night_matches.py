@@ -57,7 +57,7 @@ def night_matches(database: Path, scene: Scene, subset: Subset) -> NightMatches 
 
     def camera(name: str) -> "pycolmap.Camera":
         assert scene.camera is not None
-        return camera_of(scene.camera, name).camera(scene.images[name].size)
+        return camera_of(scene.camera, scene.images[name]).camera(scene.images[name].size)
 
     night = camera(subset.night)
     number = correct = 0

@@ -19,6 +19,7 @@ from jaxsfm.bench.methods import (
 )
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.strecha_sets import StrechaSet
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_keypoint_matches
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.mapper import MapOptions, build_models
@@ -62,6 +63,10 @@ class MethodRun:
     """Map only so many pairs of each image; RootSIFT maps all."""
     max_size: int | None = None
     """The longer side of the working images, pixels; None keeps the method's own."""
+
+    def cameras(self, each: StrechaSet) -> Cameras:
+        """What is known of the cameras of a set."""
+        return Cameras(known=parse_intrinsics(each.camera) if self.known else None)
 
     @property
     def mapping(self) -> MapOptions:
@@ -116,11 +121,11 @@ def _run_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     photos, database = each.folder / "images", work / "database.db"
     images, _ = open_images(photos)
     seconds: dict[str, float] = {}
-    camera = parse_intrinsics(each.camera) if run.known else None
+    cameras = run.cameras(each)
     verification = VerificationOptions(seed=run.seed, threads=run.threads)
     with timed(seconds, "matching"):  # COLMAP does not say how long its extraction takes
         write_rootsift_database(
-            database, photos, images, camera, verification, max_size=run.max_size
+            database, photos, images, cameras, verification, max_size=run.max_size
         )
     return _mapped(database, work, run, seconds)
 
@@ -179,9 +184,9 @@ def _run_lightglue(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     images, database = open_images(each.folder / "images")[0], work / "database.db"
     seconds: dict[str, float] = {}
     found = lightglue_matches(images, threads=run.threads, seconds=seconds)
-    camera = parse_intrinsics(each.camera) if run.known else None
+    cameras = run.cameras(each)
     with timed(seconds, "matching"):  # RootSIFT's has the verification, too
-        write_keypoint_matches(database, images, found, camera)
+        write_keypoint_matches(database, images, found, cameras)
         verify(database, VerificationOptions(seed=run.seed, threads=run.threads))
     return _mapped(database, work, run, seconds)
 
@@ -201,7 +206,7 @@ def _run_naive(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
         {pair: results[pair] for pair in kept},
         work / "database.db",
         config=config,
-        intrinsics=parse_intrinsics(each.camera) if run.known else None,
+        cameras=run.cameras(each),
         options=run.mapping,
     )
     write_models(made.models, work / "sparse")

@@ -10,6 +10,7 @@ from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import drop_pairs
 from jaxsfm.colmap.mapper import MapOptions, build_models
 from jaxsfm.colmap.poses import Poses, model_poses
@@ -53,7 +54,7 @@ def rootsift_models(scene: Scene, scratch: Path, options: DayNightOptions) -> li
         database,
         scene.folder,
         images,
-        scene.camera,
+        Cameras(known=scene.camera),
         VerificationOptions(seed=options.seed, threads=options.threads),
         pairs=None if blanks else sorted(pairs),
     )
@@ -110,7 +111,7 @@ def dense_models(
             {pair: results[pair] for pair in pairs},
             scratch / "part.db",
             config=config,
-            intrinsics=scene.camera,
+            cameras=Cameras(known=scene.camera),
             options=_map_options(scene, options),
         )
         poses = model_poses(made.models[0]) if made.models else {}

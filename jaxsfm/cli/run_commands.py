@@ -110,6 +110,8 @@ def match(
     *,
     out: Path,
     plot: Path | None = None,
+    mask0: Path | None = None,
+    mask1: Path | None = None,
     seed: int = 0,
     matching: MatchingChoice,
     network: WeightsChoice,
@@ -118,6 +120,7 @@ def match(
 
     For example
         $ jaxsfm match A.jpg B.jpg --out m.npz --plot m.png
+        $ jaxsfm match A.jpg B.jpg --out m.npz --mask0 A.jpg.png
 
     Args:
       image0: The first photo.
@@ -127,6 +130,8 @@ def match(
         keypoints1 is accurate to a fraction of a pixel. plane (n) is the index of the match's
         homography. homographies (p x 3 x 3) map the first image to the second.
       plot: File.png or File.jpg to write: a picture of the matches, with one colour for each plane.
+      mask0: Image of the size of the first photo, whose black pixels are not used.
+      mask1: The same for the second photo.
       seed: Seed of all random choices.
     """
     config = matching.config(network.relocalizer)
@@ -135,14 +140,17 @@ def match(
     import numpy as np
 
     from jaxsfm.io.atomic import atomic_file
-    from jaxsfm.io.images import inspect_image, read_image
+    from jaxsfm.io.images import inspect_image, read_image, with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
     from jaxsfm.matching.pair_matching import match_features
     from jaxsfm.sfm.refine.pair_alignment import align
 
     check_seed(seed)
-    files = [inspect_image(path, name=str(path)) for path in (image0, image1)]
+    files = [
+        with_mask(inspect_image(path, name=str(path)), mask)
+        for path, mask in ((image0, mask0), (image1, mask1))
+    ]
     weights = chosen_weights(network, config.backbone)
     features = [image_features(weights, file, config=config) for file in files]
     result = match_features(features[0], features[1], config=config, seed=seed)

@@ -11,11 +11,9 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, camera_of
-from jaxsfm.colmap.stand_in import readable_by_colmap
-from jaxsfm.errors import UserError
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
-from jaxsfm.io.images import ImageFile, shown_name
+from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult, describe
 
 pycolmap.logging.minloglevel = 3
@@ -67,40 +65,11 @@ def _consistent(results: Mapping[Pair, PairResult]) -> Iterator[PairResult]:
         yield result
 
 
-def camera_for(image: ImageFile, intrinsics: Intrinsics | None) -> pycolmap.Camera:
-    """The camera of a photo; UserError if COLMAP does not accept it.
-
-    Without intrinsics, its focal length comes from EXIF, or is 1.2 x the longer side of the photo.
-    """
-    if intrinsics is not None:
-        camera = intrinsics.camera(image.size)
-    else:
-        try:
-            with readable_by_colmap(image) as path:
-                camera = pycolmap.infer_camera_from_image(path)
-        except Exception:  # COLMAP reads fewer formats, and raises various errors
-            camera = None
-        if camera is None or (camera.width, camera.height) != image.size:
-            width, height = image.size
-            camera = pycolmap.Camera(
-                model="SIMPLE_RADIAL",
-                width=width,
-                height=height,
-                params=[1.2 * max(width, height), width / 2, height / 2, 0.0],
-            )
-    if not camera.verify_params():
-        raise UserError(
-            f"{shown_name(image.name)}: COLMAP does not accept the camera {camera.model_name} "
-            f"{camera.params}"
-        )
-    return camera
-
-
 def write_database(
     path: Path,
     images: list[ImageFile],
     results: Mapping[Pair, PairResult],
-    intrinsics: KnownCameras | None,
+    cameras: Cameras,
 ) -> None:
     """Write a new COLMAP database with cameras, images, keypoints and matches.
 
@@ -108,7 +77,7 @@ def write_database(
       path: a file there is replaced.
       images: all images. Those without matches get no keypoints.
       results: the matches. Each is read twice, and none is held in memory.
-      intrinsics: the known cameras; None: a guessed one for each image.
+      cameras: which images share a camera, and what is known of it.
 
     Raises:
       ValueError: the results are inconsistent. Nothing is written then.
@@ -143,7 +112,7 @@ def write_database(
                 yield (a, b), np.stack(index, axis=1)
 
     keypoints = {name: xy for name, (_, xy) in tables.items()}
-    _write(path, images, keypoints, pairs(), intrinsics)
+    _write(path, images, keypoints, pairs(), cameras)
 
 
 class KeypointMatches(NamedTuple):
@@ -156,12 +125,12 @@ class KeypointMatches(NamedTuple):
 
 
 def write_keypoint_matches(
-    path: Path, images: list[ImageFile], found: KeypointMatches, intrinsics: KnownCameras | None
+    path: Path, images: list[ImageFile], found: KeypointMatches, cameras: Cameras
 ) -> None:
     """Write a new COLMAP database of keypoints that are not ours. Arguments are those of
     `write_database`."""
     rows = ((pair, index) for pair, index in sorted(found.matches.items()) if len(index))
-    _write(path, images, found.keypoints, rows, intrinsics)
+    _write(path, images, found.keypoints, rows, cameras)
 
 
 def _write(
@@ -169,18 +138,18 @@ def _write(
     images: list[ImageFile],
     keypoints: Mapping[str, np.ndarray],
     matches: Iterable[tuple[Pair, np.ndarray]],
-    intrinsics: KnownCameras | None,
+    cameras: Cameras,
 ) -> None:
     empty = np.zeros((0, 2), np.float32)
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
-        ids = {}
-        camera_id = None
+        camera_ids, ids = {}, {}
+        for camera, group in cameras.assigned(images):
+            camera_ids |= dict.fromkeys((i.name for i in group), db.write_camera(camera))
         for image in sorted(images, key=lambda i: i.name):
-            if camera_id is None or not isinstance(intrinsics, Intrinsics):
-                known = None if intrinsics is None else camera_of(intrinsics, image.name)
-                camera_id = db.write_camera(camera_for(image, known))
-            ids[image.name] = db.write_image(pycolmap.Image(name=image.name, camera_id=camera_id))
+            ids[image.name] = db.write_image(
+                pycolmap.Image(name=image.name, camera_id=camera_ids[image.name])
+            )
             xy = keypoints.get(image.name, empty)
             db.write_keypoints(ids[image.name], (xy + PIXEL_OFFSET).astype(np.float32))
         for (a, b), index in matches:

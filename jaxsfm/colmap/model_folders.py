@@ -1,6 +1,7 @@
 """COLMAP models on disk, and the colours of their points."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,7 @@ import pycolmap
 
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
-from jaxsfm.io.images import ImageError
-from jaxsfm.io.photos import Reader
+from jaxsfm.io.images import ImageError, WorkingImage
 
 
 def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
@@ -45,7 +45,7 @@ def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
     return models
 
 
-def colour_points(model: pycolmap.Reconstruction, read_rgb: Reader) -> None:
+def colour_points(model: pycolmap.Reconstruction, read: Callable[[str], WorkingImage]) -> None:
     """Give every 3-D point the mean colour of its observations, in place.
 
     A photo that cannot be read any more is left out.
@@ -54,7 +54,7 @@ def colour_points(model: pycolmap.Reconstruction, read_rgb: Reader) -> None:
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
         try:
-            rgb, scale = read_rgb(image.name)
+            rgb, scale, _ = read(image.name)
         except ImageError:  # deleted since; other photos colour its points
             continue
         for point in image.points2D:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras
+from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.native import native
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
@@ -18,7 +19,7 @@ def write_rootsift_database(
     path: Path,
     folder: Path,
     images: list[ImageFile],
-    intrinsics: KnownCameras | None,
+    cameras: Cameras,
     verification: VerificationOptions,
     *,
     pairs: Iterable[Pair] | None = None,
@@ -26,10 +27,11 @@ def write_rootsift_database(
 ) -> None:
     """Write a new database with COLMAP's DoG + RootSIFT features, matched and verified.
 
-    COLMAP's defaults are used throughout. Without known cameras there is one per image, from EXIF
-    or with 1.2 x the longer side as focal length.
+    COLMAP's defaults are used throughout.
 
     Args:
+      cameras: which images share a camera, and what is known of it. If it is not one camera of all
+        images, each has its own.
       verification: its threads are those of extraction and matching too. Pairs with fewer matches
         or inliers than its `min_inliers` are emptied.
       pairs: those to match; None: all.
@@ -41,12 +43,13 @@ def write_rootsift_database(
         intrinsics, because of another size.
     """
     path.unlink(missing_ok=True)
-    reader = pycolmap.ImageReaderOptions()
-    mode = pycolmap.CameraMode.PER_IMAGE
-    if isinstance(intrinsics, Intrinsics):
-        reader.camera_model = intrinsics.model
-        reader.camera_params = ",".join(repr(float(p)) for p in intrinsics.params)
-        mode = pycolmap.CameraMode.SINGLE
+    reader, known = pycolmap.ImageReaderOptions(), cameras.known
+    reader.camera_model = cameras.model
+    alone = len(cameras.assigned(images)) == 1
+    mode = pycolmap.CameraMode.SINGLE if alone else pycolmap.CameraMode.PER_IMAGE
+    if isinstance(known, Intrinsics):
+        reader.camera_model = known.model
+        reader.camera_params = ",".join(repr(float(p)) for p in known.params)
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = verification.threads
     extraction.use_gpu = False
@@ -66,8 +69,8 @@ def write_rootsift_database(
             reader_options=reader,
             extraction_options=extraction,
         )
-        if isinstance(intrinsics, Mapping):
-            _set_cameras(path, images, intrinsics)
+        if isinstance(known, Mapping):
+            _set_cameras(path, images, known)
         options = {"matching_options": matching, "verification_options": two_view}
         if pairs is None:
             pycolmap.match_exhaustive(path, **options)

@@ -7,7 +7,6 @@ resized per axis with half-pixel centres. In COLMAP's files the centre of the to
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 COARSE_STRIDE = 16
@@ -17,13 +16,6 @@ FINE_STRIDE = 8
 def cell_to_px(cell_xy: Float[Array, "*n 2"], *, stride: int) -> Float[Array, "*n 2"]:
     """The centre of a cell, pixels."""
     return (cell_xy + 0.5) * stride - 0.5
-
-
-def rescale(
-    xy: Float[Array | np.ndarray, "*n 2"], scale_xy: Float[Array | np.ndarray, " 2"]
-) -> Float[Array | np.ndarray, "*n 2"]:
-    """Coordinates after an image was resized by `scale_xy` (new size / old size, per axis)."""
-    return (xy + 0.5) * scale_xy - 0.5
 
 
 def cell_rows_cols(capacity: int, columns: Int[Array, ""]) -> tuple[Array, Array]:

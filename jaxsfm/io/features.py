@@ -20,6 +20,9 @@ from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, shown_name, working_size
+from jaxsfm.io.masks import used_cells
+from jaxsfm.io.orientation import to_stored
+from jaxsfm.io.pixels import Pixels
 
 SIDE_BUCKET = 32
 """Pixels. Photos with 800 pixels on the longer side get 2 % more pixels on average. With 128 they
@@ -47,13 +50,17 @@ class FeatureCapacity(NamedTuple):
 
 
 class ImageFeatures(NamedTuple):
-    """The features of one image, and how its working image lies on the original."""
+    """The features of one image, and how its upright working image lies on the stored one."""
 
     image: ImageFile
     scale: tuple[float, float]
-    """Original pixels per working pixel, (x, y)."""
+    """Original pixels per working pixel, (x, y), both of the upright photo."""
     dense: DenseFeatures
-    """The features; the arrays are numpy arrays."""
+    """The features of the upright photo; the arrays are numpy arrays."""
+
+    def to_stored(self) -> np.ndarray:
+        """The float64 matrix (3, 3) that maps working pixels to the pixels of the stored photo."""
+        return to_stored(self.image.size, self.image.orientation) @ Pixels(self.scale).matrix()
 
     @property
     def capacity(self) -> FeatureCapacity:
@@ -90,7 +97,7 @@ def feature_capacity(size: tuple[int, int], *, fine_stride: int = FINE_STRIDE) -
 
 def image_capacity(image: ImageFile, *, config: Config) -> FeatureCapacity:
     """The capacity for the features of an image; it is known before the image is decoded."""
-    size = working_size(image.size, config.max_size, config.enlarge)
+    size = working_size(image.upright_size, config.max_size, config.enlarge)
     return feature_capacity(size, fine_stride=config.fine_stride)
 
 
@@ -110,6 +117,25 @@ def pad_features(dense: DenseFeatures, num_coarse: int) -> DenseFeatures:
         fine=pad_octaves(dense.fine, 4 * num_coarse),
         keypoints=pad(dense.keypoints, 4 * num_coarse),
     )
+
+
+def without_unused(dense: DenseFeatures, used: np.ndarray) -> DenseFeatures:
+    """Features without those of unused pixels, whose descriptors become zero: they never match.
+
+    A fine cell goes if its keypoint is unused, a coarse cell if all its fine cells are.
+
+    Args:
+      dense: numpy arrays.
+      used: bool (h, w), of the image that was described.
+    """
+    (rows, columns), (coarse_rows, coarse_columns) = dense.fine_grid, dense.coarse_grid
+    cells = int(rows) * int(columns)
+    fine = used_cells(used, np.asarray(dense.keypoints[:cells])).reshape(rows, columns)
+    parts = fine[: 2 * coarse_rows, : 2 * coarse_columns]
+    coarse = parts.reshape(coarse_rows, 2, coarse_columns, 2).any((1, 3)).reshape(-1)
+    for keep, octaves in ((fine.reshape(-1), dense.fine), (coarse, dense.coarse)):
+        octaves[0][: len(keep)][~keep] = 0
+    return dense
 
 
 def total_memory() -> int | None:

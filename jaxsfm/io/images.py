@@ -1,7 +1,8 @@
 """Finding and reading images. All code that looks at the pixels of a photo reads it here.
 
-Pixels are read as they are stored; the orientation in the EXIF data is ignored. COLMAP 4.2 does the
-same (measured), so keypoints and intrinsics agree with COLMAP's own tools.
+Pixels are read as they are stored, unless the reader asks for an upright photo. All coordinates
+that are written are those of the stored pixels. COLMAP 4.2 does the same (measured), so keypoints
+and intrinsics agree with COLMAP's own tools.
 """
 
 import dataclasses
@@ -10,16 +11,25 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+from PIL import ExifTags
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
-from jaxsfm.io import decoders
+from jaxsfm.io import decoders, orientation
+from jaxsfm.io.masks import (
+    MaskFile,
+    mask_path,
+    missing_masks,
+    open_mask,
+    read_mask,
+    without_blank_border,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -58,11 +68,74 @@ class ImageFile:
     """(width, height) as stored, pixels."""
     sha256: str
     """The SHA-256 of the file's bytes, hexadecimal."""
+    orientation: int = orientation.UPRIGHT
+    """How the stored photo is turned to be upright (`jaxsfm.io.orientation`)."""
+    taken_with: str = ""
+    """The camera, its lens and its focal length, as EXIF names them; empty if EXIF names no camera.
+    Photos of one zoom lens differ in the focal length."""
+    mask: MaskFile | None = None
+    """Says which pixels are used; None: all but a blank border."""
+
+    @property
+    def content(self) -> str:
+        """What the features of the photo depend on: its bytes, how it is turned, and its mask."""
+        return content(self.sha256, self.orientation, self.mask and self.mask.sha256)
+
+    @property
+    def upright_size(self) -> tuple[int, int]:
+        """(width, height) of the photo when it is upright, pixels."""
+        return orientation.upright_size(self.size, self.orientation)
 
     @property
     def identity(self) -> int:
         """32 bits of the hash. They are the image's part in the random key of a pair."""
         return int(self.sha256[:8], 16)
+
+
+def orientations(images: Iterable[ImageFile]) -> dict[str, int]:
+    """How the images that are not stored upright are turned, by name."""
+    upright = orientation.UPRIGHT
+    return {i.name: i.orientation for i in images if i.orientation != upright}
+
+
+def content(sha256: str, turned: int, mask: str | None) -> str:
+    """What describes the used pixels of an upright photo.
+
+    Args:
+      sha256: of the photo's file.
+      turned: its orientation.
+      mask: the SHA-256 of the mask's file; None: no mask.
+    """
+    parts = [sha256]
+    if turned != orientation.UPRIGHT:
+        parts.append(f"turned {turned}")
+    if mask is not None:
+        parts.append(f"masked by {mask}")
+    return " ".join(parts)
+
+
+def masks_of(images: Iterable[ImageFile]) -> dict[str, str]:
+    """The SHA-256 of the images' masks, by the names of the images."""
+    return {image.name: image.mask.sha256 for image in images if image.mask is not None}
+
+
+def with_masks(images: Iterable[ImageFile], folder: Path) -> tuple[list[ImageFile], list[str]]:
+    """The images with their masks, and the names of those that have none.
+
+    Raises:
+      UserError: the folder has no mask of any image, or a mask cannot be used.
+    """
+    images = list(images)
+    bare = missing_masks(folder, [image.name for image in images])
+
+    paths = {i.name: None if i.name in set(bare) else mask_path(folder, i.name) for i in images}
+    return [with_mask(image, paths[image.name]) for image in images], bare
+
+
+def with_mask(image: ImageFile, path: Path | None) -> ImageFile:
+    """The image with the mask at a path, if there is one; UserError if it cannot be used."""
+    mask = None if path is None else open_mask(path, image.size)
+    return dataclasses.replace(image, mask=mask)
 
 
 class WorkingImage(NamedTuple):
@@ -71,7 +144,10 @@ class WorkingImage(NamedTuple):
     rgb: np.ndarray
     """uint8 (height, width, 3)."""
     scale: tuple[float, float]
-    """Original pixels per working pixel, (x, y)."""
+    """Original pixels per working pixel, (x, y); of an upright photo, in pixels of the upright
+    original."""
+    used: np.ndarray | None = None
+    """bool (height, width): the pixels that are used; None: all."""
 
 
 def find_images(folder: Path) -> list[str]:
@@ -150,7 +226,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
             warnings.simplefilter("ignore")  # about odd metadata; only the size is needed
             # Pillow is not given the path: reading from a file, it allocates what the header says.
             with decoders.open_header(data, path.suffix) as header:
-                size = header.size
+                size, exif = header.size, _exif(header)
     except decoders.MissingReader as error:
         raise ImageError(f"{shown}: {error}") from error
     except Exception as error:  # Pillow's readers can raise almost anything
@@ -163,7 +239,35 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
     if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
         raise ImageError(f"{shown}: the file is truncated")
     digest = hashlib.sha256(data).hexdigest()
-    return ImageFile(name=name or path.name, path=path, size=size, sha256=digest)
+    return ImageFile(
+        name=name or path.name,
+        path=path,
+        size=size,
+        sha256=digest,
+        orientation=orientation.checked(exif.get(ExifTags.Base.Orientation)),
+        taken_with=_taken_with(exif),
+    )
+
+
+_CAMERA = ("Make", "Model", "BodySerialNumber", "LensModel", "FocalLength", "DigitalZoomRatio")
+"""The tags that tell cameras apart."""
+
+
+def _exif(header: decoders.Header) -> dict[int, object]:
+    """The EXIF data of a photo; empty if there is none or it is damaged."""
+    try:
+        exif = header.getexif()
+        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:  # Pillow's readers can raise almost anything
+        return {}
+
+
+def _taken_with(exif: Mapping[int, object]) -> str:
+    """What EXIF says of the camera (`ImageFile.taken_with`)."""
+    if not exif.get(ExifTags.Base.Model):
+        return ""
+    values = (exif.get(ExifTags.Base[tag], "") for tag in _CAMERA)
+    return ", ".join(text for value in values if (text := str(value).strip("\0 ")))
 
 
 def shown_name(name: str) -> str:
@@ -270,23 +374,56 @@ def size_and_scale(
     return (width, height), (size[0] / width, size[1] / height)
 
 
-def read_image(image: ImageFile, *, max_size: int, enlarge: float = 1.0) -> WorkingImage:
+def read_image(
+    image: ImageFile, *, max_size: int, enlarge: float = 1.0, upright: bool = False
+) -> WorkingImage:
     """Decode an image and resize it to its working size (`working_size`).
+
+    Args:
+      upright: turn the image so that it is upright, before it is resized.
 
     Images in grey, with alpha, with 16 bits or in CMYK are converted to RGB with 8 bits. Raises
     ImageError if the file cannot be decoded, or a side would be shorter than `MIN_SIDE`.
     """
-    rgb = _decode(image)
-    width, height = working_size(image.size, max_size, enlarge)
+    rgb, size = _decode(image), image.size
+    used = _mask_of(image)
+    if upright:
+        rgb, size = orientation.upright(rgb, image.orientation), image.upright_size
+        used = None if used is None else orientation.upright(used, image.orientation)
+    width, height = working_size(size, max_size, enlarge)
     if min(width, height) < MIN_SIDE:
         raise ImageError(
             f"{shown_name(image.name)}: {width} x {height} pixels after reduction to "
             f"{max_size} is too narrow (at least {MIN_SIDE} per side)"
         )
     if rgb.shape[:2] != (height, width):
-        larger = width > image.size[0]
+        larger = width > size[0]
         how = cv2.INTER_CUBIC if larger else cv2.INTER_AREA
         rgb = cv2.resize(rgb, (width, height), interpolation=how)
     return WorkingImage(
-        rgb=np.ascontiguousarray(rgb), scale=(image.size[0] / width, image.size[1] / height)
+        rgb=np.ascontiguousarray(rgb),
+        scale=(size[0] / width, size[1] / height),
+        used=_used(rgb, used),
     )
+
+
+def _mask_of(image: ImageFile) -> np.ndarray | None:
+    try:
+        return None if image.mask is None else read_mask(image.mask)
+    except UserError as error:
+        raise ImageError(f"{shown_name(image.name)}: {error}") from error
+
+
+def _used(rgb: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
+    """The used pixels of a working image.
+
+    Args:
+      mask: bool, the used pixels of the original. A working pixel is used if all of its part is.
+    """
+    inside = without_blank_border(rgb)
+    if mask is None:
+        return inside
+    height, width = rgb.shape[:2]
+    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    whole = share > 0.999
+    return whole if inside is None else whole & inside

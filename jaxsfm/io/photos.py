@@ -16,9 +16,13 @@ LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
 """The weights of red, green and blue in the intensity of a pixel (ITU-R BT.601)."""
 
 
-def intensities(rgb: np.ndarray) -> np.ndarray:
-    """The intensities float32 (h, w) of an image uint8 (h, w, 3)."""
-    return rgb.astype(np.float32) @ LUMA
+def intensities(image: WorkingImage) -> np.ndarray:
+    """The intensities float32 (h, w) of an image. They are NaN where pixels are not used, so that
+    no patch with such a pixel agrees with another one."""
+    gray = image.rgb.astype(np.float32) @ LUMA
+    if image.used is not None:
+        gray[~image.used] = np.nan
+    return gray
 
 
 class Photos:
@@ -49,6 +53,7 @@ class Photos:
         return read_image(self.files[name], max_size=max_size, enlarge=enlarge)
 
     def _gray(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
-        """Intensities float32 (h, w) of the working image; original pixels per working pixel."""
-        rgb, scale = self.rgb(name)
-        return intensities(rgb), scale
+        """Intensities float32 (h, w) of the working image, NaN where pixels are not used; original
+        pixels per working pixel."""
+        image = self.rgb(name)
+        return intensities(image), image.scale

@@ -17,12 +17,15 @@ from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, read_json, save_arrays, write_atomic
 from jaxsfm.io.features import ImageFeatures
-from jaxsfm.io.images import DamagedImage, ImageError, ImageFile
+from jaxsfm.io.images import DamagedImage, ImageError, ImageFile, content
+from jaxsfm.io.orientation import checked
 from jaxsfm.io.pairs import Pair, PairResult
 
 Identity = Mapping[str, Json]
 """What the matches of a run depend on: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
-`config` (`Config.matching`), `seed`, and `images` (name -> SHA-256)."""
+`config` (`Config.matching`), `seed`, `images` (name -> SHA-256), `orientations` of those that are
+not stored upright (name -> code of `jaxsfm.io.orientation`), and `masks` (name of the photo ->
+SHA-256)."""
 
 _OCTAVES = ("coarse", "fine")
 """The fields of DenseFeatures that hold one array for each octave."""
@@ -69,7 +72,7 @@ class Store:
 
     def _feature_path(self, image: ImageFile) -> Path:
         config = self._setting("config")
-        return self._file("features", {k: config.get(k) for k in EXTRACTED_BY}, image.sha256)
+        return self._file("features", {k: config.get(k) for k in EXTRACTED_BY}, image.content)
 
     def save_features(self, features: ImageFeatures) -> None:
         """Save the features of an image. Raises UserError if they cannot be written."""
@@ -118,11 +121,11 @@ class Store:
           kind: the name of the description, followed by all that it depends on besides the photo,
             the weights and jaxsfm's version.
         """
-        save_arrays(self._file("descriptors", kind, image.sha256), {"array": array})
+        save_arrays(self._file("descriptors", kind, image.content), {"array": array})
 
     def load_descriptor(self, image: ImageFile, kind: str) -> np.ndarray | None:
         """The array that was saved, or None if the file is missing or damaged."""
-        return (load_arrays(self._file("descriptors", kind, image.sha256)) or {}).get("array")
+        return (load_arrays(self._file("descriptors", kind, image.content)) or {}).get("array")
 
     # -- photos that could not be decoded --------------------------------------------------------
 
@@ -154,8 +157,14 @@ class Store:
 
     def _match_path(self, pair: Pair) -> Path:
         images = self._setting("images")
-        hashes = [images.get(name) for name in pair]
-        return self._file("matches", self.identity.get("config"), self.identity.get("seed"), hashes)
+        turned, masks = self._setting("orientations"), self._setting("masks")
+        contents = [
+            content(str(images.get(name)), checked(turned.get(name)), _text(masks.get(name)))
+            for name in pair
+        ]
+        return self._file(
+            "matches", self.identity.get("config"), self.identity.get("seed"), contents
+        )
 
     def save_matches(self, result: PairResult) -> None:
         """Save the matches of a pair. Raises UserError if they cannot be written."""
@@ -182,6 +191,10 @@ class Store:
         except (KeyError, ValueError, TypeError):
             return None
         return result if _are_matches(result) else None
+
+
+def _text(value: Json) -> str | None:
+    return value if isinstance(value, str) else None
 
 
 def _is(array: Array | np.ndarray, dtype: type, *shape: int) -> bool:

@@ -1,9 +1,8 @@
 """How many threads the libraries of a command use.
 
-Most have an environment variable of their own, which they read once. JAX has no option for it.
+Each library has an environment variable of its own, which it reads once, when it starts.
 """
 
-import importlib
 import os
 import sys
 
@@ -11,6 +10,7 @@ READ_ONCE = {
     "jax": "NPROC",
     "numpy": "OPENBLAS_NUM_THREADS",
     "pycolmap": "OMP_NUM_THREADS",
+    "cv2": "OPENCV_FOR_THREADS_NUM",
 }
 """Library -> the variable that says how many threads it may have."""
 
@@ -19,12 +19,11 @@ def limit_threads(count: int) -> None:
     """Let JAX, NumPy, OpenCV and OpenMP use `count` threads; -1 changes nothing.
 
     This must be called before the libraries are imported. One that has been imported is left alone,
-    because its threads may exist already. COLMAP's own threads are options of its calls.
+    because its threads may exist already, and other threads may be using them. COLMAP's own threads
+    are options of its calls.
     """
     if count < 1:
         return
     for library, variable in READ_ONCE.items():
         if library not in sys.modules:
             os.environ[variable] = str(count)
-    cv2 = importlib.import_module("cv2")  # only now, because it imports NumPy
-    cv2.setNumThreads(count)

@@ -17,7 +17,13 @@ from jaxsfm.core.features import Extraction, Walk
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.io.compiled_programs import announce_compilation
-from jaxsfm.io.features import ImageFeatures, check_memory, feature_capacity, padded_size
+from jaxsfm.io.features import (
+    ImageFeatures,
+    check_memory,
+    feature_capacity,
+    padded_size,
+    without_unused,
+)
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import (
@@ -112,7 +118,7 @@ def extract_images(
     weights = dataclasses.replace(weights, params=params)
 
     def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
-        return _shapes(working_size(image.size, config.max_size, config.enlarge), config)
+        return _shapes(working_size(image.upright_size, config.max_size, config.enlarge), config)
 
     def batches() -> Iterator[_Batch]:
         for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
@@ -147,6 +153,8 @@ def _results(
             yield image, each
         else:
             own = jax.tree.map(lambda x, k=k: x[k].copy(), dense)  # not a view of the whole batch
+            if each.used is not None:
+                own = without_unused(own, each.used)
             yield image, ImageFeatures(image, each.scale, own)
             k += 1
 
@@ -158,7 +166,7 @@ def _read_ahead(
 
     def read(image: ImageFile) -> WorkingImage | ImageError:
         try:
-            return read_image(image, max_size=config.max_size, enlarge=config.enlarge)
+            return read_image(image, max_size=config.max_size, enlarge=config.enlarge, upright=True)
         except ImageError as error:
             return error
 

@@ -193,7 +193,7 @@ def _conv5_rows(
     params = jax.device_put(weights.params)
     for image in images:
         try:
-            rgb = read_image(image, max_size=_side(image, NETVLAD_SIDE)).rgb
+            rgb = read_image(image, max_size=_side(image, NETVLAD_SIDE), upright=True).rgb
         except ImageError as error:
             yield image, error
             continue

@@ -14,10 +14,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxsfm.config import Config, PairShape
-from jaxsfm.core.grid import rescale
 from jaxsfm.core.sharded import match_batch, pick
 from jaxsfm.core.types import JoinedFeatures, PairMatches, Status, Thresholds
 from jaxsfm.io.features import FeatureCapacity, ImageFeatures
+from jaxsfm.io.orientation import stored_points
 from jaxsfm.io.pairs import Name, PairResult, make_pair
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.matching.device_cache import (
@@ -177,18 +177,19 @@ def _results(started: _Started) -> Iterator[PairResult]:
 def to_original_pixels(
     found: PairMatches, features0: ImageFeatures, features1: ImageFeatures
 ) -> PairResult:
-    """Convert a program's padded output to the pair's matches, in original pixels."""
+    """Convert a program's padded output to the pair's matches, in pixels of the stored photos."""
     keep = np.asarray(found.plane) >= 0
     cells = np.asarray(found.cells)[keep]
 
     def keypoints(features: ImageFeatures, side: int) -> np.ndarray:
         xy = np.asarray(features.dense.keypoints, np.float64)[cells[:, side]]
-        return np.asarray(rescale(xy, np.asarray(features.scale))).astype(np.float32)
+        image, upright = features.image, Pixels(features.scale).to_original(xy)
+        return stored_points(upright, image.size, image.orientation).astype(np.float32)
 
     # The conversion is done in float64 on the host: squares of coordinates up to 1600 px leave
     # float32 too few digits for an inverse.
     present = np.asarray(found.num_inliers) > 0
-    to0, to1 = (Pixels(each.scale).matrix() for each in (features0, features1))
+    to0, to1 = (each.to_stored() for each in (features0, features1))
     h = to1 @ np.asarray(found.homographies, np.float64)[present] @ np.linalg.inv(to0)
     norms = np.linalg.norm(h, axis=(1, 2), keepdims=True)
     return PairResult(

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,6 +13,7 @@ from jaxsfm.colmap.model import Model, Sizes, point_colours
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
+from jaxsfm.io import orientation
 from jaxsfm.io.images import (
     ImageError,
     ImageFile,
@@ -22,9 +23,10 @@ from jaxsfm.io.images import (
     size_and_scale,
 )
 from jaxsfm.io.looks import Looks
+from jaxsfm.io.masks import MaskFile, mask_path
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
-from jaxsfm.report.run_inputs import RecordedConfig
+from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
 from jaxsfm.report.run_results import EvaluationReport
 from jaxsfm.report.typed_json import from_json, to_json
@@ -51,11 +53,15 @@ class RecordedPhotos:
     """The photos of a run, for as long as they are unchanged and where the run found them."""
 
     def __init__(
-        self, folder: Path | None, hashes: Mapping[str, str], config: RecordedConfig
+        self,
+        folder: Path | None,
+        identity: RunIdentity,
+        config: RecordedConfig,
+        masks: Path | None,
     ) -> None:
-        """Photos in `folder` with the SHA-256 `hashes` by name."""
+        """The photos of the identity, which lie in `folder`, and their masks, in `masks`."""
         self.folder = folder
-        self._hashes = hashes
+        self._hashes, self._identity, self._masks = identity.images, identity, masks
         self._config = config
         self.read = functools.lru_cache(maxsize=16)(self._read)
 
@@ -67,12 +73,23 @@ class RecordedPhotos:
             image = inspect_image(self.folder / name, name=name)
         except ImageError:
             return None
-        return image if image.sha256 == self._hashes.get(name) else None
+        return self.as_described(image) if image.sha256 == self._hashes.get(name) else None
+
+    def as_described(self, image: ImageFile) -> ImageFile:
+        """The file of a photo of the run, turned and masked as it was when it was described."""
+        code = orientation.checked(self._identity.orientations.get(image.name))
+        return dataclasses.replace(image, orientation=code, mask=self._mask(image.name))
+
+    def _mask(self, name: str) -> MaskFile | None:
+        sha256 = self._identity.masks.get(name)
+        return None if sha256 is None else MaskFile(mask_path(self._masks or Path(), name), sha256)
 
     def recorded(self, name: str) -> ImageFile:
         """The file of a photo as the run found it, unseen: it may be gone. Its size is (0, 0)."""
         path = (self.folder or Path()) / name
-        return ImageFile(name=name, path=path, size=(0, 0), sha256=self._hashes[name])
+        return self.as_described(
+            ImageFile(name=name, path=path, size=(0, 0), sha256=self._hashes[name])
+        )
 
     def name_of(self, sha256: str) -> str | None:
         """The name of the photo with that content; None if the run has no such photo."""
@@ -165,6 +182,12 @@ def evaluation_report(
     return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
 
 
+def _masks(report: RunReport) -> Path | None:
+    """The folder of the run's masks."""
+    folder = report.options.others.get("masks")
+    return Path(folder) if isinstance(folder, str) else None
+
+
 def _described(report: RunReport) -> RecordedConfig:
     """The limits of the working images whose cells the matches are of."""
     config, looks = report.options.config, report.looks
@@ -214,7 +237,7 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(where, report.identity.images, _described(report)),
+        photos=RecordedPhotos(where, report.identity, _described(report), _masks(report)),
         model=model,
         colours=colours,
         reference=known,

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import field
 from typing import Annotated
 
-from jaxsfm.report.typed_json import OTHERS, Count, Range
+from jaxsfm.report.typed_json import OMITTED, OTHERS, Count, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -22,6 +22,10 @@ class RunIdentity:
     seed: Count = 0
     images: dict[str, str]
     """The SHA-256 of every usable photo, by name."""
+    orientations: dict[str, Count] = field(default_factory=dict, metadata=OMITTED)
+    """How photos that are not stored upright are turned, by name (`jaxsfm.io.orientation`)."""
+    masks: dict[str, str] = field(default_factory=dict, metadata=OMITTED)
+    """The SHA-256 of the masks, by the names of their photos."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

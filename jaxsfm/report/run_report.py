@@ -74,6 +74,9 @@ class RunReport:
     given: UsedExternalMatches | None = None
     looks: UsedLooks | None = field(default=None, metadata=OMITTED)
     """None: all photos were described at the size of the config."""
+    turned: dict[str, Annotated[int, Range(1, 360)]] = field(default_factory=dict, metadata=OMITTED)
+    """By how many degrees photos are turned clockwise to be upright, by name: those that the run
+    found to be stored sideways without a note in EXIF."""
     models: list[ModelRow]
     """The one with most photos first; empty if there is none."""
     mapping: list[Attempt] = field(default_factory=list)

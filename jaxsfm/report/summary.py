@@ -109,6 +109,9 @@ def summary_lines(report: RunReport) -> list[str]:
     ]
     if looks := report.looks:
         lines.append(f"looks            {looks.in_words()}")
+    if turned := report.turned:
+        each = [f"{shown_name(name)} by {degrees} deg" for name, degrees in turned.items()]
+        lines.append(f"turned           {named(each)} clockwise: stored sideways without a note")
     if given := report.given:
         lines.append(
             f"given            {given.matches} matches in {given.pairs} pairs of {given.images} "

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 K = TypeVar("K")
 OMITTED = {"omitted": True}
-"""Metadata of a field that is left out of the JSON where it is None."""
+"""Metadata of a field that is left out of the JSON where it is None or an empty dict."""
 OTHERS = {"others": True}
 """Metadata of a field dict[str, object] that holds the keys which the dataclass does not name."""
 
@@ -67,7 +67,7 @@ def to_json(value: "DataclassInstance") -> dict[str, Json]:
         each = getattr(value, field.name)
         if field.metadata == OTHERS:
             plain.update(each)
-        elif each is not None or field.metadata != OMITTED:
+        elif field.metadata != OMITTED or (each is not None and each != {}):
             plain[field.name] = _plain(each)
     return plain
 

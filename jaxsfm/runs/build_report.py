@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,6 +13,7 @@ from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.looks import SavedMatches
+from jaxsfm.io.orientation import UPRIGHT, quarters_between
 from jaxsfm.io.pairs import Pair, PairCounts
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
@@ -101,6 +102,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         ),
         given=None if about is None else from_json(UsedExternalMatches, about),
         looks=stages.looks,
+        turned=_turned(stages.usable, stages.identity.orientations),
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,
@@ -110,6 +112,15 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
     )
     sizes = {image.name: image.size for image in stages.usable}
     return explained(report, config, sizes, made.verification.angles)
+
+
+def _turned(images: Sequence[ImageFile], orientations: Mapping[str, int]) -> dict[str, int]:
+    """The degrees by which photos were turned, beyond what EXIF says."""
+    found = {
+        image.name: 90 * quarters_between(image.orientation, orientations.get(image.name, UPRIGHT))
+        for image in images
+    }
+    return {name: degrees for name, degrees in found.items() if degrees}
 
 
 def extended_report(
@@ -211,8 +222,9 @@ def _now() -> str:
 def _recorded_options(config: Config, options: RunOptions) -> RecordedOptions:
     plain = dataclasses.asdict(options) | {"config": dataclasses.asdict(config)}
     del plain["progress"]
-    if options.reference is not None:  # to be found from any working directory
-        plain["reference"] = options.reference.absolute()
+    for name in ("reference", "masks"):  # to be found from any working directory
+        path = getattr(options, name)
+        plain[name] = path and path.absolute()
     return from_json(RecordedOptions, json.loads(json.dumps(plain, default=str)))
 
 

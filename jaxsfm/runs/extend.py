@@ -12,7 +12,7 @@ from pathlib import Path
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.images import ImageError, ImageFile, orientations
 from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
@@ -87,7 +87,11 @@ def _extend(
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     cameras = {n: camera_prior(image, model.views, intrinsics) for n, image in images.items()}
     hashes = {name: image.sha256 for name, image in images.items()}
-    identity = dataclasses.replace(identity, images=identity.images | hashes)
+    identity = dataclasses.replace(
+        identity,
+        images=identity.images | hashes,
+        orientations=identity.orientations | orientations(images.values()),
+    )
     folder = open_locked_folder(run, to_json(identity))
     job = Job(
         store=folder,
@@ -142,7 +146,11 @@ def _unchanged_photos(
     photos is not."""
     report = run.report
     used = {n: h for n, h in report.identity.images.items() if n not in report.images.skipped}
-    there = {image.name: image for image in usable if used.get(image.name) == image.sha256}
+    there = {
+        image.name: run.photos.as_described(image)
+        for image in usable
+        if used.get(image.name) == image.sha256
+    }
     photos_of_run(run, [name for name in needed if name not in there])  # names what is gone
     return there
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
+from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image, orientations
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.store import Store
 from jaxsfm.runs.job import Job
@@ -70,7 +70,11 @@ def match_queries(
         group = queries[k : k + together]
         own = {query.image.name: query.image for query in group}
         images = {**files, **own}
-        identity = {**job.store.identity, "images": {n: i.sha256 for n, i in images.items()}}
+        identity = {
+            **job.store.identity,
+            "images": {name: image.sha256 for name, image in images.items()},
+            "orientations": orientations(images.values()),
+        }
         with tempfile.TemporaryDirectory(prefix="jaxsfm-") as scratch:
             part = dataclasses.replace(
                 job,

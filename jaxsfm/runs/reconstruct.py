@@ -7,14 +7,14 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import read_external_matches
-from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageFile
-from jaxsfm.io.looks import Looks
+from jaxsfm.io.images import ImageFile, masks_of, named, orientations, with_masks
 from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.weights import chosen_weights
@@ -24,19 +24,13 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, nearest_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page.after_run import page_after_run
-from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
+from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.job import Job, pairs_without
-from jaxsfm.runs.matching_looks import (
-    MatchedPairs,
-    first_look,
-    job_of_look,
-    match_again,
-    match_pairs,
-    timed,
-)
+from jaxsfm.runs.mapping_looks import RunPhotos, map_in_looks
+from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.runs.run_stages import RunStages
 
@@ -78,8 +72,12 @@ def reconstruct_folder(
     selection = parse_pair_selection(options.pairs)
     pairs = selected_pairs(selection, (image.name for image in usable), names)
     _check_enough(images, usable, skipped)
-    if intrinsics is not None:
-        check_fits(intrinsics, {image.name: image.size for image in usable})
+    if options.masks is not None:
+        usable, bare = with_masks(usable, options.masks)
+        if bare:
+            logger.warning("%s: no mask in %s, so all of it is used", named(bare), options.masks)
+    cameras = Cameras(known=intrinsics, sharing=options.cameras, model=options.camera_model)
+    cameras.check_fits(usable)
     external = read_external_matches(options.with_database, options.with_hloc, usable, intrinsics)
     weights = chosen_weights(options.network, config.backbone)
     if selection.retrieval:
@@ -92,6 +90,8 @@ def reconstruct_folder(
         config=config.matching(),
         seed=options.seed,
         images={image.name: image.sha256 for image in usable},
+        orientations=orientations(usable),
+        masks=masks_of(usable),
     )
     seconds: dict[str, float] = {}
     with open_folder(out, to_json(identity)) as folder:
@@ -111,52 +111,37 @@ def reconstruct_folder(
                 found, lost = _retrieve(job, tried, options.retrieval, selection.retrieval)
                 pairs, skipped = sorted({*pairs, *found}), skipped | lost
         by_name = {image.name: image for image in usable if image.name not in skipped}
-        first = first_look(config, by_name.values())
-        look = job_of_look(job, identity, first) if first else job
-        counts, lost = match_pairs(look, by_name, pairs_without(pairs, skipped), seconds)
+        photos = RunPhotos(
+            job=job, identity=identity, images=by_name, pairs=pairs_without(pairs, skipped)
+        )
+        matched, lost = photos.match(seconds)
         skipped |= lost
         good = [image for image in usable if image.name not in skipped]
         _check_enough(images, good, skipped)
         stages = RunStages(
             folder=folder,
             images=good,
-            intrinsics=intrinsics,
+            cameras=cameras,
             external=external,
             config=config,
             options=options,
             seconds=seconds,
         )
-        matched = MatchedPairs(Looks(look.store), look.config, counts)
-        mapped = stages.map(matched, again=False)
-        looks = UsedLooks(first_px=first.max_size) if first else None
-        again = mapped.unsettled(counts) if first else None
-        if looks is not None and again is not None:
-            logger.info("%s", again.in_words())
-            matched_again = match_again(job, by_name, matched, again, seconds)
-            mapped_again = stages.map(matched_again, again=True)
-            looks = dataclasses.replace(
-                looks,
-                photos=again.photos,
-                again=again.pairs,
-                whole=again.whole,
-                in_vain=mapped.better_than(mapped_again),
-            )
-            if not looks.in_vain:
-                matched, mapped = matched_again, mapped_again
+        mapped = map_in_looks(photos.without(lost), matched, stages)
         with folder.publish() as target:
-            made = stages.refine(mapped, target)
+            made = stages.refine(mapped.mapped, target)
             report = run_report(
                 StageResults(
                     folder=images,
-                    identity=identity,
+                    identity=mapped.identity,
                     usable=good,
                     skipped=skipped,
-                    results=matched.counts,
-                    handed_on=mapped.handed_on,
+                    results=mapped.matched.counts,
+                    handed_on=mapped.mapped.handed_on,
                     external=external,
                     reconstructed=made,
                     weights=from_json(UsedWeights, weights.described(config)),
-                    looks=looks,
+                    looks=mapped.looks,
                     seconds=seconds,
                 ),
                 config=config,

@@ -3,6 +3,7 @@
 import dataclasses
 from pathlib import Path
 
+from jaxsfm.colmap.intrinsics import MODELS
 from jaxsfm.errors import UserError
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.execution import Execution
@@ -49,6 +50,15 @@ def check_options(options: RunOptions) -> None:
     """Raise UserError, before the work, for options that COLMAP or the engine would refuse."""
     if options.best_pairs is not None and options.best_pairs < 1:
         raise UserError(f"--best-pairs must be at least 1; got {options.best_pairs}")
+    if options.camera_model not in MODELS:
+        raise UserError(
+            f"--camera-model must be one of {', '.join(MODELS)}; got {options.camera_model!r}"
+        )
+    if options.intrinsics is not None and options.cameras in ("folder", "photo"):
+        raise UserError(
+            f"--cameras {options.cameras} and --intrinsics exclude each other, because the known "
+            "camera is that of all photos"
+        )
     check_seed(options.seed)
     check_threads(options.threads)
     chosen_engine(options.engine)

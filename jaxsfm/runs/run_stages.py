@@ -7,8 +7,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import ExternalMatches, JoinedMatches
-from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.config import Config
@@ -85,19 +85,17 @@ class RunStages:
 
     folder: WorkFolder
     images: list[ImageFile]
-    intrinsics: Intrinsics | None
+    cameras: Cameras
     external: ExternalMatches
     config: Config
     options: RunOptions
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds; the stages add theirs."""
+    look: str = ""
+    """The end of the names of the stages' folders, so that several looks lie beside each other."""
 
-    def map(self, matched: MatchedPairs, *, again: bool) -> MappedRun:
-        """Map the pairs with inliers.
-
-        Args:
-          again: whether this is after the second look.
-        """
+    def map(self, matched: MatchedPairs) -> MappedRun:
+        """Map the pairs with inliers."""
         chosen = matched.with_inliers(self.options.best_pairs)
         ours = SavedMatches(matched.looks, chosen)
         matches = JoinedMatches(ours, self.external, {image.name for image in self.images})
@@ -111,7 +109,7 @@ class RunStages:
             matches,
             config=self.config,
             described=matched.described,
-            intrinsics=self.intrinsics,
+            cameras=self.cameras,
             options=MapOptions(
                 mapper=options.mapper,
                 refine_intrinsics=options.refines,
@@ -119,7 +117,7 @@ class RunStages:
                 threads=options.threads,
             ),
         )
-        cache = StageCache(self.folder, key, "-again" if again else "")
+        cache = StageCache(self.folder, key, self.look)
         total, quiet = len(self.images), not options.progress
         with (
             timed(self.seconds, "mapping"),

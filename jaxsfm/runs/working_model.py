@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.database import camera_for
-from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
+from jaxsfm.colmap.cameras import Cameras, estimated_camera
+from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.view import View
@@ -69,15 +69,17 @@ def camera_prior(
       UserError: the given intrinsics do not fit the photo's size.
     """
     if intrinsics is not None:
-        check_fits(intrinsics, {image.name: image.size})
-        return CameraPrior(intrinsics.camera(image.size), "given")
+        known = Cameras(known=intrinsics)
+        known.check_fits([image])
+        ((camera, _),) = known.assigned([image])
+        return CameraPrior(camera, "given")
     fitting = [v.camera for v in views if (v.camera.width, v.camera.height) == image.size]
     count = Counter(camera.camera_id for camera in fitting)
     shared = {c.camera_id: c for c in fitting if count[c.camera_id] > 1}
     if len(shared) == 1:
         (camera,) = shared.values()
         return CameraPrior(camera, "run")
-    camera = camera_for(image, None)
+    camera = estimated_camera([image])
     return CameraPrior(camera, "exif" if camera.has_prior_focal_length else "guess")
 
 

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
-from jaxsfm.colmap.intrinsics import KnownCameras, check_fits
 from jaxsfm.colmap.mapper import MapOptions
 from jaxsfm.colmap.model_folders import read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views, verify
@@ -64,14 +64,12 @@ class MatchedPhotos:
     its size."""
     described: Config
     """The settings that the matches were made with."""
-    intrinsics: KnownCameras | None
-    """None takes one camera per photo."""
+    cameras: Cameras
     options: MapOptions
     """Of the mapper; its `scale` is that of the described photos."""
 
     def __post_init__(self) -> None:
-        if self.intrinsics is not None:
-            check_fits(self.intrinsics, {image.name: image.size for image in self.images})
+        self.cameras.check_fits(self.images)
 
 
 class MappedStage(NamedTuple):
@@ -113,7 +111,7 @@ def reconstruct(
     database: Path,
     *,
     config: Config,
-    intrinsics: KnownCameras | None = None,
+    cameras: Cameras | None = None,
     options: MapOptions | None = None,
 ) -> Reconstructed:
     """Make COLMAP models from verified matches: mapping of trusted pairs, check, refinement.
@@ -125,15 +123,20 @@ def reconstruct(
       database: where to write the COLMAP database; a file there is replaced.
       config: the one that the matches were made with. Its `view_graph`, `checked` and `refinement`
         switch those parts on.
-      intrinsics: the known cameras. None takes one camera per photo.
-      options: of the mapper. By default it is incremental, and refines the intrinsics unless they
-        are given.
+      cameras: what is known and assumed of the cameras; by default no camera is known.
+      options: of the mapper. By default it is incremental, and refines the intrinsics unless the
+        cameras are known.
 
     Raises:
-      UserError: the intrinsics do not fit the images, or COLMAP fails.
+      UserError: the cameras do not fit the images, or COLMAP fails.
     """
     given = matched_photos(
-        images, matches, config=config, described=config, intrinsics=intrinsics, options=options
+        images,
+        matches,
+        config=config,
+        described=config,
+        cameras=cameras or Cameras(),
+        options=options,
     )
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         stages = StageCache(WorkFolder(Path(scratch), {}), "")
@@ -146,22 +149,22 @@ def matched_photos(
     *,
     config: Config,
     described: Config,
-    intrinsics: KnownCameras | None,
+    cameras: Cameras,
     options: MapOptions | None,
 ) -> MatchedPhotos:
     """Photos with their matches; `options` as in `reconstruct`, in pixels of the described photos.
 
     Raises:
-      UserError: the intrinsics do not fit the images.
+      UserError: the cameras do not fit the images.
     """
-    options = options or MapOptions(refine_intrinsics=intrinsics is None)
+    options = options or MapOptions(refine_intrinsics=cameras.known is None)
     scale = Photos(images, described).median_scale()
     return MatchedPhotos(
         images=images,
         matches=matches,
         config=config,
         described=described,
-        intrinsics=intrinsics,
+        cameras=cameras,
         options=dataclasses.replace(options, scale=scale),
     )
 
@@ -181,7 +184,7 @@ def map_matches(
     config, options, stages = given.config, given.options, kept.folder
 
     def verify_matches(folder: Path) -> None:
-        write_database(folder / DATABASE, given.images, given.matches, given.intrinsics)
+        write_database(folder / DATABASE, given.images, given.matches, given.cameras)
         figures = _verified(folder / DATABASE, options, config.view_graph)
         stage_files.write_verification(folder, figures)
 
@@ -200,7 +203,7 @@ def map_matches(
         stage_files.write_mapping(folder, made.figures)
 
     by_image = [[image.name, image.sha256, image.size] for image in given.images]
-    camera = _plain(given.intrinsics)
+    camera = _plain(given.cameras)
     verifying = [options.seed, options.threads, options.scale, config.view_graph]
     key = digest(
         kept.matches_key, stage_files.FORMAT, by_image, camera, verifying, package_versions()
@@ -263,11 +266,12 @@ def refine_mapped(
     )
 
 
-def _plain(intrinsics: KnownCameras | None) -> Json:
-    """The known cameras as part of a key."""
-    if isinstance(intrinsics, Mapping):
-        return {name: dataclasses.asdict(each) for name, each in intrinsics.items()}
-    return intrinsics and dataclasses.asdict(intrinsics)
+def _plain(cameras: Cameras) -> Json:
+    """What is known and assumed of cameras, as part of a key."""
+    known = cameras.known
+    if isinstance(known, Mapping):
+        return {name: dataclasses.asdict(each) for name, each in known.items()}
+    return dataclasses.asdict(known) if known else [cameras.sharing, cameras.model]
 
 
 def _verified(database: Path, options: MapOptions, view_graph: bool) -> VerificationFigures:

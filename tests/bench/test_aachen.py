@@ -11,6 +11,7 @@ from jaxsfm.bench import scenes
 from jaxsfm.bench.aachen import PAIRS, aachen_scene, read_nvm
 from jaxsfm.bench.scenes import Subset
 from jaxsfm.cli.main import main
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images, write_database
 from jaxsfm.colmap.poses import CameraPose, read_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
@@ -119,10 +120,15 @@ def test_an_nvm_file_holds_the_same_poses(copy, truth):
 def test_databases_hold_the_known_camera_of_each_photo(folder, tmp_path):
     made = aachen_scene(folder)
     images = list(made.images.values())
-    write_database(tmp_path / "ours.db", images, {}, made.camera)
+    write_database(tmp_path / "ours.db", images, {}, Cameras(known=made.camera))
     verification = VerificationOptions(threads=1)
     write_rootsift_database(
-        tmp_path / "rootsift.db", made.folder, images, made.camera, verification, pairs=[]
+        tmp_path / "rootsift.db",
+        made.folder,
+        images,
+        Cameras(known=made.camera),
+        verification,
+        pairs=[],
     )
     for name in ("ours.db", "rootsift.db"):
         found = read_images(tmp_path / name)

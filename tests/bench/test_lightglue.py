@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench.lightglue import lightglue_matches
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import KeypointMatches, read_matches, write_keypoint_matches
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import inspect_image
@@ -29,7 +30,7 @@ def test_keypoints_and_matches_of_others_come_back_from_the_database(strecha, tm
     keypoints = {a: np.float32([[0, 0], [3, 4]]), b: np.float32([[5, 6]])}
     path = tmp_path / "database.db"
     matches = {(a, b): np.asarray([[1, 0]]), (a, images[2].name): np.zeros((0, 2), int)}
-    write_keypoint_matches(path, images, KeypointMatches(keypoints, matches), None)
+    write_keypoint_matches(path, images, KeypointMatches(keypoints, matches), Cameras())
     xy = read_matches(path, (a, b), verified=False)
     np.testing.assert_array_equal(np.stack(xy), [[[3, 4]], [[5, 6]]])
     assert len(read_matches(path, (a, images[2].name), verified=False)[0]) == 0

@@ -12,6 +12,7 @@ from foreign_model import NAMES, camera, exact_model, image_files, write_run
 from plyfile import PlyData
 
 from jaxsfm.cli.main import main
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.formats.hloc import FEATURES, MATCHES, read_hloc
 
@@ -152,7 +153,7 @@ def test_an_empty_model_is_exported_empty(tmp_path):
     folder = tmp_path / "empty" / "sparse" / "0"
     folder.mkdir(parents=True)
     pycolmap.Reconstruction().write_binary(folder)
-    write_database(tmp_path / "empty" / "database.db", image_files(NAMES, folder), {}, None)
+    write_database(tmp_path / "empty" / "database.db", image_files(NAMES, folder), {}, Cameras())
     for to in ALL:
         (tmp_path / to).mkdir()
         assert export(tmp_path / "empty", to, target(tmp_path / to, to)) == 0

@@ -6,6 +6,7 @@ import pycolmap
 import pytest
 from foreign_model import results_of
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
@@ -23,7 +24,7 @@ class Scene(NamedTuple):
     images: list[ImageFile]
     results: dict[Pair, PairResult]
     """The points that both images of each pair see; a cell is the point's number."""
-    known: Intrinsics
+    cameras: Cameras
 
 
 def _truth() -> pycolmap.Reconstruction:
@@ -47,4 +48,4 @@ def scene(tmp_path_factory) -> Scene:
     nowhere = tmp_path_factory.mktemp("images")
     images = [ImageFile(name=n, path=nowhere / n, size=SIZE, sha256=64 * "0") for n in NAMES]
     truth = _truth()
-    return Scene(truth, NAMES, images, results_of(truth), KNOWN)
+    return Scene(truth, NAMES, images, results_of(truth), Cameras(known=KNOWN))

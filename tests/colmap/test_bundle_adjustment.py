@@ -1,9 +1,14 @@
 """Laws of COLMAP's bundle adjustment as it is used here."""
 
-import numpy as np
-from room_scene import Room, arrays, exact_model
+import dataclasses
 
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+import numpy as np
+import pycolmap
+from room_scene import Room, arrays, camera, exact_model
+
+from jaxsfm.colmap import bundle_adjustment
+from jaxsfm.colmap.bundle_adjustment import VIEWS_FOR_CENTRE, bundle_adjust
+from jaxsfm.colmap.model import Model
 
 
 def diverging(room: Room, points: int):
@@ -40,3 +45,45 @@ def test_an_exact_model_stays_as_it_is(rendered):
     after = arrays(model, rendered)
     np.testing.assert_allclose(after.tracks.points, before.tracks.points, atol=1e-6)
     assert after.errors_px().max() < 1e-4
+
+
+TRUTH = camera().params
+
+
+def wrong_centres(room: Room, of_views: list[int]) -> pycolmap.Reconstruction:
+    """The exact room; view k has camera `of_views[k]`, whose principal point is 6 pixels off."""
+    exact = exact_model(room)
+    views = []
+    for view, number in zip(exact.views, of_views, strict=True):
+        own = camera()
+        own.camera_id = number
+        views.append(dataclasses.replace(view, camera=own))
+    model = Model(views, exact.tracks).to_colmap()
+    for each in model.cameras.values():
+        each.principal_point_x += 6.0
+        each.principal_point_y -= 6.0
+    return model
+
+
+def adjusted(model: pycolmap.Reconstruction, *, refine_intrinsics: bool = True) -> dict[int, float]:
+    """How far off each principal point is after the adjustment, pixels, by camera."""
+    bundle_adjust(model, loss_px=100.0, refine_intrinsics=refine_intrinsics, threads=1)
+    return {n: float(np.abs(c.params[2:] - TRUTH[2:]).max()) for n, c in model.cameras.items()}
+
+
+def test_a_camera_of_many_views_finds_its_principal_point(rendered):
+    assert adjusted(wrong_centres(rendered, [1] * 5))[1] < 0.1
+
+
+def test_a_known_camera_keeps_its_principal_point(rendered):
+    assert adjusted(wrong_centres(rendered, [1] * 5), refine_intrinsics=False) == {1: 6.0}
+
+
+def test_cameras_of_few_views_keep_their_principal_points(rendered):
+    off = adjusted(wrong_centres(rendered, [1] * VIEWS_FOR_CENTRE + [2, 2]))
+    assert off[1] != 6.0 and off[2] == 6.0
+
+
+def test_a_principal_point_that_runs_away_is_put_back(rendered, monkeypatch):
+    monkeypatch.setattr(bundle_adjustment, "FARTHEST_CENTRE", 0.01)  # 5 of 480 pixels
+    assert adjusted(wrong_centres(rendered, [1] * 5)) == {1: 6.0}

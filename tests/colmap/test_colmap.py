@@ -9,6 +9,7 @@ from mapped import map_database
 
 from jaxsfm.colmap import database as colmap
 from jaxsfm.colmap import mapper as mapping
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import (
     keypoint_tables,
     write_database,
@@ -34,19 +35,19 @@ def errors(model, truth) -> tuple[int, float, float]:
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_an_exact_scene_comes_back_with_its_odd_names(tmp_path, scene, mapper):
-    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.cameras)
     models = map_database(tmp_path / "d.db", dataclasses.replace(ONE, mapper=mapper))
     registered, position, rotation = errors(models[0], scene.truth)
     assert registered == len(scene.names) and position < 1e-4 and rotation < 1e-3
     (camera,) = models[0].cameras.values()
-    assert tuple(camera.params) == scene.known.params  # to the bit
+    assert tuple(camera.params) == scene.cameras.known.params  # to the bit
     assert read_two_views(tmp_path / "d.db").keys() == scene.results.keys()
 
 
 @pytest.mark.parametrize("mapper", ["incremental", "global"])
 def test_a_wrong_focal_length_moves_only_when_refined(tmp_path, scene, mapper):
     wrong = Intrinsics(model="SIMPLE_PINHOLE", params=(1250.0, 512.0, 384.0))
-    write_database(tmp_path / "d.db", scene.images, scene.results, wrong)
+    write_database(tmp_path / "d.db", scene.images, scene.results, Cameras(known=wrong))
     for refine in (False, True):
         options = dataclasses.replace(ONE, mapper=mapper, refine_intrinsics=refine)
         model = map_database(tmp_path / "d.db", options)[0]
@@ -59,7 +60,7 @@ def test_a_wrong_focal_length_moves_only_when_refined(tmp_path, scene, mapper):
 
 
 def test_without_intrinsics_every_image_has_its_camera(tmp_path, scene):
-    write_database(tmp_path / "d.db", scene.images, scene.results, None)
+    write_database(tmp_path / "d.db", scene.images, scene.results, Cameras(sharing="photo"))
     with pycolmap.Database.open(tmp_path / "d.db") as db:
         cameras = db.read_all_cameras()
         assert len({image.camera_id for image in db.read_all_images()}) == len(scene.names)
@@ -73,7 +74,7 @@ def test_without_intrinsics_every_image_has_its_camera(tmp_path, scene):
 
 
 def test_the_database_holds_the_matches_half_a_pixel_further(tmp_path, scene):
-    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.cameras)
     with pycolmap.Database.open(tmp_path / "d.db") as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         assert sorted(ids) == scene.names
@@ -140,7 +141,7 @@ def test_one_thread_and_one_seed_give_the_same_bytes(tmp_path, scene):
     files = []
     for run in ("1", "2"):
         database, out = tmp_path / f"{run}.db", tmp_path / run
-        write_database(database, scene.images, dict(reversed(scene.results.items())), None)
+        write_database(database, scene.images, dict(reversed(scene.results.items())), Cameras())
         write_models(map_database(database, MapOptions(threads=1, seed=7)), out)
         files.append({p.relative_to(out): p.read_bytes() for p in out.rglob("*") if p.is_file()})
     assert files[0] and files[0] == files[1]
@@ -150,7 +151,7 @@ def test_an_image_without_matches_is_in_the_database_but_not_in_the_model(tmp_pa
     lonely = ImageFile(
         name="0.png", path=tmp_path / "0.png", size=scene.images[0].size, sha256=64 * "0"
     )
-    write_database(tmp_path / "d.db", [lonely, *scene.images], scene.results, scene.known)
+    write_database(tmp_path / "d.db", [lonely, *scene.images], scene.results, scene.cameras)
     model = map_database(tmp_path / "d.db", ONE)[0]
     assert sorted(model_poses(model)) == scene.names
     with pycolmap.Database.open(tmp_path / "d.db") as db:
@@ -159,6 +160,6 @@ def test_an_image_without_matches_is_in_the_database_but_not_in_the_model(tmp_pa
 
 def test_no_matches_give_no_model(tmp_path, scene):
     for mapper in ("incremental", "global"):
-        write_database(tmp_path / "d.db", scene.images, {}, scene.known)  # replaces the former
+        write_database(tmp_path / "d.db", scene.images, {}, scene.cameras)  # replaces the former
         assert map_database(tmp_path / "d.db", dataclasses.replace(ONE, mapper=mapper)) == []
     assert read_two_views(tmp_path / "d.db") == {}

@@ -5,8 +5,8 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from jaxsfm.colmap.cameras import Cameras, estimated_camera
 from jaxsfm.colmap.database import (
-    camera_for,
     read_images,
     read_matches,
     write_database,
@@ -54,14 +54,17 @@ def test_keypoints_that_are_known_are_the_old_ones_and_others_follow_them(tmp_pa
     old, known = images_in(tmp_path, "bc"), np.arange(50, 150)
     path = tmp_path / "copy.db"
     write_database(
-        tmp_path / "database.db", old, {("b", "c"): matched(("b", "c"), known)}, intrinsics=None
+        tmp_path / "database.db",
+        old,
+        {("b", "c"): matched(("b", "c"), known)},
+        Cameras(sharing="photo"),
     )
     copy_database(tmp_path / "database.db", path, 2 * len(known))
     ids = {name: image_id for name, (image_id, _) in read_images(path).items()}
     with pycolmap.Database.open(path) as db:
         before = {name: db.read_keypoints(ids[name]) for name in "bc"}
     (new,) = images_in(tmp_path, "a")
-    add_images(path, {"a": (new, camera_for(new, None))})
+    add_images(path, {"a": (new, estimated_camera([new]))})
     cells = np.r_[known[::-2], np.arange(200, 200 + more)]
     pairs = [("a", "b"), ("a", "c")]
     add_matches(path, {p: matched(p, cells) for p in pairs}, VerificationOptions(threads=1))
@@ -79,7 +82,7 @@ def test_keypoints_that_are_known_are_the_old_ones_and_others_follow_them(tmp_pa
 
 def test_without_matches_nothing_is_verified(tmp_path):
     path = tmp_path / "database.db"
-    write_database(path, images_in(tmp_path, "bc"), {}, intrinsics=None)
+    write_database(path, images_in(tmp_path, "bc"), {}, Cameras(sharing="photo"))
     assert add_matches(path, {}, VerificationOptions(threads=1)) == {}
 
 

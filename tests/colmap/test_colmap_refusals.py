@@ -69,7 +69,7 @@ def test_bad_results_are_refused_before_native_code(tmp_path, monkeypatch, scene
     (tmp_path / "d.db").write_bytes(b"the former")
     change, message = BAD[case]
     with pytest.raises(ValueError, match=message):
-        write_database(tmp_path / "d.db", scene.images, change(scene.results), scene.known)
+        write_database(tmp_path / "d.db", scene.images, change(scene.results), scene.cameras)
     assert (tmp_path / "d.db").read_bytes() == b"the former"
 
 
@@ -77,7 +77,7 @@ def test_a_keypoint_on_the_very_edge_is_inside(tmp_path, scene):
     edge = changed("keypoints0", put(0, [-0.5, 767.5]))(
         {p: scene.results[p] for p in list(scene.results)[:1]}
     )
-    write_database(tmp_path / "d.db", scene.images, edge, scene.known)
+    write_database(tmp_path / "d.db", scene.images, edge, scene.cameras)
 
 
 # -- waiting ---------------------------------------------------------------------------------------
@@ -92,7 +92,7 @@ def tokens(monkeypatch) -> list[pycolmap.CancellationToken]:
 
 
 def test_ctrl_c_while_waiting_stops_native_code(tmp_path, monkeypatch, scene, tokens):
-    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.cameras)
     wait, waited = threading.Event.wait, []
 
     def interrupted(event, timeout=None):
@@ -114,13 +114,13 @@ def test_a_failure_beside_the_waiting_thread_is_raised(tmp_path, scene):
     def fail() -> None:
         raise ZeroDivisionError("the bar broke")
 
-    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.cameras)
     with pytest.raises(Exception, match="the bar broke"):
         map_database(tmp_path / "d.db", ONE, on_image=fail)
 
 
 def test_every_registered_image_is_counted(tmp_path, scene):
     counted = []
-    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.cameras)
     map_database(tmp_path / "d.db", ONE, on_image=lambda: counted.append(1))
     assert len(counted) == len(scene.names)

@@ -11,6 +11,7 @@ import pytest
 from foreign_model import NAMES, SIZE, camera, exact_model, image_files, results_of
 from mapped import map_database
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.external_matches import NO_EXTERNAL_MATCHES, JoinedMatches, read_external_matches
 from jaxsfm.colmap.formats.database import read_database
@@ -29,7 +30,7 @@ ONE = MapOptions(refine_intrinsics=False, threads=1)
 
 def write_theirs(path, results, images=IMAGES, *, verified=False):
     """A database as another tool makes it: the same photos, its own keypoints."""
-    write_database(path, images, results, KNOWN)
+    write_database(path, images, results, Cameras(known=KNOWN))
     if verified:
         with pycolmap.Database.open(path) as db:
             ids = {image.name: image.image_id for image in db.read_all_images()}
@@ -50,7 +51,7 @@ def halves():
 
 def merged_database(path, ours, given):
     names = set(NAMES)
-    write_database(path, IMAGES, JoinedMatches(ours, given, names), KNOWN)
+    write_database(path, IMAGES, JoinedMatches(ours, given, names), Cameras(known=KNOWN))
     return read_database(path, where="merged")
 
 
@@ -93,7 +94,7 @@ def test_images_that_neither_connects_alone_come_into_one_model(tmp_path, halves
     ours = {pair: r for pair, r in ours.items() if NAMES[3] not in pair}
     theirs = {pair: r for pair, r in theirs.items() if NAMES[3] in pair}
     given = read_external_matches(write_theirs(tmp_path / "theirs.db", theirs), None, IMAGES, KNOWN)
-    write_database(tmp_path / "ours.db", IMAGES, ours, KNOWN)
+    write_database(tmp_path / "ours.db", IMAGES, ours, Cameras(known=KNOWN))
     (alone,) = map_database(tmp_path / "ours.db", ONE)
     assert sorted(model_poses(alone)) == NAMES[:3]
     merged_database(tmp_path / "both.db", ours, given)

@@ -153,7 +153,7 @@ def test_a_planar_scene_is_mapped_whole(tmp_path, scene):
                 num_dropped=0,
                 status=Status.VERIFIED,
             )
-    write_database(tmp_path / "d.db", scene.images, results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, results, scene.cameras)
     two_views = verified(tmp_path / "d.db", ONE)
     assert all(view.planar for view in two_views.values())
     models, _ = build_models(tmp_path / "d.db", two_views, ONE)
@@ -162,7 +162,7 @@ def test_a_planar_scene_is_mapped_whole(tmp_path, scene):
 
 
 def test_two_view_rotations_spreads_and_angles_are_the_scenes(tmp_path, scene):
-    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.cameras)
     images = list(scene.truth.images.values())
     centre = {i.name: i.projection_center() for i in images}
     rotation = {i.name: i.cam_from_world().rotation.matrix() for i in images}
@@ -180,7 +180,7 @@ def test_dropped_pairs_are_gone_for_the_mapper_but_their_matches_stay(tmp_path, 
     import pycolmap
 
     path = tmp_path / "d.db"
-    write_database(path, scene.images, scene.results, scene.known)
+    write_database(path, scene.images, scene.results, scene.cameras)
     all_pairs = sorted(verified(path, ONE))
     lonely = scene.names[0]
     dropped = [pair for pair in all_pairs if lonely in pair]
@@ -195,7 +195,7 @@ def test_dropped_pairs_are_gone_for_the_mapper_but_their_matches_stay(tmp_path, 
 
 @pytest.mark.parametrize("initial", [None, 0])
 def test_a_given_initial_pair_gives_the_same_scene(tmp_path, scene, initial):
-    write_database(tmp_path / "d.db", scene.images, scene.results, scene.known)
+    write_database(tmp_path / "d.db", scene.images, scene.results, scene.cameras)
     if initial is None:
         assert map_database(tmp_path / "d.db", ONE)[0].num_reg_images() == 5
         return
@@ -213,7 +213,7 @@ def test_a_given_pair_gives_one_model_not_one_per_try(tmp_path, scene):
         for i, j in ((0, 1), (0, 2), (1, 2))
     }
     path = tmp_path / "d.db"
-    write_database(path, small + scene.images, scene.results | other, scene.known)
+    write_database(path, small + scene.images, scene.results | other, scene.cameras)
     two_views = verified(path, ONE)
     pair = next(p for p in initial_pairs(two_views) if p[0] in scene.names)
     assert [m.num_reg_images() for m in mapper._run(path, ONE, pair, lambda: None)] == [5]

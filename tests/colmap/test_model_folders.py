@@ -11,6 +11,7 @@ from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.mapper import MapOptions
 from jaxsfm.colmap.model_folders import colour_points, write_models
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.io.images import WorkingImage
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)
 
@@ -39,7 +40,7 @@ def test_two_scenes_give_two_models_the_larger_first(tmp_path, scene):
         )
         for i, j in ((0, 1), (0, 2), (1, 2))
     }
-    write_database(tmp_path / "d.db", small + scene.images, scene.results | other, scene.known)
+    write_database(tmp_path / "d.db", small + scene.images, scene.results | other, scene.cameras)
     models = map_database(tmp_path / "d.db", ONE)
     assert [sorted(model_poses(m)) for m in models] == [scene.names, [i.name for i in small]]
 
@@ -60,7 +61,7 @@ def test_a_point_has_the_colour_of_the_pixels_under_it(scene, scale):
             for shared in ids if len(ids) > 1 else ():
                 lone[shared] = False  # two points on one pixel
     model = pycolmap.Reconstruction(scene.truth)
-    colour_points(model, lambda name: (photos[name], scale))
+    colour_points(model, lambda name: WorkingImage(photos[name], scale))
     checked = [p for p in model.points3D if lone.get(p, True)]
     assert len(checked) > 100
     for point_id in checked:

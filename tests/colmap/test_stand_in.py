@@ -8,7 +8,7 @@ import pytest
 from moving_views import HEIGHT, WIDTH, views
 from PIL import ExifTags, Image
 
-from jaxsfm.colmap.database import camera_for
+from jaxsfm.colmap.cameras import estimated_camera
 from jaxsfm.io.images import inspect_image
 
 FOCAL_35 = 50
@@ -42,7 +42,7 @@ def written(path, focal, orientation=1):
 
 @pytest.mark.parametrize("suffix", [".jpg", ".heic", ".dng"])
 def test_the_focal_length_comes_from_exif_in_any_format(tmp_path, suffix):
-    camera = camera_for(written(tmp_path / f"a{suffix}", FOCAL_35), None)
+    camera = estimated_camera([written(tmp_path / f"a{suffix}", FOCAL_35)])
     # 35 mm film has a diagonal of 43.27 mm.
     expected = FOCAL_35 / 43.27 * math.hypot(WIDTH, HEIGHT)
     assert camera.mean_focal_length() == pytest.approx(expected, rel=1e-3)
@@ -51,13 +51,13 @@ def test_the_focal_length_comes_from_exif_in_any_format(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", [".jpg", ".heic", ".dng"])
 def test_without_exif_the_focal_length_is_a_guess(tmp_path, suffix):
-    camera = camera_for(written(tmp_path / f"a{suffix}", None), None)
+    camera = estimated_camera([written(tmp_path / f"a{suffix}", None)])
     assert camera.mean_focal_length() == pytest.approx(1.2 * WIDTH)
     assert not camera.has_prior_focal_length
 
 
 @pytest.mark.parametrize("suffix", [".heic", ".dng"])
 def test_a_sideways_photo_has_the_camera_of_its_upright_pixels(tmp_path, suffix):
-    camera = camera_for(written(tmp_path / f"a{suffix}", FOCAL_35, orientation=6), None)
+    camera = estimated_camera([written(tmp_path / f"a{suffix}", FOCAL_35, orientation=6)])
     assert (camera.width, camera.height) == (HEIGHT, WIDTH)
     assert camera.has_prior_focal_length

@@ -20,7 +20,7 @@ ONE = MapOptions(refine_intrinsics=False, threads=1)
 @pytest.fixture
 def database(tmp_path, scene):
     path = tmp_path / "d.db"
-    write_database(path, scene.images, scene.results, scene.known)
+    write_database(path, scene.images, scene.results, scene.cameras)
     verified(path, ONE)
     return path
 

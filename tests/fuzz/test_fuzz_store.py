@@ -11,6 +11,7 @@ import pytest
 from fuzz_children import run_cases
 from mutations import damaged, damaged_json, outcome
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.io.features import ImageFeatures
@@ -142,7 +143,7 @@ def arrays(rng, folder) -> str:
         assert np.isfinite(found.dense.keypoints).all()
     else:
         names = dict(zip(PAIR, FILES, strict=True))
-        write_database(folder / "d.db", list(names.values()), {PAIR: found}, None)
+        write_database(folder / "d.db", list(names.values()), {PAIR: found}, Cameras())
     return "read"
 
 

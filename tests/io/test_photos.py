@@ -16,7 +16,7 @@ def test_the_working_size_is_that_of_the_image_that_is_read(tmp_path, size, max_
     file = inspect_image(write_png(tmp_path / "a.png", two_colours(size[1], size[0])))
     photos = Photos([file], Config(max_size=max_size, enlarge=enlarge))
     (width, height), scale = photos.working_size(file.name)
-    rgb, read_scale = photos.rgb(file.name)
+    rgb, read_scale, _ = photos.rgb(file.name)
     gray, gray_scale = photos.gray(file.name)
     assert rgb.shape == (height, width, 3) and gray.shape == (height, width)
     assert scale == read_scale == gray_scale

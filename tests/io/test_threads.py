@@ -68,9 +68,10 @@ def test_a_library_that_is_loaded_is_left_alone(monkeypatch):
     for name, variable in READ_ONCE.items():
         monkeypatch.setitem(sys.modules, name, sys.modules.get(name))
         monkeypatch.setenv(variable, "7")
-    monkeypatch.setattr(cv2, "setNumThreads", lambda count: None)
-    limit_threads(3)
+    threads = cv2.getNumThreads()
+    limit_threads(threads + 3)
     assert {os.environ[variable] for variable in READ_ONCE.values()} == {"7"}
+    assert cv2.getNumThreads() == threads
 
 
 @pytest.mark.parametrize("count", [-1, 0])

@@ -7,6 +7,7 @@ import shutil
 import pycolmap
 import pytest
 
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.work_folder import open_folder
@@ -135,6 +136,6 @@ def test_what_would_not_fit_on_the_disk_is_refused_before_native_code_begins(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))
     with pytest.raises(UserError, match="about 4 MB are needed, 3 MB are left"):
         if what == "database":
-            write_database(tmp_path / "database.db", [], {}, None)
+            write_database(tmp_path / "database.db", [], {}, Cameras())
         else:
             write_models([pycolmap.Reconstruction()], tmp_path / "sparse")

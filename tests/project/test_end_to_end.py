@@ -27,7 +27,7 @@ def test_a_dozen_lines_of_python_do_the_same_as_the_command(tmp_path):
         matches,
         tmp_path / "database.db",
         config=config,
-        intrinsics=jaxsfm.parse_intrinsics(str(tmp_path / "K.txt")),
+        cameras=jaxsfm.Cameras(known=jaxsfm.parse_intrinsics(str(tmp_path / "K.txt"))),
     )
     errors = jaxsfm.evaluate(jaxsfm.model_poses(made.models[0]), truth)
     assert len(errors.images) == 4
@@ -60,7 +60,7 @@ def test_strecha_cameras_are_recovered_at_half_size(data_folder, tmp_path):
         matches,
         tmp_path / "database.db",
         config=config,
-        intrinsics=jaxsfm.parse_intrinsics(str(folder / "images" / "K.txt")),
+        cameras=jaxsfm.Cameras(known=jaxsfm.parse_intrinsics(str(folder / "images" / "K.txt"))),
     )
     poses, truth = jaxsfm.model_poses(made.models[0]), jaxsfm.read_poses(folder)
     assert {name[:4] for name in poses} == set(names)

@@ -11,6 +11,7 @@ import numpy as np
 
 import jaxsfm
 from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.config import Config, preset
@@ -103,7 +104,7 @@ def measure_stage(data: Path) -> Iterator[Metric]:
     def sift() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             database = Path(scratch) / "database.db"
-            write_rootsift_database(database, folder, photos, None, VerificationOptions())
+            write_rootsift_database(database, folder, photos, Cameras(), VerificationOptions())
 
     def ours(config: Config) -> None:
         features = jaxsfm.extract(weights, photos, config=config)

@@ -12,6 +12,7 @@ import itertools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 from jax.sharding import NamedSharding, PartitionSpec
@@ -19,6 +20,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxsfm.config import Config
 from jaxsfm.io.features import FeatureCapacity, ImageFeatures
 from jaxsfm.io.images import ImageError, ImageFile, image_bytes, working_size
+from jaxsfm.io.masks import mask_path
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.device_cache import ImageCache, tile_order
@@ -61,7 +63,8 @@ class RayEngine:
     ) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
         """As `jaxsfm.matching.extraction.extract_images`, in any order; UserError also for Ray."""
         ordered = sorted(
-            images, key=lambda image: working_size(image.size, config.max_size, config.enlarge)
+            images,
+            key=lambda image: working_size(image.upright_size, config.max_size, config.enlarge),
         )
         if not ordered:
             return
@@ -101,11 +104,21 @@ class RayEngine:
                 yield result
 
 
-def _bytes(image: ImageFile) -> bytes | ImageError:
+class PhotoBytes(NamedTuple):
+    """The bytes of a photo's files."""
+
+    photo: bytes
+    mask: bytes | None
+
+
+def _bytes(image: ImageFile) -> PhotoBytes | ImageError:
     try:
-        return image_bytes(image)
+        return PhotoBytes(image_bytes(image), image.mask and image.mask.path.read_bytes())
     except ImageError as error:
         return error
+    except OSError as error:
+        assert image.mask is not None
+        return ImageError(f"{image.mask.path}: cannot be read ({error.strerror})")
 
 
 def _task_size(count: int, workers: int, most: int) -> int:
@@ -144,7 +157,7 @@ class ExtractionWork:
         return dataclasses.replace(self.weights, params=params)
 
     def __call__(
-        self, images: Sequence[ImageFile], files: Mapping[str, bytes | ImageError]
+        self, images: Sequence[ImageFile], files: Mapping[str, PhotoBytes | ImageError]
     ) -> Iterator[tuple[ImageFile, ImageFeatures | ImageError]]:
         """Extract images, whose files are written to a temporary folder of this machine."""
         theirs = {image.name: image for image in images}
@@ -156,8 +169,12 @@ class ExtractionWork:
                     yield image, data
                     continue
                 path = Path(folder) / f"{k}{image.path.suffix}"
-                path.write_bytes(data)
-                here.append(dataclasses.replace(image, path=path))
+                path.write_bytes(data.photo)
+                mask = image.mask
+                if mask is not None and data.mask is not None:
+                    mask = dataclasses.replace(mask, path=mask_path(Path(folder), str(k)))
+                    mask.path.write_bytes(data.mask)
+                here.append(dataclasses.replace(image, path=path, mask=mask))
             stream = extract_images(
                 self._on_devices, here, config=self.config, execution=self.execution
             )

@@ -123,8 +123,8 @@ def align(
     )
     return align_matches(
         result,
-        intensities(first.rgb),
-        intensities(second.rgb),
+        intensities(first),
+        intensities(second),
         first.scale,
         second.scale,
         octaves=config.aligned_octaves,

@@ -1,0 +1,118 @@
+"""Which pixels of a photo are used: all but those of its mask, and but blank borders.
+
+A mask has COLMAP's convention: it is an image of the photo's size whose black pixels are ignored,
+and the mask of the photo `sub/a.jpg` is the file `sub/a.jpg.png` in the folder of the masks.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxsfm.errors import UserError
+
+BLANK = 1
+"""The largest value of a pixel in a blank border: rectified photos are black where they have no
+content."""
+LEAST_BLANK = 0.02
+"""A blank border covers at least this share of the photo. A frame of a few pixels is no matter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskFile:
+    """The file of a mask that has been checked."""
+
+    path: Path
+    sha256: str
+    """The SHA-256 of the file's bytes, hexadecimal."""
+
+
+def mask_path(folder: Path, name: str) -> Path:
+    """Where the mask of a photo lies."""
+    return folder / f"{name}.png"
+
+
+def open_mask(path: Path, size: tuple[int, int]) -> MaskFile:
+    """Check a mask for a photo of (width, height).
+
+    Raises:
+      UserError: the file is no image of this size, or all of it is black.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
+    used = decode_mask(data)
+    if used is None:
+        raise UserError(f"{path}: not a readable mask")
+    if used.shape[::-1] != size:
+        raise UserError(
+            f"{path}: the mask has {used.shape[1]} x {used.shape[0]} pixels and its photo "
+            f"{size[0]} x {size[1]}"
+        )
+    if not used.any():
+        raise UserError(f"{path}: the mask is black, so nothing of its photo would be used")
+    return MaskFile(path, hashlib.sha256(data).hexdigest())
+
+
+def decode_mask(data: bytes) -> np.ndarray | None:
+    """The used pixels bool (h, w) of a mask's file; None if it is no image."""
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    gray = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    return None if gray is None else gray > 0
+
+
+def read_mask(mask: MaskFile) -> np.ndarray:
+    """The used pixels bool (h, w); UserError if the file is gone or has changed."""
+    try:
+        data = mask.path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{mask.path}: cannot be read ({error.strerror})") from error
+    used = decode_mask(data)
+    if used is None or hashlib.sha256(data).hexdigest() != mask.sha256:
+        raise UserError(f"{mask.path}: the mask has changed since it was first read")
+    return used
+
+
+def without_blank_border(rgb: np.ndarray) -> np.ndarray | None:
+    """The used pixels bool (h, w) of a photo uint8 (h, w, 3); None if all are.
+
+    Blank pixels that are connected to the border are not used. Dark ones inside the photo are: a
+    night has them, too.
+    """
+    edges = (rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1])
+    if not any((edge.max(-1) <= BLANK).any() for edge in edges):
+        return None  # most photos, in no time
+    blank = (rgb.max(-1) <= BLANK).astype(np.uint8)
+    _, labels = cv2.connectedComponents(blank, connectivity=4)
+    outer = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    border = np.isin(labels, outer[outer > 0])
+    return ~border if border.mean() >= LEAST_BLANK else None
+
+
+def used_cells(used: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
+    """Which keypoints (m, 2) lie on used pixels bool (h, w) of the same image: bool (m,)."""
+    height, width = used.shape
+    x, y = np.rint(keypoints).astype(int).T
+    return used[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+
+
+def missing_masks(folder: Path, names: Iterable[str]) -> list[str]:
+    """The photos without a mask, of which all pixels are used.
+
+    Raises:
+      UserError: there is no such folder, or it has no mask of any photo.
+    """
+    names = list(names)
+    if not folder.is_dir():
+        raise UserError(f"--masks {folder}: no such folder")
+    missing = [name for name in names if not mask_path(folder, name).is_file()]
+    if len(missing) == len(names):
+        raise UserError(
+            f"--masks {folder}: no mask of any photo (the mask of {names[0]} would be "
+            f"{mask_path(Path(), names[0])})"
+        )
+    return missing

@@ -1,0 +1,103 @@
+"""The matching and the mapping of a run's photos, look by look.
+
+All photos are matched and mapped at a small size first. Then those that turn out to be stored
+sideways are turned, and those that have found no place are described at full size.
+"""
+
+import dataclasses
+import logging
+from collections.abc import Collection, Mapping
+from typing import NamedTuple
+
+from jaxsfm.io.images import ImageFile, orientations
+from jaxsfm.io.looks import Looks
+from jaxsfm.io.pairs import Pair
+from jaxsfm.report.run_inputs import RunIdentity, UsedLooks
+from jaxsfm.runs.job import Job, pairs_without
+from jaxsfm.runs.matching_looks import (
+    MatchedPairs,
+    first_look,
+    job_of_look,
+    match_again,
+    match_pairs,
+)
+from jaxsfm.runs.run_stages import MappedRun, RunStages
+from jaxsfm.runs.turned_photos import Trials, find_turned
+
+logger = logging.getLogger("jaxsfm")
+
+
+class MappedLooks(NamedTuple):
+    """What the looks at a run's photos gave."""
+
+    matched: MatchedPairs
+    mapped: MappedRun
+    looks: UsedLooks | None
+    """None: all photos were described at the size of the config."""
+    identity: RunIdentity
+    """That of the run, with the orientations that were found."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunPhotos:
+    """The photos of a run that can be decoded, and the pairs of them to match."""
+
+    job: Job
+    identity: RunIdentity
+    images: Mapping[str, ImageFile]
+    pairs: Collection[Pair]
+
+    def match(self, seconds: dict[str, float]) -> tuple[MatchedPairs, dict[str, str]]:
+        """Match the pairs at the size of the first look; says also why photos cannot be decoded."""
+        first = first_look(self.job.config, self.images.values())
+        look = job_of_look(self.job, self.identity, first or self.job.config)
+        counts, lost = match_pairs(look, self.images, self.pairs, seconds)
+        return MatchedPairs(Looks(look.store), look.config, counts), lost
+
+    def without(self, lost: Collection[str]) -> "RunPhotos":
+        """These photos without some."""
+        left = {name: image for name, image in self.images.items() if name not in lost}
+        return dataclasses.replace(self, images=left, pairs=pairs_without(self.pairs, lost))
+
+    def upright(self, turned: Mapping[str, ImageFile]) -> "RunPhotos":
+        """These photos, some of them turned."""
+        images = {**self.images, **turned}
+        identity = dataclasses.replace(self.identity, orientations=orientations(images.values()))
+        job = job_of_look(self.job, identity, self.job.config)
+        return dataclasses.replace(self, images=images, identity=identity, job=job)
+
+
+def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) -> MappedLooks:
+    """Map the photos; where that leaves photos without a sure place, look again.
+
+    Args:
+      matched: the photos after the first look.
+    """
+    mapped, seconds = stages.map(matched), stages.seconds
+    trials = Trials(photos.job, photos.identity, photos.images, seconds)
+    if turned := find_turned(mapped, trials, matched.counts):
+        photos = photos.upright(turned)
+        matched, _ = photos.match(seconds)
+        stages = dataclasses.replace(
+            stages, images=[photos.images[image.name] for image in stages.images], look="-turned"
+        )
+        mapped = stages.map(matched)
+    if matched.described == photos.job.config:
+        return MappedLooks(matched, mapped, None, photos.identity)
+    looks = UsedLooks(first_px=matched.described.max_size)
+    again = mapped.unsettled(matched.counts)
+    if again is None:
+        return MappedLooks(matched, mapped, looks, photos.identity)
+    logger.info("%s", again.in_words())
+    matched_again = match_again(photos.job, photos.images, matched, again, seconds)
+    mapped_again = dataclasses.replace(stages, look=stages.look + "-again").map(matched_again)
+    looks = dataclasses.replace(
+        looks,
+        photos=again.photos,
+        again=again.pairs,
+        whole=again.whole,
+        in_vain=mapped.better_than(mapped_again),
+    )
+    if not looks.in_vain:
+        matched, mapped = matched_again, mapped_again
+    return MappedLooks(matched, mapped, looks, photos.identity)
