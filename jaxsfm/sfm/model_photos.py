@@ -86,14 +86,14 @@ class ModelPhotos:
     def _gray(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
         """Intensities float32 (h, w) of the working image; original pixels per working pixel."""
         try:
-            rgb, scale = self.rgb(name)
+            image = self.rgb(name)
         except ImageError as error:
             if name not in self.unread:
                 self.unread[name] = str(error)
                 logger.warning("%s; its observations are not aligned", error)
             (width, height), scale = size_and_scale(self._sizes[name], self._limit)
             return np.zeros((height, width), np.float32), scale
-        return intensities(rgb), scale
+        return intensities(image), image.scale
 
 
 def _check_size(file: ImageFile, size: tuple[int, int], folder: Path) -> None:
