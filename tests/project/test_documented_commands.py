@@ -13,6 +13,8 @@ import shlex
 import shutil
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import jaxsfm
@@ -94,6 +96,8 @@ def home(plain, scene, tmp_path, monkeypatch):
     shutil.copy(scene / "K.txt", tmp_path / "SET/images")
     for name, photo in (("A.jpg", photos[0]), ("B.jpg", photos[1])):
         shutil.copy(photo, tmp_path / name)
+        white = np.full(cv2.imread(str(photo)).shape[:2], 255, np.uint8)
+        assert cv2.imwrite(str(tmp_path / f"{name}.png"), white)
     for folder in (tmp_path, tmp_path / "images"):
         shutil.copy(scene / "K.txt", folder)
     (tmp_path / "VIDEO.mp4").touch()
