@@ -21,7 +21,8 @@ from jaxsfm.bench.matches import Matcher, Matches
 from jaxsfm.bench.methods import PAIR_METHODS
 from jaxsfm.bench.options import HomographyOptions
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import SUFFIXES, ImageFile
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.photo_folder import SUFFIXES
 from jaxsfm.sfm.epipolar import homography
 
 ACCURACY_PX = (1, 3, 5, 10)

@@ -22,7 +22,8 @@ from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, check_fits, parse_intrinsics
 from jaxsfm.colmap.poses import Poses, read_poses
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageFile, find_images, inspect_image, read_image
+from jaxsfm.io.images import ImageFile, inspect_image, read_image
+from jaxsfm.io.photo_folder import find_images
 from jaxsfm.sfm.evaluation import pair_names
 
 PHOTOS = "images_upright"

@@ -17,7 +17,8 @@ from jaxsfm.bench.matches import Matcher, Matches
 from jaxsfm.bench.methods import PAIR_METHODS
 from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import SUFFIXES, ImageFile
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.photo_folder import SUFFIXES
 from jaxsfm.sfm.epipolar import epipolar_residuals, fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)

@@ -141,7 +141,8 @@ def match(
     import numpy as np
 
     from jaxsfm.io.atomic import atomic_file
-    from jaxsfm.io.images import inspect_image, read_image, with_mask
+    from jaxsfm.io.images import inspect_image, read_image
+    from jaxsfm.io.masked_images import with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
     from jaxsfm.matching.pair_matching import match_features

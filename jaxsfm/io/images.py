@@ -8,10 +8,8 @@ and intrinsics agree with COLMAP's own tools.
 import dataclasses
 import hashlib
 import logging
-import os
-import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,20 +20,15 @@ from PIL import ExifTags
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 from jaxsfm.io import decoders, orientation
+from jaxsfm.io.image_headers import exif_of, jpeg_is_complete, taken_with
 from jaxsfm.io.masks import (
     MaskFile,
-    mask_path,
-    missing_masks,
-    open_mask,
     read_mask,
     without_blank_border,
 )
 
 logger = logging.getLogger(__name__)
 
-SUFFIXES = frozenset(
-    (*".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split(), *decoders.SUFFIXES)
-)
 MAX_DECODED_PIXELS = 250_000_000
 """Larger images (0.75 GB) are refused, or decoded at reduced size if their format allows it."""
 MOST_NAMED = 3
@@ -114,30 +107,6 @@ def content(sha256: str, turned: int, mask: str | None) -> str:
     return " ".join(parts)
 
 
-def masks_of(images: Iterable[ImageFile]) -> dict[str, str]:
-    """The SHA-256 of the images' masks, by the names of the images."""
-    return {image.name: image.mask.sha256 for image in images if image.mask is not None}
-
-
-def with_masks(images: Iterable[ImageFile], folder: Path) -> tuple[list[ImageFile], list[str]]:
-    """The images with their masks, and the names of those that have none.
-
-    Raises:
-      UserError: the folder has no mask of any image, or a mask cannot be used.
-    """
-    images = list(images)
-    bare = missing_masks(folder, [image.name for image in images])
-
-    paths = {i.name: None if i.name in set(bare) else mask_path(folder, i.name) for i in images}
-    return [with_mask(image, paths[image.name]) for image in images], bare
-
-
-def with_mask(image: ImageFile, path: Path | None) -> ImageFile:
-    """The image with the mask at a path, if there is one; UserError if it cannot be used."""
-    mask = None if path is None else open_mask(path, image.size)
-    return dataclasses.replace(image, mask=mask)
-
-
 class WorkingImage(NamedTuple):
     """The pixels of an image at working size."""
 
@@ -148,54 +117,6 @@ class WorkingImage(NamedTuple):
     original."""
     used: np.ndarray | None = None
     """bool (height, width): the pixels that are used; None: all."""
-
-
-def find_images(folder: Path) -> list[str]:
-    """The names of the image files in a folder and its sub-folders, sorted, without hidden ones.
-
-    Cameras and phones store a photo in two formats, and people convert photos. Of files that differ
-    in their suffix alone, a RAW file is left out if there is another one, and a HEIC or AVIF file
-    if there is one in a usual format.
-
-    Raises:
-      UserError: there is no such folder, it cannot be read, or it holds no images.
-    """
-    try:
-        if not folder.exists():
-            raise UserError(f"{folder}: no such folder")
-        if not folder.is_dir():
-            raise UserError(f"{folder}: not a folder")
-        os.listdir(folder)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
-
-    def unreadable(error: OSError) -> None:
-        logger.warning("%s: skipped, cannot be read (%s)", error.filename, error.strerror)
-
-    names = []
-    for root, folders, files in os.walk(folder, onerror=unreadable):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        names += [
-            (Path(root) / name).relative_to(folder).as_posix()
-            for name in files
-            if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
-        ]
-    if not names:
-        suffixes = ", ".join(sorted(SUFFIXES))
-        raise UserError(f"{folder}: there are no images in this folder (looked for {suffixes})")
-    return _without_doubles(sorted(names))
-
-
-def _without_doubles(names: list[str]) -> list[str]:
-    rank = {name: decoders.RANK[decoders.SUFFIXES.get(Path(name).suffix.lower())] for name in names}
-    least: dict[str, int] = {}
-    for name in names:
-        stem = name.removesuffix(Path(name).suffix)
-        least[stem] = min(rank[name], least.get(stem, rank[name]))
-    doubles = [n for n in names if rank[n] > least[n.removesuffix(Path(n).suffix)]]
-    if doubles:
-        logger.info("left out, as the same photo is there in another format: %s", named(doubles))
-    return sorted({*names} - {*doubles})
 
 
 def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
@@ -226,7 +147,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
             warnings.simplefilter("ignore")  # about odd metadata; only the size is needed
             # Pillow is not given the path: reading from a file, it allocates what the header says.
             with decoders.open_header(data, path.suffix) as header:
-                size, exif = header.size, _exif(header)
+                size, exif = header.size, exif_of(header)
     except decoders.MissingReader as error:
         raise ImageError(f"{shown}: {error}") from error
     except Exception as error:  # Pillow's readers can raise almost anything
@@ -236,7 +157,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
             f"{shown}: {size[0]} x {size[1]} pixels is too small (at least {MIN_SIDE} per side)"
         )
     # Decoders would fill the missing part of a JPEG with grey and not say so.
-    if data[:2] == b"\xff\xd8" and not _jpeg_is_complete(data):
+    if data[:2] == b"\xff\xd8" and not jpeg_is_complete(data):
         raise ImageError(f"{shown}: the file is truncated")
     digest = hashlib.sha256(data).hexdigest()
     return ImageFile(
@@ -245,29 +166,8 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
         size=size,
         sha256=digest,
         orientation=orientation.checked(exif.get(ExifTags.Base.Orientation)),
-        taken_with=_taken_with(exif),
+        taken_with=taken_with(exif),
     )
-
-
-_CAMERA = ("Make", "Model", "BodySerialNumber", "LensModel", "FocalLength", "DigitalZoomRatio")
-"""The tags that tell cameras apart."""
-
-
-def _exif(header: decoders.Header) -> dict[int, object]:
-    """The EXIF data of a photo; empty if there is none or it is damaged."""
-    try:
-        exif = header.getexif()
-        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-    except Exception:  # Pillow's readers can raise almost anything
-        return {}
-
-
-def _taken_with(exif: Mapping[int, object]) -> str:
-    """What EXIF says of the camera (`ImageFile.taken_with`)."""
-    if not exif.get(ExifTags.Base.Model):
-        return ""
-    values = (exif.get(ExifTags.Base[tag], "") for tag in _CAMERA)
-    return ", ".join(text for value in values if (text := str(value).strip("\0 ")))
 
 
 def shown_name(name: str) -> str:
@@ -279,34 +179,6 @@ def named(names: Sequence[str], most: int = MOST_NAMED) -> str:
     """The first names of a list for messages, and how many more there are."""
     shown = ", ".join(shown_name(name) for name in names[:most])
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
-
-
-_SCAN_END = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
-
-
-def _jpeg_is_complete(data: bytes) -> bool:
-    """Whether the end marker follows the last scan; bytes that a camera appends are ignored.
-
-    Source: ITU-T T.81, B.1. Segments carry their length. Entropy-coded data ends at the next marker
-    that is neither a stuffed zero nor a restart.
-    """
-    position = 2
-    while position + 4 <= len(data):
-        if data[position] != 0xFF:
-            return False
-        marker = data[position + 1]
-        if marker == 0xD9:
-            return True
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
-            position += 1 if marker == 0xFF else 2
-            continue
-        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-        if marker == 0xDA:
-            end = _SCAN_END.search(data, position)
-            if end is None:
-                return False
-            position = end.start()
-    return data[position : position + 2] == b"\xff\xd9"
 
 
 def image_bytes(image: ImageFile) -> bytes:

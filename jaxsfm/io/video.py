@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.io.images import SUFFIXES, shown_name
+from jaxsfm.io.images import shown_name
+from jaxsfm.io.photo_folder import SUFFIXES
 
 logger = logging.getLogger(__name__)
 

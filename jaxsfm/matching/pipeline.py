@@ -11,8 +11,9 @@ from tqdm import tqdm
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures
-from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image
+from jaxsfm.io.images import ImageError, ImageFile, inspect_image
 from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.extraction import extract_images

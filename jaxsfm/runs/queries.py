@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, ImageFile, find_images, inspect_image, orientations
+from jaxsfm.io.images import ImageError, ImageFile, inspect_image, orientations
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.store import Store
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.working_model import CameraPrior

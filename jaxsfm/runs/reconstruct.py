@@ -14,7 +14,8 @@ from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageFile, masks_of, named, orientations, with_masks
+from jaxsfm.io.images import ImageFile, named, orientations
+from jaxsfm.io.masked_images import masks_of, with_masks
 from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.weights import chosen_weights

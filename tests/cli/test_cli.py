@@ -76,10 +76,14 @@ def test_same_seed_and_one_thread_give_the_same_model_byte_for_byte(scene, tmp_p
 
 
 @pytest.mark.slow
-def test_known_intrinsics_are_one_fixed_camera_and_none_is_one_per_photo(scene, tmp_path, plain):
+def test_a_known_camera_is_that_of_all_photos_and_unknown_ones_are_shared_as_asked(
+    scene, tmp_path, plain
+):
     assert rows(plain[0], "select model from cameras") == [(1,)]  # PINHOLE
-    run(scene, tmp_path / "free")
-    assert rows(tmp_path / "free", "select model from cameras") == [(2,)] * 3  # SIMPLE_RADIAL
+    run(scene, tmp_path / "auto")
+    assert rows(tmp_path / "auto", "select model from cameras") == [(2,)]  # SIMPLE_RADIAL
+    run(scene, tmp_path / "photo", "--cameras", "photo", "--camera-model", "OPENCV")
+    assert rows(tmp_path / "photo", "select model from cameras") == [(4,)] * 3
     run(scene, tmp_path / "model", "--intrinsics", "SIMPLE_PINHOLE:320,160,120")
     assert rows(tmp_path / "model", "select model from cameras") == [(0,)]
 
@@ -302,7 +306,7 @@ def test_bad_folders_are_named(scene, tmp_path, capsys):
     out = ("--out", tmp_path / "out")
     refuse(capsys, ["reconstruct", tmp_path / "nowhere", *out], tmp_path / "nowhere", "no such")
     file = write(tmp_path / "file.txt", "x")
-    refuse(capsys, ["reconstruct", file, *out], file, "not a folder")
+    refuse(capsys, ["reconstruct", file, *out], file, "not a video")
     (tmp_path / "empty").mkdir()
     refuse(capsys, ["reconstruct", tmp_path / "empty", *out], "no images")
     (tmp_path / "one").mkdir()
@@ -634,7 +638,7 @@ def test_no_description_of_an_option_is_broken_where_the_source_wraps():
     for choice in (MatchingChoice, ModelChoice, *choices):
         attributes = (choice.__doc__ or "").partition("Attributes:")[2]
         assert attributes and not re.search(r"\n {4}", attributes), choice.__name__
-    assert "Folder with the photos; sub-folders are included.\n" in COMMANDS["reconstruct"].__doc__
+    assert "Folder with the photos; sub-folders are included.\n" in COMMANDS["pairs"].__doc__
     assert "convolutions: Number format in which the network multiplies." in MatchingChoice.__doc__
 
 

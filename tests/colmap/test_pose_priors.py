@@ -18,7 +18,7 @@ def priors(path) -> dict[str, pycolmap.PosePrior]:
 @pytest.mark.parametrize("geographic", [True, False])
 def test_each_image_has_its_prior_and_no_other_has_one(tmp_path, scene, geographic):
     path = tmp_path / "d.db"
-    write_database(path, scene.images, scene.results, scene.known)
+    write_database(path, scene.images, scene.results, scene.cameras)
     first, second, third = scene.names[:3]
     given = {
         first: Position(7.5, 46.5, 300.0, 0.5),

@@ -12,13 +12,8 @@ from PIL import ExifTags, Image, features
 from raw_files import dng
 
 from jaxsfm.io.decoders import open_header, special_format
-from jaxsfm.io.images import (
-    DamagedImage,
-    ImageError,
-    find_images,
-    inspect_image,
-    read_image,
-)
+from jaxsfm.io.images import DamagedImage, ImageError, inspect_image, read_image
+from jaxsfm.io.photo_folder import find_images
 
 ORIENTATION = ExifTags.Base.Orientation
 QUARTERS = {1: 0, 6: -1, 3: 2, 8: 1}

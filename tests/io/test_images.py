@@ -9,7 +9,8 @@ from PIL import Image
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, find_images, inspect_image, read_image
+from jaxsfm.io.images import ImageError, inspect_image, read_image
+from jaxsfm.io.photo_folder import find_images
 
 
 def write_png(path: Path, rgb: np.ndarray) -> Path:

@@ -13,11 +13,9 @@ from jaxsfm.io.images import (
     ImageError,
     ImageFile,
     inspect_image,
-    masks_of,
     read_image,
-    with_mask,
-    with_masks,
 )
+from jaxsfm.io.masked_images import masks_of, with_mask, with_masks
 from jaxsfm.io.masks import BLANK, mask_path, without_blank_border
 from jaxsfm.io.photos import intensities
 

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from jaxsfm import preset
 from jaxsfm.cli.main import main
 from jaxsfm.io.pairs import exhaustive_pairs
-from jaxsfm.io.work_folder import WorkFolder
+from jaxsfm.io.store import Store
 from jaxsfm.matching.ray import engine
 from jaxsfm.matching.ray.engine import CACHED_IMAGES, TILE, RayEngine, pair_blocks
 from jaxsfm.matching.ray.workers import TASKS_PER_WORKER
@@ -60,7 +60,7 @@ def test_a_killed_worker_and_a_damaged_photo_change_nothing(scene, tmp_path, mon
     (photos / "torn.png").write_bytes((photos / "view0.png").read_bytes()[:20_000])
     args = ["reconstruct", str(photos), "--preset", "paper", "--threads", "1", "--out"]
     assert main([*args, str(tmp_path / "local")]) == 0
-    original, killed = WorkFolder.load_features, []
+    original, killed = Store.load_features, []
     killer = threading.Thread(target=kill_a_busy_worker, args=(killed,))
 
     def loading(self, image):  # features are wanted as soon as the first worker is there
@@ -68,7 +68,7 @@ def test_a_killed_worker_and_a_damaged_photo_change_nothing(scene, tmp_path, mon
             killer.start()
         return original(self, image)
 
-    monkeypatch.setattr(WorkFolder, "load_features", loading)
+    monkeypatch.setattr(Store, "load_features", loading)
     capsys.readouterr()
     assert main([*args, str(tmp_path / "ray"), "--engine", "ray", "--workers", "2"]) == 0
     printed = capsys.readouterr()

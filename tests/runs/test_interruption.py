@@ -11,7 +11,7 @@ import pytest
 import jaxsfm.runs.run_stages
 from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
-from jaxsfm.io.work_folder import WorkFolder
+from jaxsfm.io.store import Store
 from jaxsfm.matching import extraction, pair_matching
 
 QUICK = ("--preset", "paper")
@@ -36,8 +36,8 @@ def interrupt_after(monkeypatch, owner, name: str, calls: int) -> list[int]:
 @pytest.mark.parametrize(
     ("stage", "owner", "function", "calls"),
     [
-        ("extraction", WorkFolder, "save_features", 1),
-        ("matching", WorkFolder, "save_matches", 2),
+        ("extraction", Store, "save_features", 1),
+        ("matching", Store, "save_matches", 2),
         ("mapping", jaxsfm.runs.run_stages, "map_matches", 0),
     ],
 )
@@ -61,8 +61,8 @@ def test_an_interrupted_run_goes_on_where_it_was(
     done = len(list((tmp_path / "cut").glob("features/*/*.npz")))
     matched = len(list((tmp_path / "cut").glob("matches/*/*.npz")))
     assert (done, matched) == {"extraction": (1, 0), "matching": (3, 2), "mapping": (3, 3)}[stage]
-    extracted = interrupt_after(monkeypatch, WorkFolder, "save_features", 99)
-    rematched = interrupt_after(monkeypatch, WorkFolder, "save_matches", 99)
+    extracted = interrupt_after(monkeypatch, Store, "save_features", 99)
+    rematched = interrupt_after(monkeypatch, Store, "save_matches", 99)
     assert main([*args, str(tmp_path / "cut")]) == 0
     assert extracted[0] == 3 - done and rematched[0] == 3 - matched
     for file in sorted((tmp_path / "whole" / "matches").glob("*/*.npz")):
@@ -77,14 +77,14 @@ def test_an_interrupt_that_a_callback_swallowed_still_ends_the_run(
     scene, tmp_path, monkeypatch, capsys
 ):
     """Like JAX's garbage collector hook, which Python lets print and forget the exception."""
-    original = WorkFolder.save_features
+    original = Store.save_features
 
     def swallowing(*args, **kwargs):
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         return original(*args, **kwargs)
 
-    monkeypatch.setattr(WorkFolder, "save_features", swallowing)
+    monkeypatch.setattr(Store, "save_features", swallowing)
     command = ["reconstruct", str(scene / "images"), *QUICK, "--out", str(tmp_path / "out")]
     assert main(command) == 130
     assert "interrupted" in capsys.readouterr().err

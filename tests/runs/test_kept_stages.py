@@ -7,7 +7,7 @@ import pytest
 
 from jaxsfm.cli.main import main
 from jaxsfm.colmap import model_folders
-from jaxsfm.io.work_folder import WorkFolder
+from jaxsfm.io.store import Store
 from jaxsfm.sfm import reconstruction
 
 
@@ -25,8 +25,8 @@ def counted(monkeypatch) -> dict[str, int]:
 
         monkeypatch.setattr(owner, name, wrapped)
 
-    count(WorkFolder, "save_features", "extract")
-    count(WorkFolder, "save_matches", "match")
+    count(Store, "save_features", "extract")
+    count(Store, "save_matches", "match")
     count(reconstruction, "verify", "verify")
     count(reconstruction, "build_checked_models", "map")
     count(reconstruction, "refine_models", "refine")

@@ -10,8 +10,8 @@ from moving_views import views, write_video
 
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import find_images
 from jaxsfm.io.pair_selection import FEW, MOST_NEIGHBOURS, chosen_pairs, many_frames
+from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.work_folder import lock_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.runs.video import frames as frames_module
