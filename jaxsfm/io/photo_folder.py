@@ -6,6 +6,7 @@ from pathlib import Path
 
 from jaxsfm.errors import UserError
 from jaxsfm.io import decoders
+from jaxsfm.io.images import named
 
 logger = logging.getLogger(__name__)
 
