@@ -66,7 +66,8 @@ class MethodRun:
 
     def cameras(self, each: StrechaSet) -> Cameras:
         """What is known of the cameras of a set."""
-        return Cameras(known=parse_intrinsics(each.camera) if self.known else None)
+        known = parse_intrinsics(each.camera) if self.known else None
+        return Cameras(known=known, sharing="photo")
 
     @property
     def mapping(self) -> MapOptions:
@@ -160,6 +161,7 @@ def _run_method(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     options = RunOptions(
         pairs="exhaustive",  # as RootSIFT
         intrinsics=each.camera if run.known else None,
+        cameras="auto" if run.known else "photo",
         network=run.network,
         seed=run.seed,
         threads=run.threads,

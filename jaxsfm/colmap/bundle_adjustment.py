@@ -15,7 +15,8 @@ fountain-P11, the median rotation is off by 0.16 and 0.27 deg instead of 0.47 an
 worst by 0.33 and 0.89 deg instead of 1.14 and 1.29. All eight views of Herz-Jesus-P8 find the point
 to 0.4 px, which was 8 px from the centre of the photos."""
 FARTHEST_CENTRE = 0.1
-"""A principal point this far from where it was, in units of the longer side, is not believed."""
+"""A principal point that moves farther than this from the centre of the photo, in units of the
+longer side, is not believed."""
 
 
 def bundle_adjust(
@@ -53,7 +54,7 @@ def bundle_adjust(
     if refine_intrinsics and shared and not options.refine_principal_point:
         options.refine_principal_point = True  # COLMAP has one switch for all cameras
         _solve(reconstruction, options, fixed=sorted(views.keys() - shared))
-    lost = [n for n in before if _moved(reconstruction.camera(n), before[n]) > FARTHEST_CENTRE]
+    lost = [n for n in before if _ran_away(reconstruction.camera(n), before[n])]
     for number in lost:
         camera = reconstruction.camera(number)
         camera.principal_point_x, camera.principal_point_y = before[number]
@@ -70,9 +71,11 @@ def _centre(camera: pycolmap.Camera) -> tuple[float, float]:
     return camera.principal_point_x, camera.principal_point_y
 
 
-def _moved(camera: pycolmap.Camera, before: tuple[float, float]) -> float:
-    """How far a principal point has moved, in units of the longer side."""
-    return math.dist(_centre(camera), before) / max(camera.width, camera.height)
+def _ran_away(camera: pycolmap.Camera, before: tuple[float, float]) -> bool:
+    """Whether a principal point is too far out, and farther than it was."""
+    middle = camera.width / 2, camera.height / 2
+    now, then = math.dist(_centre(camera), middle), math.dist(before, middle)
+    return now > max(then, FARTHEST_CENTRE * max(camera.width, camera.height))
 
 
 def _solve(

@@ -84,7 +84,8 @@ def looks_calibrated(model: pycolmap.Reconstruction) -> bool:
     """Whether the cameras of all images with a pose seem to have been known beforehand.
 
     COLMAP puts the principal point of a camera that it guesses into the image's centre, and its
-    mapper leaves it there. So a principal point beside the centre comes from a calibration.
+    mapper leaves it there. So a principal point beside the centre comes from a calibration, or from
+    our refinement.
     """
     return not any(
         camera.principal_point_x == camera.width / 2

@@ -3,13 +3,13 @@
 Source: CIPA DC-008-2023 (EXIF 3.0), section 4.6.6.
 """
 
-import io
 import math
 import warnings
 from collections.abc import Iterable, Mapping
 
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
+from jaxsfm.io.decoders import any_size, open_header
 from jaxsfm.io.images import ImageError, ImageFile, image_bytes
 from jaxsfm.io.position_tables import Position
 
@@ -39,7 +39,7 @@ def gps_of(image: ImageFile) -> Position | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about odd metadata
             # Pillow is given the bytes: reading from a file, it allocates what the header says.
-            with Image.open(io.BytesIO(data)) as opened:
+            with any_size(), open_header(data, image.path.suffix) as opened:
                 fields = dict(opened.getexif().get_ifd(ExifTags.IFD.GPSInfo))
     except Exception:  # Pillow's readers can raise almost anything on damaged metadata
         return None

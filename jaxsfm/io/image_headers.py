@@ -12,12 +12,19 @@ _CAMERA = ("Make", "Model", "BodySerialNumber", "LensModel", "FocalLength", "Dig
 
 
 def exif_of(header: decoders.Header) -> dict[int, object]:
-    """The EXIF data of a photo; empty if there is none or it is damaged."""
+    """The EXIF data of a photo; empty if there is none or it is damaged.
+
+    OpenCV turns a TIFF file upright when it decodes it, and Pillow gives its upright size. So its
+    orientation is left out.
+    """
     try:
         exif = header.getexif()
-        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+        found = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
     except Exception:  # Pillow's readers can raise almost anything
         return {}
+    if getattr(header, "format", None) == "TIFF":
+        found.pop(ExifTags.Base.Orientation, None)
+    return found
 
 
 def taken_with(exif: Mapping[int, object]) -> str:

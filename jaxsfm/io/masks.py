@@ -17,6 +17,8 @@ from jaxsfm.errors import UserError
 BLANK = 1
 """The largest value of a pixel in a blank border: rectified photos are black where they have no
 content."""
+WIDTH = 5
+"""A blank border is at least so many pixels wide at every place."""
 LEAST_BLANK = 0.02
 """A blank border covers at least this share of the photo. A frame of a few pixels is no matter."""
 
@@ -87,6 +89,8 @@ def without_blank_border(rgb: np.ndarray) -> np.ndarray | None:
     if not any((edge.max(-1) <= BLANK).any() for edge in edges):
         return None  # most photos, in no time
     blank = (rgb.max(-1) <= BLANK).astype(np.uint8)
+    # Dark pixels of a night touch each other by chance. What is narrower than the kernel goes.
+    blank = cv2.morphologyEx(blank, cv2.MORPH_OPEN, np.ones((WIDTH, WIDTH), np.uint8))
     _, labels = cv2.connectedComponents(blank, connectivity=4)
     outer = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     border = np.isin(labels, outer[outer > 0])

@@ -160,8 +160,8 @@ def differences(old: Identity, new: Identity) -> str:
         if isinstance(before, dict) and isinstance(now, dict) and key == "images":
             changed = sorted(n for n in before.keys() | now.keys() if before.get(n) != now.get(n))
             parts.append(f"{len(changed)} images, first {changed[0]!r}")
-        elif key == "orientations":
-            parts.append("how images are turned")
+        elif key in ("orientations", "masks"):
+            parts.append({"orientations": "how images are turned", "masks": "--masks"}[key])
         elif isinstance(before, dict) and isinstance(now, dict):
             parts.append(differences(before, now))
         else:

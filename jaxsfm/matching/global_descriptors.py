@@ -38,7 +38,7 @@ CELLS = f"cells {SIDE}"
 GEM = f"gem {SIDE}"
 """The kind of GeM descriptors in the store."""
 ByContent = dict[str, np.ndarray]
-"""Descriptors by the SHA-256 of the photo's file."""
+"""Descriptors by `ImageFile.content`."""
 _gem, _vlad, _netvlad, _fit = (jax.jit(f) for f in (gem, vlad, netvlad, fit_vocabulary))
 
 
@@ -48,30 +48,30 @@ class PhotoCollection:
 
     weights: Weights
     unique: list[ImageFile]
-    """One photo of each content, in order of the SHA-256."""
+    """One photo of each content, in order of the contents."""
     store: Store
     execution: Execution | None
     on_image: Callable[[], object]
     """Called for every photo that has been through the network."""
     lost: dict[str, ImageError] = field(default_factory=dict)
-    """Errors of photos that cannot be decoded, by SHA-256; added while photos are described."""
+    """Errors of photos that cannot be decoded, by content; added while photos are described."""
 
     def stored(self, kind: str) -> ByContent:
         """All descriptors of this kind that are in the store."""
-        found = {image.sha256: self.store.load_descriptor(image, kind) for image in self.unique}
-        return {sha256: each for sha256, each in found.items() if each is not None}
+        found = {image.content: self.store.load_descriptor(image, kind) for image in self.unique}
+        return {content: each for content, each in found.items() if each is not None}
 
     def missing(self, have: Collection[str]) -> list[ImageFile]:
-        """The photos whose SHA-256 is not in `have`."""
-        return [image for image in self.unique if image.sha256 not in have]
+        """The photos whose content is not in `have`."""
+        return [image for image in self.unique if image.content not in have]
 
 
 def gem_descriptors(collection: PhotoCollection) -> ByContent:
     """The generalised mean of each photo's coarse descriptors, float32 (c,)."""
     found = collection.stored(GEM)
     for image, rows in _decoded(collection, _coarse_rows(collection, collection.missing(found))):
-        found[image.sha256] = np.asarray(_gem(_padded(rows)))
-        collection.store.save_descriptor(image, GEM, found[image.sha256])
+        found[image.content] = np.asarray(_gem(_padded(rows)))
+        collection.store.save_descriptor(image, GEM, found[image.content])
     return found
 
 
@@ -90,13 +90,13 @@ def vlad_descriptors(collection: PhotoCollection) -> ByContent:
     good = collection.missing(collection.lost)
     kind = _vlad_kind(good)
     found = collection.stored(kind)
-    todo = [image for image in good if image.sha256 not in found]
+    todo = [image for image in good if image.content not in found]
     words = _vocabulary(collection, good) if todo else None
     for image in todo:
         interrupt.check()
         rows = _padded(_local_descriptors(collection, image))
-        found[image.sha256] = np.asarray(_vlad(rows, words))
-        collection.store.save_descriptor(image, kind, found[image.sha256])
+        found[image.content] = np.asarray(_vlad(rows, words))
+        collection.store.save_descriptor(image, kind, found[image.content])
     return found
 
 
@@ -110,13 +110,13 @@ def netvlad_descriptors(collection: PhotoCollection) -> ByContent:
     extras = read_extras(collection.weights.path)
     head = NetVLADHead(*(jnp.asarray(extras[f"netvlad.{name}"]) for name in NetVLADHead._fields))
     for image, rows in _decoded(collection, _conv5_rows(collection.weights, todo)):
-        found[image.sha256] = np.asarray(_netvlad(rows, head))
-        collection.store.save_descriptor(image, kind, found[image.sha256])
+        found[image.content] = np.asarray(_netvlad(rows, head))
+        collection.store.save_descriptor(image, kind, found[image.content])
     return found
 
 
 def _vlad_kind(images: Iterable[ImageFile]) -> str:
-    return f"vlad {SIDE} {SAMPLE} {digest(sorted(image.sha256 for image in images))}"
+    return f"vlad {SIDE} {SAMPLE} {digest(sorted(image.content for image in images))}"
 
 
 def _vocabulary(collection: PhotoCollection, good: list[ImageFile]) -> Vocabulary:
@@ -140,7 +140,7 @@ def _decoded(
     for image, rows in stream:
         interrupt.check()
         if isinstance(rows, ImageError):
-            collection.lost[image.sha256] = rows
+            collection.lost[image.content] = rows
         else:
             yield image, rows
         collection.on_image()

@@ -89,8 +89,8 @@ def describe_photos(
     check_retrieval(kind, weights)
     images = list(images)
     # Each content is described once, in an order that does not depend on the caller.
-    of_content = {image.sha256: image for image in images}
-    unique = [of_content[sha256] for sha256 in sorted(of_content)]
+    of_content = {image.content: image for image in images}
+    unique = [of_content[content] for content in sorted(of_content)]
     with contextlib.ExitStack() as stack:
         if store is None:
             scratch = stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
@@ -100,8 +100,8 @@ def describe_photos(
         found = _DESCRIBE[kind](collection)
     lost = collection.lost
     return GlobalDescriptors(
-        {image.name: found[image.sha256] for image in images if image.sha256 in found},
-        [(image, lost[image.sha256]) for image in images if image.sha256 in lost],
+        {image.name: found[image.content] for image in images if image.content in found},
+        [(image, lost[image.content]) for image in images if image.content in lost],
     )
 
 

@@ -23,6 +23,7 @@ from jaxsfm.io.images import (
     size_and_scale,
 )
 from jaxsfm.io.looks import Looks
+from jaxsfm.io.masked_images import with_mask
 from jaxsfm.io.masks import MaskFile, mask_path
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
@@ -64,6 +65,7 @@ class RecordedPhotos:
         self._hashes, self._identity, self._masks = identity.images, identity, masks
         self._config = config
         self.read = functools.lru_cache(maxsize=16)(self._read)
+        self.taken_with = functools.cache(self._taken_with)
 
     def file(self, name: str) -> ImageFile | None:
         """The file of a photo; None if it is gone or has changed."""
@@ -79,6 +81,19 @@ class RecordedPhotos:
         """The file of a photo of the run, turned and masked as it was when it was described."""
         code = orientation.checked(self._identity.orientations.get(image.name))
         return dataclasses.replace(image, orientation=code, mask=self._mask(image.name))
+
+    def _taken_with(self, name: str) -> str:
+        """What EXIF says of the camera of a photo; empty if nothing, or if the file is gone."""
+        image = self.file(name)
+        return "" if image is None else image.taken_with
+
+    def with_own_mask(self, image: ImageFile) -> ImageFile:
+        """A new photo with its mask, if there is one in the folder of the run's masks.
+
+        Raises UserError if the mask cannot be used.
+        """
+        path = None if self._masks is None else mask_path(self._masks, image.name)
+        return with_mask(image, path if path is not None and path.is_file() else None)
 
     def _mask(self, name: str) -> MaskFile | None:
         sha256 = self._identity.masks.get(name)

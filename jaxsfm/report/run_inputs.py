@@ -1,10 +1,15 @@
 """The part of a run's report that says what the run was made with."""
 
 import dataclasses
+from collections.abc import Iterable, Mapping
 from dataclasses import field
-from typing import Annotated
+from typing import Annotated, TypeVar
 
+from jaxsfm.io.images import ImageFile, orientations
+from jaxsfm.io.masked_images import masks_of
 from jaxsfm.report.typed_json import OMITTED, OTHERS, Count, Range
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,6 +31,20 @@ class RunIdentity:
     """How photos that are not stored upright are turned, by name (`jaxsfm.io.orientation`)."""
     masks: dict[str, str] = field(default_factory=dict, metadata=OMITTED)
     """The SHA-256 of the masks, by the names of their photos."""
+
+    def with_images(self, images: Iterable[ImageFile]) -> "RunIdentity":
+        """The same run with these images, which replace those of the same names."""
+        new = {image.name: image for image in images}
+
+        def others(values: Mapping[str, T]) -> dict[str, T]:
+            return {name: value for name, value in values.items() if name not in new}
+
+        return dataclasses.replace(
+            self,
+            images=self.images | {name: image.sha256 for name, image in new.items()},
+            orientations=others(self.orientations) | orientations(new.values()),
+            masks=others(self.masks) | masks_of(new.values()),
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

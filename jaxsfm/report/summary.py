@@ -112,7 +112,7 @@ def summary_lines(report: RunReport) -> list[str]:
         lines.append(f"looks            {looks.in_words()}")
     if turned := report.turned:
         each = [f"{shown_name(name)} by {degrees} deg" for name, degrees in turned.items()]
-        lines.append(f"turned           {named(each)} clockwise: stored sideways without a note")
+        lines.append(f"turned           {named(each)} clockwise, to stand as the others do")
     if given := report.given:
         lines.append(
             f"given            {given.matches} matches in {given.pairs} pairs of {given.images} "

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, ImageFile, orientations
+from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
@@ -78,6 +78,7 @@ def _extend(
         )
     usable, broken = open_images(finished.photos.folder, progress=options.progress)
     images, skipped = _added_photos(finished, usable, broken)
+    images = {name: finished.photos.with_own_mask(image) for name, image in images.items()}
     if not images and not skipped:
         return None
     seed = finished.report.options.seed
@@ -85,13 +86,12 @@ def _extend(
     names = [view.name for view in model.views]
     files = _unchanged_photos(finished, usable, names) | images
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
-    cameras = {n: camera_prior(image, model.views, intrinsics) for n, image in images.items()}
-    hashes = {name: image.sha256 for name, image in images.items()}
-    identity = dataclasses.replace(
-        identity,
-        images=identity.images | hashes,
-        orientations=identity.orientations | orientations(images.values()),
-    )
+    taken_with = finished.photos.taken_with
+    cameras = {
+        name: camera_prior(image, model.views, intrinsics, taken_with)
+        for name, image in images.items()
+    }
+    identity = identity.with_images(images.values())
     folder = open_locked_folder(run, to_json(identity))
     job = Job(
         store=folder,
@@ -134,7 +134,14 @@ def _added_photos(
     """
     skipped = run.report.images.skipped
     used = run.report.identity.images.keys() - skipped.keys()
-    fresh = [i for i in usable if i.name not in used and not run.store.why_unusable(i)]
+    others = {name.removesuffix(Path(name).suffix) for name in used}
+    fresh = [
+        i
+        for i in usable
+        if i.name not in used
+        and i.name.removesuffix(i.path.suffix) not in others  # the same photo in another format
+        and not run.store.why_unusable(i)
+    ]
     unusable = {n: why for n, why in broken.items() if n not in used and n not in skipped}
     return {image.name: image for image in fresh}, unusable
 
@@ -151,8 +158,8 @@ def _unchanged_photos(
         for image in usable
         if used.get(image.name) == image.sha256
     }
-    photos_of_run(run, [name for name in needed if name not in there])  # names what is gone
-    return there
+    # One that is gone is named. One of which there is another format now is still there.
+    return there | photos_of_run(run, [name for name in needed if name not in there])
 
 
 def _match_new(

@@ -5,6 +5,8 @@ import logging
 from collections.abc import Collection, Iterable
 from pathlib import Path
 
+import numpy as np
+
 from jaxsfm.errors import UserError
 from jaxsfm.io.exif_gps import read_gps
 from jaxsfm.io.images import ImageFile, named, shown_name
@@ -52,6 +54,8 @@ def measured_positions(choice: str, images: list[ImageFile]) -> MeasuredPosition
     table = read_position_table(path)
     system = coordinate_system(table.system, f"{OPTION} {path}")
     _check_angles(table, system, path)
+    every = [*table.positions.values(), *(point.position for point in table.points)]
+    system.check(np.asarray([(at.x, at.y, at.z or 0.0) for at in every]))
     names = _MatchedNames(images)
     if table.points:
         points = _points_of(table, names, {image.name: image for image in images}, path)

@@ -72,7 +72,10 @@ def localize_photos(
     model = read_working_model(finished.folder / "sparse" / "0", finished.config, seed=seed)
     intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
     usable, unusable = open_queries(photos)
-    cameras = {path: camera_prior(i, model.views, intrinsics) for path, i in usable.items()}
+    cameras = {
+        path: camera_prior(image, model.views, intrinsics, finished.photos.taken_with)
+        for path, image in usable.items()
+    }
     weights = weights_of_run(finished, options.network)
     unknown = {image.name: image for image in usable.values()}
     shortlist = shortlist or similar_photos(

@@ -9,7 +9,7 @@ import logging
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
-from jaxsfm.io.images import ImageFile, orientations
+from jaxsfm.io.images import ImageFile
 from jaxsfm.io.looks import Looks
 from jaxsfm.io.pairs import Pair
 from jaxsfm.report.run_inputs import RunIdentity, UsedLooks
@@ -62,7 +62,7 @@ class RunPhotos:
     def upright(self, turned: Mapping[str, ImageFile]) -> "RunPhotos":
         """These photos, some of them turned."""
         images = {**self.images, **turned}
-        identity = dataclasses.replace(self.identity, orientations=orientations(images.values()))
+        identity = self.identity.with_images(turned.values())
         job = job_of_look(self.job, identity, self.job.config)
         return dataclasses.replace(self, images=images, identity=identity, job=job)
 
@@ -75,7 +75,8 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     """
     mapped, seconds = stages.map(matched), stages.seconds
     trials = Trials(photos.job, photos.identity, photos.images, seconds)
-    if turned := find_turned(mapped, trials, matched.counts):
+    checked = photos.job.config.checked  # the paper takes photos as they are stored
+    if checked and (turned := find_turned(mapped, trials, matched.counts)):
         photos = photos.upright(turned)
         matched, _ = photos.match(seconds)
         stages = dataclasses.replace(

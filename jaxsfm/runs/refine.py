@@ -199,7 +199,7 @@ def refine_lines(report: RefineReport) -> list[str]:
             + ("" if done.accepted else "; too few agreed, so this pass was taken back")
         )
     intrinsics = "were refined" if report.refined_intrinsics else "stayed as they were"
-    lines.append(f"focal lengths and distortion {intrinsics}")
+    lines.append(f"intrinsics {intrinsics}")
     lines += [f"not read: {reason}" for reason in report.unread.values()]
     for at in report.refinement.placed:
         if at.name in report.removed:

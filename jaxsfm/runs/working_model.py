@@ -1,7 +1,7 @@
 """What `localize` and `extend` need of a finished run: its model, its weights and its photos."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -58,12 +58,19 @@ def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> Workin
 
 
 def camera_prior(
-    image: ImageFile, views: Sequence[View], intrinsics: Intrinsics | None
+    image: ImageFile,
+    views: Sequence[View],
+    intrinsics: Intrinsics | None,
+    taken_with: Callable[[str], str] = lambda _: "",
 ) -> CameraPrior:
     """The camera that a photo starts with.
 
     It is the given one. Without one, it is the camera of the model, if the model has exactly one
-    camera of the photo's size that several views share. Else it comes from EXIF, or is a guess.
+    camera of the photo's size that several views share, and EXIF does not say that the photo was
+    taken with another one. Else it comes from EXIF, or is a guess.
+
+    Args:
+      taken_with: what EXIF says of the camera of a photo of the model, by name.
 
     Raises:
       UserError: the given intrinsics do not fit the photo's size.
@@ -73,12 +80,12 @@ def camera_prior(
         known.check_fits([image])
         ((camera, _),) = known.assigned([image])
         return CameraPrior(camera, "given")
-    fitting = [v.camera for v in views if (v.camera.width, v.camera.height) == image.size]
-    count = Counter(camera.camera_id for camera in fitting)
-    shared = {c.camera_id: c for c in fitting if count[c.camera_id] > 1}
-    if len(shared) == 1:
-        (camera,) = shared.values()
-        return CameraPrior(camera, "run")
+    fitting = [v for v in views if (v.camera.width, v.camera.height) == image.size]
+    count = Counter(view.camera.camera_id for view in fitting)
+    shared = {v.camera.camera_id: v for v in fitting if count[v.camera.camera_id] > 1}
+    alike = [view for view in shared.values() if taken_with(view.name) == image.taken_with]
+    if len(alike) == 1:
+        return CameraPrior(alike[0].camera, "run")
     camera = estimated_camera([image])
     return CameraPrior(camera, "exif" if camera.has_prior_focal_length else "guess")
 

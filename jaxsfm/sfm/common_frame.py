@@ -81,6 +81,8 @@ def find_frame(
       error_px: points fall together if the second model's point, in the photos of the first model
         that observe it, is this near to its keypoints in the mean, pixels of the views.
     """
+    if not len(points.first):
+        return None
     sides = [
         {view.name: view for view in model.views if view.name in shared}
         for model in (first, second)

@@ -202,7 +202,7 @@ def map_matches(
         write_models(made.alternative, folder / ALTERNATIVE)
         stage_files.write_mapping(folder, made.figures)
 
-    by_image = [[image.name, image.sha256, image.size] for image in given.images]
+    by_image = [[image.name, image.content, image.size] for image in given.images]
     camera = _plain(given.cameras)
     verifying = [options.seed, options.threads, options.scale, config.view_graph]
     key = digest(

@@ -106,7 +106,8 @@ def radial_lens(camera: pycolmap.Camera, to: str, *, centred: bool) -> Lens:
         if off > TOLERANCE_PX:
             raise UserError(
                 f"--to {to}: its principal point is the image's centre, but the {lens.model} "
-                f"camera's lies {off:.2f} pixels off"
+                f"camera's lies {off:.2f} pixels off (reconstruct with --cameras photo leaves it "
+                "there)"
             )
     return lens
 

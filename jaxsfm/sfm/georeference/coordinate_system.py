@@ -13,6 +13,7 @@ import numpy as np
 from jaxsfm.colmap.geodesy import east_north_up
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
+from jaxsfm.io.position_tables import OPTION
 
 if TYPE_CHECKING:
     import pyproj
@@ -48,6 +49,11 @@ class CoordinateSystem(NamedTuple):
     crs: "pyproj.CRS | None"
     """Its definition, if it needs pyproj."""
 
+    def check(self, xyz: np.ndarray) -> None:
+        """Raise UserError unless all positions float64 (n, 3) lie in this system."""
+        if self.kind != "local":
+            self._wgs84(xyz)
+
     def frame(self, xyz: np.ndarray) -> Frame:
         """The frame whose origin lies amid positions float64 (n, 3), n >= 1, in this system."""
         middle = np.median(xyz, axis=0)
@@ -82,7 +88,14 @@ class CoordinateSystem(NamedTuple):
         import pyproj
 
         to = pyproj.Transformer.from_crs(self.crs, pyproj.CRS("EPSG:4979"), always_xy=True)
-        return np.stack(to.transform(*xyz.T), axis=1)
+        moved = np.stack(to.transform(*xyz.T), axis=1)
+        if not np.isfinite(moved).all():
+            bad = xyz[~np.isfinite(moved).all(1)][0]
+            raise UserError(
+                f"{OPTION}: the position ({bad[0]:g}, {bad[1]:g}) lies outside {self.name}; are "
+                "its first two numbers in the right order?"
+            )
+        return moved
 
 
 LOCAL = CoordinateSystem("local", None, None)

@@ -136,7 +136,10 @@ def _mean_shift(views: Sequence[View], blocks: Sequence[AlignedBlock]) -> float 
 def _doubtful(views: Sequence[View], blocks: Sequence[AlignedBlock]) -> list[View]:
     """The views in which a much smaller share of the candidates agreed than in others."""
     count = len(views)
-    shown = sum(np.bincount(block.found.view, minlength=count) for block in blocks)
+    # Where pixels are not used there is no score, and nothing to agree with.
+    shown = sum(
+        np.bincount(block.found.view[np.isfinite(block.score)], minlength=count) for block in blocks
+    )
     agreed = sum(np.bincount(block.found.view[block.agrees], minlength=count) for block in blocks)
     share = np.asarray(agreed / np.maximum(shown, 1))
     return [views[k] for k in np.flatnonzero(share < DOUBTFUL_SHARE * np.median(share)).tolist()]

@@ -53,9 +53,16 @@ def chunks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
 def block_means(image: np.ndarray, px: int) -> np.ndarray:
     """An image (h, w) with pixels `px` times as large, each the mean of those it covers.
 
-    Rows and columns at the end that fill no large pixel are left out.
+    Rows and columns at the end that fill no large pixel are left out. A large pixel is the mean of
+    the used pixels, and is not used (NaN) itself if less than half of it is.
     """
     if px == 1:
         return image
     h, w = (side // px for side in image.shape)
-    return image[: h * px, : w * px].reshape(h, px, w, px).mean((1, 3))
+    blocks = image[: h * px, : w * px].reshape(h, px, w, px)
+    if not np.isnan(blocks).any():
+        return blocks.mean((1, 3))
+    used = np.isfinite(blocks)
+    count = used.sum((1, 3))
+    total = np.where(used, blocks, 0).sum((1, 3))
+    return np.where(2 * count >= px * px, total / np.maximum(count, 1), np.nan).astype(image.dtype)
