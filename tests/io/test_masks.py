@@ -141,7 +141,9 @@ def test_a_blank_border_is_not_used_and_a_dark_place_inside_is(value):
     rgb = rectified(value)
     used = without_blank_border(rgb)
     assert used is not None and used[30, 60]
-    np.testing.assert_array_equal(used[:, :50], (rgb > BLANK).all(-1)[:, :50])
+    expected = (rgb > BLANK).all(-1)
+    assert (used != expected)[:, :50].sum() <= 4  # the tips in the corners are narrow
+    assert not used[:, :11].any() and used[:, 20:50].all()
 
 
 def test_dark_but_not_blank_borders_are_used():
@@ -164,3 +166,12 @@ def test_the_border_and_the_mask_are_both_left_out(tmp_path):
     used = read_image(masked, max_size=90).used
     assert border is not None and used is not None
     np.testing.assert_array_equal(used, border & left_half())
+
+
+def test_dark_pixels_that_touch_the_border_by_chance_are_used():
+    """A night with noise: the blank pixels form lines, and no area."""
+    rgb = np.full((60, 90, 3), 100, np.uint8)
+    rgb[::3] = 0
+    rgb[:, ::4] = 0
+    assert (rgb[0] == 0).all() and (rgb == 0).mean() > 0.4
+    assert without_blank_border(rgb) is None

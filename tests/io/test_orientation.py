@@ -91,3 +91,12 @@ def test_features_of_other_turns_are_other_features(tmp_path):
     one, other = (inspect_image(tagged(tmp_path / f"{c}.png", pixels(), c)) for c in (1, 6))
     assert other.content != other.sha256 and one.content == one.sha256
     assert orientations([one, other]) == {"6.png": 6}
+
+
+@pytest.mark.parametrize("code", orientation.CODES)
+def test_a_tiff_is_turned_once(tmp_path, code):
+    """OpenCV turns it when it decodes it, whatever it is asked for."""
+    image = inspect_image(tagged(tmp_path / "a.tif", pixels(), code, "TIFF"))
+    read = read_image(image, max_size=60, upright=True)
+    np.testing.assert_array_equal(read.rgb, orientation.upright(pixels(), code))
+    assert image.size == image.upright_size == read.rgb.shape[1::-1]

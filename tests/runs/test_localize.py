@@ -289,6 +289,10 @@ def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, phot
     assert chosen() == chosen(odd_one) == chosen(odd_one, wide, wide) == ("run", shared)
     assert chosen(odd_one, odd_one)[0] == "guess"  # nobody can tell which
     assert camera_prior(new, model.views[:1], None).source == "guess"  # nobody else's
+    # EXIF decides between cameras of one size, and a photo of another one gets none of them.
+    named = dataclasses.replace(new, taken_with="phone")
+    assert camera_prior(named, model.views, None).source == "guess"
+    assert camera_prior(named, model.views, None, lambda _: "phone").source == "run"
 
 
 @pytest.mark.slow
