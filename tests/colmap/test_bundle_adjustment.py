@@ -85,5 +85,14 @@ def test_cameras_of_few_views_keep_their_principal_points(rendered):
 
 
 def test_a_principal_point_that_runs_away_is_put_back(rendered, monkeypatch):
-    monkeypatch.setattr(bundle_adjustment, "FARTHEST_CENTRE", 0.01)  # 5 of 480 pixels
-    assert adjusted(wrong_centres(rendered, [1] * 5)) == {1: 6.0}
+    """The photos are said to be wider, so that the right point is farther from their centre."""
+
+    def wide() -> pycolmap.Reconstruction:
+        model = wrong_centres(rendered, [1] * 5)
+        model.camera(1).width += 40
+        return model
+
+    assert adjusted(wide())[1] < 0.1
+    monkeypatch.setattr(bundle_adjustment, "FARTHEST_CENTRE", 0.01)
+    assert adjusted(wide()) == {1: 6.0}
+    assert adjusted(wrong_centres(rendered, [1] * 5))[1] < 0.1  # it comes nearer to the centre
