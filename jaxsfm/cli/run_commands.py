@@ -61,6 +61,8 @@ def reconstruct(
     For example
         $ jaxsfm reconstruct PHOTOS --out OUT
         $ jaxsfm reconstruct PHOTOS --out OUT --intrinsics K.txt --preset robust
+        $ jaxsfm reconstruct PHOTOS --out OUT --cameras single --camera-model OPENCV
+        $ jaxsfm reconstruct PHOTOS --out OUT --masks MASKS
         $ jaxsfm reconstruct PHOTOS --out OUT --georeference gcp_list.txt
         $ jaxsfm reconstruct VIDEO.mp4 --out OUT
 
