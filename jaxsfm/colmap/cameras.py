@@ -61,7 +61,7 @@ class Cameras:
           UserError: a known camera does not fit its photos, or COLMAP does not accept it.
         """
         ordered = sorted(images, key=lambda image: image.name)
-        one_source, upright = _from_one_source(ordered), _pixels_were_turned(ordered)
+        one_source, upright = _from_one_source(ordered), pixels_were_turned(ordered)
         together: dict[object, list[ImageFile]] = {}
         for image in ordered:
             key = self._key(image, one_source), image.orientation if upright else None
@@ -93,7 +93,7 @@ class Cameras:
         return estimated_camera(group, self.model)
 
 
-def _pixels_were_turned(images: Sequence[ImageFile]) -> bool:
+def pixels_were_turned(images: Sequence[ImageFile]) -> bool:
     """Whether a program has turned the pixels of some photos of one camera, and noted it.
 
     A camera stores the rows of its sensor, however it is held. Then all photos have one size as

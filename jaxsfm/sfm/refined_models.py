@@ -7,11 +7,14 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from jaxsfm.colmap.cameras import pixels_were_turned
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model_folders import colour_points
 from jaxsfm.colmap.triangulation import with_all_points
+from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
 from jaxsfm.config import Config, Refinement
+from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
@@ -101,6 +104,8 @@ def refine_models(
         except ImageError as error:  # a photo was deleted since; the mapper's model remains
             logger.warning("no refinement: %s", error)
             new = whole(model)
+        if done is not None and options.refine_intrinsics:
+            new = _with_one_camera(new, photos, options.threads)
         left = [image for image in evidence.unmapped if image.name not in registered(new)]
         evidence = evidence._replace(unmapped=left)
         refined.append(new)
@@ -110,6 +115,20 @@ def refine_models(
     for model in refined:
         colour_points(model, photos.rgb)
     return RefinedModels([refined[k] for k in order], [figures[k] for k in order], order)
+
+
+def _with_one_camera(
+    model: "pycolmap.Reconstruction", photos: Photos, threads: int
+) -> "pycolmap.Reconstruction":
+    """A model whose photos of one camera were turned differently, adjusted for that camera."""
+    files = {name: photos.files[name] for name in registered(model)}
+    codes = {name: file.orientation for name, file in files.items()}
+    if not (pixels_were_turned(list(files.values())) and shares_one_camera(model, codes)):
+        return model
+    try:
+        return adjust_as_one(model, codes, threads=threads)
+    except UserError:  # cameras of this kind cannot be turned
+        return model
 
 
 def described_px(ratio: float) -> int:
