@@ -6,6 +6,7 @@ from pathlib import Path
 
 from jaxsfm.config import Config
 from jaxsfm.io.pair_selection import chosen_pairs, many_frames
+from jaxsfm.io.video import open_video
 from jaxsfm.io.work_folder import FRAMES, lock_folder
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -26,6 +27,8 @@ def reconstruct_video(video: Path, out: Path, *, config: Config, options: RunOpt
       UserError: the video or an option cannot be used. What was computed is kept.
     """
     check_options(options)
+    with open_video(video):  # what is no video makes no folder
+        pass
     with lock_folder(out):
         found = frames_folder(video, out / FRAMES, progress=options.progress)
     how = "have been chosen before" if found.there else "were chosen"
