@@ -20,9 +20,11 @@ def updated(
     """
     model = pycolmap.Reconstruction(original)
     model.delete_all_points2D_and_points3D()
-    for image_id, image in refined.images.items():
-        points = [pycolmap.Point2D(point.xy) for point in image.points2D]
-        model.image(image_id).points2D = pycolmap.Point2DList(points)
+    for image_id, image in model.images.items():
+        # An image that was taken out is emptied too, so that COLMAP counts its points anew.
+        there = refined.exists_image(image_id)
+        pixels = [point.xy for point in refined.image(image_id).points2D] if there else []
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels])
     for camera_id in model.cameras:
         if refined.exists_camera(camera_id):
             model.camera(camera_id).params = refined.camera(camera_id).params.tolist()
