@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from room_scene import noisy_model, read_of
+from room_scene import SIZE, noisy_model, read_of
 
 from jaxsfm.colmap.mapper import MapOptions, part_of, registered
 from jaxsfm.config import Config, Refinement
-from jaxsfm.io.images import ImageError
+from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
@@ -34,6 +34,9 @@ def placement(*, registered: bool = False, octave_px: int | None = 1) -> Placeme
 class FakePhotos:
     def __init__(self, rendered) -> None:
         self.gray, self.rgb = read_of(rendered), None
+        self.files = {
+            name: ImageFile(name=name, path=Path(name), size=SIZE, sha256="") for name in NAMES
+        }
 
     def median_scale(self) -> float:
         return 1.0
