@@ -52,6 +52,14 @@ class Cameras:
             sizes = {image.name: image.size for image in images}
             check_one_size(sizes, "--cameras single: there is")
 
+    def each_its_own(self, images: Sequence[ImageFile]) -> "Cameras | None":
+        """The same with a camera for each photo; None unless `auto` makes photos share cameras."""
+        if self.known is not None or self.sharing != "auto":
+            return None
+        if len(self.assigned(images)) == len(images):
+            return None
+        return dataclasses.replace(self, sharing="photo")
+
     def assigned(
         self, images: Sequence[ImageFile]
     ) -> list[tuple[pycolmap.Camera, list[ImageFile]]]:

@@ -75,6 +75,8 @@ class RunReport:
     given: UsedExternalMatches | None = None
     looks: UsedLooks | None = field(default=None, metadata=OMITTED)
     """None: all photos were described at the size of the config."""
+    own_cameras: bool | None = field(default=None, metadata=OMITTED)
+    """True: each photo has its own camera, because the model of shared ones was worse."""
     turned: dict[str, Annotated[int, Range(1, 360)]] = field(default_factory=dict, metadata=OMITTED)
     """By how many degrees photos are turned clockwise to be upright, by name: those that the run
     found to be stored sideways without a note in EXIF."""

@@ -110,6 +110,8 @@ def summary_lines(report: RunReport) -> list[str]:
     ]
     if looks := report.looks:
         lines.append(f"looks            {looks.in_words()}")
+    if report.own_cameras:
+        lines.append("cameras          one for each photo: the model of shared ones was worse")
     if turned := report.turned:
         each = [f"{shown_name(name)} by {degrees} deg" for name, degrees in turned.items()]
         lines.append(f"turned           {named(each)} clockwise, to stand as the others do")

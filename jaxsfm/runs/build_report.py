@@ -61,6 +61,8 @@ class StageResults:
     """How the models were moved into metres."""
     weights: UsedWeights
     looks: UsedLooks | None
+    own_cameras: bool
+    """Whether each photo has its own camera, because shared ones did not do."""
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -105,6 +107,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         ),
         given=None if about is None else from_json(UsedExternalMatches, about),
         looks=stages.looks,
+        own_cameras=stages.own_cameras or None,
         turned=_turned(stages.usable, stages.identity.orientations),
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,

@@ -36,6 +36,8 @@ class MappedLooks(NamedTuple):
     """None: all photos were described at the size of the config."""
     identity: RunIdentity
     """That of the run, with the orientations that were found."""
+    own_cameras: bool = False
+    """Whether each photo has its own camera, because shared ones did not do."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,12 +85,16 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
             stages, images=[photos.images[image.name] for image in stages.images], look="-turned"
         )
         mapped = stages.map(matched)
+    shared = stages
+    if not mapped.settled():
+        stages, mapped = _with_own_cameras(matched, mapped, stages)
+    own = stages is not shared
     if matched.described == photos.job.config:
-        return MappedLooks(matched, mapped, None, photos.identity)
+        return MappedLooks(matched, mapped, None, photos.identity, own)
     looks = UsedLooks(first_px=matched.described.max_size)
     again = mapped.unsettled(matched.counts)
     if again is None:
-        return MappedLooks(matched, mapped, looks, photos.identity)
+        return MappedLooks(matched, mapped, looks, photos.identity, own)
     logger.info("%s", again.in_words())
     matched_again = match_again(photos.job, photos.images, matched, again, seconds)
     mapped_again = dataclasses.replace(stages, look=stages.look + "-again").map(matched_again)
@@ -101,4 +107,23 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     )
     if not looks.in_vain:
         matched, mapped = matched_again, mapped_again
-    return MappedLooks(matched, mapped, looks, photos.identity)
+    return MappedLooks(matched, mapped, looks, photos.identity, own)
+
+
+def _with_own_cameras(
+    matched: MatchedPairs, mapped: MappedRun, stages: RunStages
+) -> tuple[RunStages, MappedRun]:
+    """The stages and the models with a camera for each photo, if these models are better.
+
+    Photos of one drone that all look straight down do not determine the camera that they share, and
+    the model bends until photos contradict each other.
+    """
+    cameras = stages.cameras.each_its_own(stages.images)
+    if cameras is None:
+        return stages, mapped
+    own = dataclasses.replace(stages, cameras=cameras, look=stages.look + "-own-cameras")
+    mapped_own = own.map(matched)
+    if not mapped_own.better_than(mapped):
+        return stages, mapped
+    logger.info("shared cameras gave a worse model, so each photo has its own camera")
+    return own, mapped_own

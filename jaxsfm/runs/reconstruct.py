@@ -149,6 +149,7 @@ def reconstruct_folder(
                     georeference=moved,
                     weights=from_json(UsedWeights, weights.described(config)),
                     looks=mapped.looks,
+                    own_cameras=mapped.own_cameras,
                     seconds=seconds,
                 ),
                 config=config,

@@ -56,6 +56,10 @@ class MappedRun:
         names = [image.name for image in self.given.images]
         return second_look(counts, names, self.photos, self.trusted(), green=self.green())
 
+    def settled(self) -> bool:
+        """Whether all photos are in one model, and nothing speaks against it."""
+        return self.green() and max(map(len, self.photos), default=0) == len(self.given.images)
+
     def better_than(self, other: "MappedRun") -> bool:
         """Whether there are more photos in the best model. Models that something speaks against are
         worse than others."""
