@@ -61,7 +61,12 @@ GREEN, AMBER, FEW = Mapped(True, 18), Mapped(False, 18), Mapped(True, 12)
 
 @pytest.mark.parametrize(
     ("mapped", "own", "better"),
-    [(AMBER, GREEN, True), (FEW, GREEN, True), (AMBER, AMBER, False), (FEW, AMBER, False)],
+    [
+        (AMBER, GREEN, True),
+        (FEW, GREEN, True),
+        (AMBER, Mapped(False, 18), False),
+        (FEW, AMBER, False),
+    ],
 )
 def test_the_better_model_is_kept_and_of_equal_ones_that_of_shared_cameras(mapped, own, better):
     assert choose(mapped, own) is (own if better else mapped)
