@@ -77,7 +77,7 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     """
     mapped, seconds = stages.map(matched), stages.seconds
     trials = Trials(photos.job, photos.identity, photos.images, seconds)
-    checked = photos.job.config.checked  # the paper takes photos as they are stored
+    checked = photos.job.config.checked  # the paper looks at nothing twice
     if checked and (turned := find_turned(mapped, trials, matched.counts)):
         photos = photos.upright(turned)
         matched, _ = photos.match(seconds)
@@ -86,7 +86,7 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
         )
         mapped = stages.map(matched)
     shared = stages
-    if not mapped.settled():
+    if checked and not mapped.settled():
         stages, mapped = _with_own_cameras(matched, mapped, stages)
     own = stages is not shared
     if matched.described == photos.job.config:
