@@ -56,25 +56,30 @@ class Cameras:
         """The same with a camera for each photo; None unless `auto` makes photos share cameras."""
         if self.known is not None or self.sharing != "auto":
             return None
-        if len(self.assigned(images)) == len(images):
+        if len(self.groups(images)) == len(images):
             return None
         return dataclasses.replace(self, sharing="photo")
 
     def assigned(
         self, images: Sequence[ImageFile]
     ) -> list[tuple[pycolmap.Camera, list[ImageFile]]]:
-        """The cameras, each with its photos: both in the order of the photos' names.
+        """The cameras, each with its photos (`groups`).
 
         Raises:
           UserError: a known camera does not fit its photos, or COLMAP does not accept it.
         """
+        upright = pixels_were_turned(images)
+        return [(self._camera(group, upright), group) for group in self.groups(images)]
+
+    def groups(self, images: Sequence[ImageFile]) -> list[list[ImageFile]]:
+        """The photos that share a camera: groups and photos in the order of the photos' names."""
         ordered = sorted(images, key=lambda image: image.name)
         one_source, upright = _from_one_source(ordered), pixels_were_turned(ordered)
         together: dict[object, list[ImageFile]] = {}
         for image in ordered:
             key = self._key(image, one_source), image.orientation if upright else None
             together.setdefault(key, []).append(image)
-        return [(self._camera(group, upright), group) for group in together.values()]
+        return list(together.values())
 
     def _key(self, image: ImageFile, one_source: bool) -> object:
         """Photos with equal keys share a camera, unless their pixels were turned differently."""

@@ -45,7 +45,7 @@ def write_rootsift_database(
     path.unlink(missing_ok=True)
     reader, known = pycolmap.ImageReaderOptions(), cameras.known
     reader.camera_model = cameras.model
-    alone = len(cameras.assigned(images)) == 1
+    alone = len(cameras.groups(images)) == 1
     mode = pycolmap.CameraMode.SINGLE if alone else pycolmap.CameraMode.PER_IMAGE
     if isinstance(known, Intrinsics):
         reader.camera_model = known.model

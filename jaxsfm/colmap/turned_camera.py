@@ -15,7 +15,7 @@ from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
-from jaxsfm.io.orientation import QUARTERS, UPRIGHT, to_stored, upright_size
+from jaxsfm.io.orientation import QUARTERS, UPRIGHT, stored_axes, upright_size
 
 
 def shares_one_camera(model: pycolmap.Reconstruction, codes: Mapping[str, int]) -> bool:
@@ -79,9 +79,8 @@ def _turned(camera: pycolmap.Camera, code: int) -> pycolmap.Camera:
 def _in_frame(view: View, camera: pycolmap.Camera, code: int) -> View:
     """A view whose pixels are those of a camera that `code` turns to the view's own."""
     size = camera.width, camera.height
-    axes = np.eye(3)
-    axes[:2, :2] = to_stored(size, code)[:2, :2]
-    return dataclasses.replace(view, rotation=axes @ view.rotation, camera=camera, size=size)
+    rotation = stored_axes(code) @ view.rotation
+    return dataclasses.replace(view, rotation=rotation, camera=camera, size=size)
 
 
 def _moved(model: Model, views: list[View]) -> Model:

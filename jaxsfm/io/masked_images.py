@@ -21,9 +21,12 @@ def with_masks(images: Iterable[ImageFile], folder: Path) -> tuple[list[ImageFil
     """
     images = list(images)
     bare = missing_masks(folder, [image.name for image in images])
-
-    paths = {i.name: None if i.name in set(bare) else mask_path(folder, i.name) for i in images}
-    return [with_mask(image, paths[image.name]) for image in images], bare
+    lacking = set(bare)
+    masked = [
+        image if image.name in lacking else with_mask(image, mask_path(folder, image.name))
+        for image in images
+    ]
+    return masked, bare
 
 
 def with_mask(image: ImageFile, path: Path | None) -> ImageFile:

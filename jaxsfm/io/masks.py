@@ -43,11 +43,7 @@ def open_mask(path: Path, size: tuple[int, int]) -> MaskFile:
     Raises:
       UserError: the file is no image of this size, or all of it is black.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
-    used = decode_mask(data)
+    used, sha256 = _decoded(path)
     if used is None:
         raise UserError(f"{path}: not a readable mask")
     if used.shape[::-1] != size:
@@ -57,24 +53,24 @@ def open_mask(path: Path, size: tuple[int, int]) -> MaskFile:
         )
     if not used.any():
         raise UserError(f"{path}: the mask is black, so nothing of its photo would be used")
-    return MaskFile(path, hashlib.sha256(data).hexdigest())
+    return MaskFile(path, sha256)
 
 
-def decode_mask(data: bytes) -> np.ndarray | None:
-    """The used pixels bool (h, w) of a mask's file; None if it is no image."""
+def _decoded(path: Path) -> tuple[np.ndarray | None, str]:
+    """The used pixels bool (h, w) of a mask's file, None if it is no image; and its SHA-256."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from error
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     gray = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    return None if gray is None else gray > 0
+    return None if gray is None else gray > 0, hashlib.sha256(data).hexdigest()
 
 
 def read_mask(mask: MaskFile) -> np.ndarray:
     """The used pixels bool (h, w); UserError if the file is gone or has changed."""
-    try:
-        data = mask.path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{mask.path}: cannot be read ({error.strerror})") from error
-    used = decode_mask(data)
-    if used is None or hashlib.sha256(data).hexdigest() != mask.sha256:
+    used, sha256 = _decoded(mask.path)
+    if used is None or sha256 != mask.sha256:
         raise UserError(f"{mask.path}: the mask has changed since it was first read")
     return used
 

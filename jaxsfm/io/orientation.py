@@ -52,6 +52,18 @@ def to_stored(size: tuple[int, int], orientation: int) -> np.ndarray:
     return matrix
 
 
+def stored_axes(orientation: int) -> np.ndarray:
+    """The rotation (3, 3) from the camera axes of the upright photo to those of the stored one.
+
+    Raises ValueError for a mirrored photo, which has no such rotation.
+    """
+    if orientation not in QUARTERS:
+        raise ValueError(f"orientation must be one of {QUARTERS}; got {orientation}")
+    axes = np.eye(3)
+    axes[:2, :2] = to_stored((1, 1), orientation)[:2, :2]
+    return axes
+
+
 def stored_points(upright_xy: np.ndarray, size: tuple[int, int], orientation: int) -> np.ndarray:
     """Points (n, 2) of the upright photo, in pixels of the stored one; `size` as in `to_stored`."""
     matrix = to_stored(size, orientation)

@@ -1,18 +1,16 @@
 """Two models that share photos, joined to one in a new folder (`jaxsfm merge`)."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Literal
 
 from jaxsfm.colmap.given_model import ModelFigures, figures_of, looks_calibrated, read_given_model
 from jaxsfm.colmap.updated_model import has_rigs
-from jaxsfm.errors import UserError, writing
-from jaxsfm.io.atomic import atomic_folder
+from jaxsfm.errors import UserError
 from jaxsfm.io.images import named
 from jaxsfm.io.versions import versions
 from jaxsfm.options import check_threads
-from jaxsfm.runs.refine import check_new_folder, write_model
+from jaxsfm.runs.refine import check_new_folder, write_new_folder
 from jaxsfm.sfm.merged_models import merge_models
 
 REPORT = "merge.json"
@@ -82,10 +80,7 @@ def merge_folders(
         refined_intrinsics=refines,
         versions=versions(),
     )
-    with writing(f"--out {out}"), atomic_folder(out) as fresh:
-        write_model(merged.model, fresh)
-        text = json.dumps(dataclasses.asdict(report), indent=1)
-        (fresh / REPORT).write_text(text, encoding="utf-8")
+    write_new_folder(out, merged.model, REPORT, dataclasses.asdict(report))
     return report
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tqdm import tqdm
 
@@ -134,10 +134,7 @@ def refine_folder(
         settings=settings,
         versions=versions(),
     )
-    with writing(f"--out {out}"), atomic_folder(out) as fresh:
-        write_model(found.model, fresh)
-        text = json.dumps(dataclasses.asdict(report), indent=1)
-        (fresh / REPORT).write_text(text, encoding="utf-8")
+    write_new_folder(out, found.model, REPORT, dataclasses.asdict(report))
     return report
 
 
@@ -153,10 +150,17 @@ def check_new_folder(out: Path) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
 
 
-def write_model(model: "pycolmap.Reconstruction", folder: Path) -> None:
-    """Write a model into an existing folder; UserError if the disk is too small."""
-    check_disk_space(folder, SPARE_BYTES + OBSERVATION_BYTES * model.compute_num_observations())
-    model.write_binary(folder)
+def write_new_folder(
+    out: Path, model: "pycolmap.Reconstruction", name: str, report: dict[str, Any]
+) -> None:
+    """Write a model and the file `name` with its report into the new folder `--out`.
+
+    Raises UserError if the folder cannot be written, or the disk is too small.
+    """
+    with writing(f"--out {out}"), atomic_folder(out) as fresh:
+        check_disk_space(fresh, SPARE_BYTES + OBSERVATION_BYTES * model.compute_num_observations())
+        model.write_binary(fresh)
+        (fresh / name).write_text(json.dumps(report, indent=1), encoding="utf-8")
 
 
 def _removed(given: "pycolmap.Reconstruction", found: GivenRefinement) -> list[str]:

@@ -56,7 +56,4 @@ def _upright_axes(code: int) -> np.ndarray:
 
     A mirrored photo has no such rotation; its axes are taken as they are stored.
     """
-    axes = np.eye(3)
-    if code in orientation.QUARTERS:
-        axes[:2, :2] = orientation.to_stored((1, 1), code)[:2, :2].T
-    return axes
+    return orientation.stored_axes(code).T if code in orientation.QUARTERS else np.eye(3)

@@ -44,7 +44,7 @@ class Stages:
 
 @pytest.fixture(autouse=True)
 def shared(monkeypatch):
-    monkeypatch.setattr(Cameras, "assigned", lambda self, images: [1])
+    monkeypatch.setattr(Cameras, "groups", lambda self, images: [images])
 
 
 def choose(mapped: Mapped, own: Mapped, cameras: Cameras | None = None) -> Mapped:
