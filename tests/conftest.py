@@ -1,6 +1,7 @@
 """Strict type promotion in every test, and the inputs that several packages' tests share."""
 
 import atexit
+import gc
 import json
 import os
 import shutil
@@ -25,6 +26,21 @@ from shared import once
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 DATA = Path(os.environ.get("JAXSFM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+MAPS = Path("/proc/self/maps")
+MOST_MAPS = 20_000
+"""Linux allows a process 65,530 mapped regions, and each compiled program takes several. A worker
+that had run nearly all tests came to 64,700: its next compilation failed, and it hung."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_programs() -> Iterator[None]:
+    """Compiled programs are given up after a module when they have become many."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

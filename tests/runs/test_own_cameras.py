@@ -1,6 +1,7 @@
 """Where shared cameras do not do, each photo has its own."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -47,8 +48,10 @@ def shared(monkeypatch):
     monkeypatch.setattr(Cameras, "groups", lambda self, images: [images])
 
 
-def choose(mapped: Mapped, own: Mapped, cameras: Cameras | None = None) -> Mapped:
-    stages: Any = Stages(cameras or Cameras(), own, images=[1, 2])
+def choose(
+    mapped: Mapped, own: Mapped, cameras: Cameras | None = None, photos: Sequence[int] = (1, 2)
+) -> Mapped:
+    stages: Any = Stages(cameras or Cameras(), own, images=[*photos])
     matched: Any = None
     made: Any = mapped
     found, chosen = _with_own_cameras(matched, made, stages)
@@ -84,3 +87,12 @@ def test_the_better_model_is_kept_and_of_equal_ones_that_of_shared_cameras(mappe
 )
 def test_what_the_user_has_said_of_the_cameras_is_kept(cameras):
     assert choose(AMBER, GREEN, cameras) is AMBER
+
+
+@pytest.mark.parametrize(("shared", "tried"), [(1, False), (2, False), (3, True)])
+def test_cameras_that_few_photos_share_are_not_why_a_model_is_bent(monkeypatch, shared, tried):
+    """Of four photos, some share a camera."""
+    photos = [1, 2, 3, 4]
+    groups = [photos[:shared], *([photo] for photo in photos[shared:])]
+    monkeypatch.setattr(Cameras, "groups", lambda self, images: groups)
+    assert choose(AMBER, GREEN, photos=photos) is (GREEN if tried else AMBER)
