@@ -1,5 +1,6 @@
 """Runs of the mapper on a share of the matches, and the points of all matches afterwards."""
 
+import dataclasses
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -42,10 +43,12 @@ class MapperRuns:
         Args:
           database: with the pairs to map.
           scratch: a folder for the database that the mapper is given.
-          share: give the mapper a share of the matches; otherwise all of them.
+          share: give the mapper a share of the matches, of which it makes a draft; otherwise all of
+            them.
           on_image: called for every image that the mapper registers.
         """
-        self._database, self._options, self._on_image = database, options, on_image
+        self._database, self._on_image = database, on_image
+        self._options = dataclasses.replace(options, draft=share)
         self._share = share
         self._given = scratch / "mapper.db" if share else database
         self._whole: list[tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]] = []
