@@ -209,8 +209,8 @@ def with_left_out_images(
     Images are connected if verified pairs join them to the best model, and at most `MISSING` of
     them may be left out. After a draft, the incremental mapper is run with all that it does
     otherwise. Then it is started from other initial pairs (`initial_pairs`, each image once, with
-    lower demands). If there is still no model, the global mapper is tried. An attempt that registers
-    more images replaces the former ones, except for models of other images.
+    lower demands). If there is still no model, the global mapper is tried. An attempt that
+    registers more images replaces the former ones, except for models of other images.
 
     Returns:
       `first` itself if nothing was tried.

@@ -47,9 +47,8 @@ class MapperRuns:
             them.
           on_image: called for every image that the mapper registers.
         """
-        self._database, self._on_image = database, on_image
-        self._options = dataclasses.replace(options, draft=share)
-        self._share = share
+        self._database, self._options, self._on_image = database, options, on_image
+        self._share, self._mapping = share, dataclasses.replace(options, draft=share)
         self._given = scratch / "mapper.db" if share else database
         self._whole: list[tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]] = []
         """Models, and what `with_all_points` gave for them."""
@@ -65,7 +64,7 @@ class MapperRuns:
         if self._share:
             shutil.copyfile(self._database, self._given)
             keep_inliers(self._given, mapper_matches(read_inliers(self._given)))
-        made = first_models(self._given, self._options, on_image=self._on_image)
+        made = first_models(self._given, self._mapping, on_image=self._on_image)
         self.attempts += made.attempts
         return made
 
@@ -77,7 +76,7 @@ class MapperRuns:
           two_views: the pairs in the database.
         """
         more = with_left_out_images(
-            made, self._given, two_views, self._options, on_image=self._on_image
+            made, self._given, two_views, self._mapping, on_image=self._on_image
         )
         self.attempts += more.attempts[len(made.attempts) :]
         return more

@@ -103,6 +103,30 @@ def test_connected_images_left_out_are_tried_from_other_pairs_and_the_best_count
     assert [a.registered for a in attempts] == [[2], [4], [3]]
 
 
+def test_after_a_draft_the_whole_run_is_tried_before_other_pairs(monkeypatch, tmp_path):
+    drafts, left = [], [[model("ab")], [model("abc")], [model("abcdef")], [model("ab")]]
+
+    def run(database, options, initial, on_image):
+        drafts.append((options.draft, initial))
+        return left.pop(0)
+
+    monkeypatch.setattr(mapper, "_run", run)
+    draft = dataclasses.replace(ONE, draft=True)
+    models, attempts = build_models(tmp_path / "d.db", PAIRS, draft)
+    assert drafts == [(True, None), (False, None), (False, ("a", "b"))]
+    assert models[0].num_reg_images() == 6 and [a.registered for a in attempts] == [[2], [3], [6]]
+
+
+def test_a_draft_is_adjusted_less_often_and_takes_no_image_for_a_single_pair():
+    colmap, draft = (
+        mapper.incremental_options(dataclasses.replace(ONE, draft=draft)) for draft in (False, True)
+    )
+    assert colmap.structure_less_registration_fallback
+    assert not draft.structure_less_registration_fallback
+    assert draft.ba_global_frames_ratio > colmap.ba_global_frames_ratio
+    assert draft.ba_global_points_ratio > colmap.ba_global_points_ratio
+
+
 def test_without_any_model_the_global_mapper_is_the_last_try(monkeypatch, tmp_path):
     calls = runs(monkeypatch, [[], [], [], [model("abc")]])
     models, attempts = build_models(tmp_path / "d.db", PAIRS, ONE)

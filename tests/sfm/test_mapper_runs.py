@@ -1,5 +1,6 @@
 """Laws of runs of the mapper: what it is given, and what is kept. The mapper is made up."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
@@ -32,7 +33,7 @@ def runs(tmp_path, monkeypatch):
         return Mapped([], [tried])
 
     def again(made, path, two_views, options, *, on_image):
-        log.append((path.read_text(), two_views))
+        log.append((path.read_text(), options))
         return Mapped([], [*made.attempts, *made.attempts]) if two_views else made
 
     def keep(path: Path, kept) -> None:
@@ -58,12 +59,12 @@ def runs(tmp_path, monkeypatch):
     return make, database, log, whole
 
 
-def test_the_mapper_gets_a_share_and_the_database_keeps_all(runs):
+def test_the_mapper_makes_a_draft_of_a_share_and_the_database_keeps_all(runs):
     make, database, log, _ = runs
     mapper = make(share=True)
     made = mapper.first()
     mapper.with_left_out_images(made, {("a", "b"): "a pair"})
-    assert [given for given, _ in log] == ["some of all of all"] * 2
+    assert log == [("some of all of all", dataclasses.replace(OPTIONS, draft=True))] * 2
     assert database.read_text() == "all" and len(mapper.attempts) == 2
 
 

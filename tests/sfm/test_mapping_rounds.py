@@ -107,15 +107,17 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         second: dict[frozenset[Pair], tuple] = {}
         searched: list[frozenset[Pair]] = []
 
+        drafted = config.refinement is not None
+
         def first(database, options, *, on_image):
-            assert options is OPTIONS
+            assert options == dataclasses.replace(OPTIONS, draft=drafted)
             pairs = frozenset(tuple(pair) for pair in json.loads(database.read_text()))
             given.append(set(pairs))
             tried = Attempt(mapper="incremental", initial_pair=None, registered=[len(given)])
             return Mapped([FakeModel(pairs)] * models, [tried])
 
         def again(made, database, trusted, options, *, on_image):
-            assert options is OPTIONS and set(trusted) == given[-1]
+            assert options.draft == drafted and set(trusted) == given[-1]
             if not left_out(made.models[0]):
                 return made
             started.append(made.models[0])
