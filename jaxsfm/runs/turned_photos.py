@@ -33,6 +33,11 @@ LEAST_INLIERS = 60
 """A turn is believed if it has so many verified matches with all partners together, and twice as
 many as any other turn. Strangers have a plane of 26 by accident, rarely two."""
 
+FEW = 0.1
+"""If something speaks against the models, they are not made again for so small a share of the
+photos. A photo from far above has no clear top, and matches one from the other side when it is
+turned: one of the 135 photos of *statue* was, and all rounds of mapping were made again."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Trials:
@@ -88,8 +93,10 @@ def find_turned(
     for name in sorted(images.keys() - placed - seen_upright):
         if quarters := trials.turn_of(name, partners(name, upright, counts)):
             turns[name] = quarters
+    if len(turns) <= FEW * len(images) and not mapped.green():
+        return {}
     if turns:
-        logger.info("%s are stored sideways: they are turned and matched again", named([*turns]))
+        logger.info("stored sideways, turned and matched again: %s", named([*turns]))
     return {name: turned(images[name], quarters) for name, quarters in sorted(turns.items())}
 
 

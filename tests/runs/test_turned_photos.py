@@ -1,11 +1,14 @@
 """Which photos outside a model are tried with quarter turns."""
 
+from collections.abc import Iterable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from jaxsfm.core.types import Status
+from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairCounts
 from jaxsfm.runs import turned_photos
 from jaxsfm.runs.turned_photos import LEAST_INLIERS, find_turned
@@ -14,16 +17,23 @@ from jaxsfm.runs.turned_photos import LEAST_INLIERS, find_turned
 class Trials:
     """Trials that note what they are asked."""
 
-    def __init__(self) -> None:
-        self.images = {
-            name: SimpleNamespace(name=name, orientation=1) for name in ("a", "b", "x", "y")
-        }
+    def __init__(self, names: Iterable[str] = "abxy", turns: int = 0) -> None:
+        self.images = {n: ImageFile(name=n, path=Path(n), size=(4, 3), sha256=n) for n in names}
         self.asked: list[str] = []
+        self.turns = turns
 
     def turn_of(self, name: str, partners: list[str]) -> int:
-        assert set(partners) <= {"a", "b"}
+        assert set(partners) <= set("ab")
         self.asked.append(name)
-        return 0
+        return self.turns
+
+
+def model(monkeypatch, *, green: bool = True) -> Any:
+    """A model of `a` and `b`, which are upright."""
+    monkeypatch.setattr(turned_photos, "model_poses", lambda model: {})
+    monkeypatch.setattr(turned_photos, "quarter_turns", lambda poses, codes: {})
+    monkeypatch.setattr(turned_photos, "registered", lambda model: {"a", "b"})
+    return SimpleNamespace(stage=SimpleNamespace(models=lambda: ["model"]), green=lambda: green)
 
 
 @pytest.mark.parametrize(
@@ -37,12 +47,22 @@ class Trials:
 def test_a_photo_that_matches_an_upright_one_as_it_is_is_not_tried(
     monkeypatch, partner, inliers, asked
 ):
-    monkeypatch.setattr(turned_photos, "model_poses", lambda model: {})
-    monkeypatch.setattr(turned_photos, "quarter_turns", lambda poses, codes: {})
-    monkeypatch.setattr(turned_photos, "registered", lambda model: {"a", "b"})
     trials: Any = Trials()
-    mapped: Any = SimpleNamespace(stage=SimpleNamespace(models=lambda: ["model"]))
     found = PairCounts(inliers, 1, 2 * inliers, 0, Status.VERIFIED)
     pair = (min(partner, "x"), max(partner, "x"))
-    assert find_turned(mapped, trials, {pair: found}) == {}
+    assert find_turned(model(monkeypatch), trials, {pair: found}) == {}
     assert trials.asked == asked
+
+
+@pytest.mark.parametrize(
+    ("photos", "green", "turned"),
+    [("abx", True, "x"), ("abx", False, "x"), ("abxcdefghi", True, "x"), ("abxcdefghi", False, "")],
+)
+def test_a_doubtful_model_is_not_made_again_for_one_photo_of_many(
+    monkeypatch, photos, green, turned
+):
+    """All but `x` match an upright photo as they are."""
+    trials: Any = Trials(photos, turns=1)
+    found = PairCounts(LEAST_INLIERS, 1, LEAST_INLIERS, 0, Status.VERIFIED)
+    counts = {("a", name): found for name in photos if name not in "ax"}
+    assert [*find_turned(model(monkeypatch, green=green), trials, counts)] == [*turned]
