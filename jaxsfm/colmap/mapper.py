@@ -151,13 +151,16 @@ def part_of(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap.
     return part
 
 
-def _complete(models: list[pycolmap.Reconstruction], pairs: list[Pair]) -> bool:
-    """Whether the best model has (nearly) all images that a chain of pairs connects to it."""
+def _complete(
+    models: list[pycolmap.Reconstruction], pairs: list[Pair], missing: float = MISSING
+) -> bool:
+    """Whether the best model has the images that a chain of pairs connects to it, all but a share
+    of `missing`."""
     if not models:
         return not pairs
     names = registered(models[0])
     connected = component_of(names, pairs)
-    return len(connected - names) <= MISSING * len(connected)
+    return len(connected - names) <= missing * len(connected)
 
 
 class Mapped(NamedTuple):
@@ -206,11 +209,12 @@ def with_left_out_images(
 ) -> Mapped:
     """Start the mapper again if its first run found no model or left out connected images.
 
-    Images are connected if verified pairs join them to the best model, and at most `MISSING` of
-    them may be left out. After a draft, the incremental mapper is run with all that it does
-    otherwise. Then it is started from other initial pairs (`initial_pairs`, each image once, with
-    lower demands). If there is still no model, the global mapper is tried. An attempt that
-    registers more images replaces the former ones, except for models of other images.
+    Images are connected if verified pairs join them to the best model. If a draft leaves out one of
+    them, the incremental mapper is run with all that it does otherwise. After that, at most
+    `MISSING` of them may be left out. Then it is started from other initial pairs
+    (`initial_pairs`, each image once, with lower demands). If there is still no model, the global
+    mapper is tried. An attempt that registers more images replaces the former ones, except for
+    models of other images.
 
     Returns:
       `first` itself if nothing was tried.
@@ -226,8 +230,8 @@ def with_left_out_images(
             starts.insert(0, None)
             options = dataclasses.replace(options, draft=False)
         for pair in starts:
-            if _complete(models, pairs):
-                break
+            if _complete(models, pairs, MISSING if pair else 0):
+                continue
             other = _run(database, options, pair, on_image)
             attempts.append(_attempt("incremental", pair, other))
             if other and (not models or other[0].num_reg_images() > models[0].num_reg_images()):

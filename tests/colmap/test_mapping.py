@@ -117,6 +117,19 @@ def test_after_a_draft_the_whole_run_is_tried_before_other_pairs(monkeypatch, tm
     assert models[0].num_reg_images() == 6 and [a.registered for a in attempts] == [[2], [3], [6]]
 
 
+def test_after_a_draft_no_connected_image_may_be_missing(monkeypatch, tmp_path):
+    """Without a draft, one of twelve is no reason to try again. A night photo is one of many."""
+    names = "abcdefghijkl"
+    chain = {pair: two_view() for pair in zip(names[:-1], names[1:], strict=True)}
+    draft = dataclasses.replace(ONE, draft=True)
+    calls = runs(monkeypatch, [[model(names[:-1])], [model(names)]])
+    assert len(build_models(tmp_path / "d.db", chain, draft)[1]) == 2 == len(calls)
+    calls = runs(monkeypatch, [[model(names[:-1])], [model(names[:-1])]])
+    assert len(build_models(tmp_path / "d.db", chain, draft)[1]) == 2 == len(calls)
+    calls = runs(monkeypatch, [[model(names)]])
+    assert len(build_models(tmp_path / "d.db", chain, draft)[1]) == 1 == len(calls)
+
+
 def test_a_draft_is_adjusted_less_often_and_takes_no_image_for_a_single_pair():
     colmap, draft = (
         mapper.incremental_options(dataclasses.replace(ONE, draft=draft)) for draft in (False, True)
