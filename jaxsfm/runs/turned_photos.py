@@ -101,14 +101,14 @@ def find_turned(
 
 
 def _seen_beside(upright: Collection[str], counts: Mapping[Pair, PairCounts]) -> set[str]:
-    """The photos that match an upright photo well, and so are upright themselves.
+    """The upright photos, and those that match one of them well and so are upright, too.
 
     In a collection many photos are in no model or a smaller one, and a trial of each takes
     seconds. Of the 135 photos of *statue* the first model has a tenth.
     """
     known = set(upright)
     well = [pair for pair, found in counts.items() if found.num_inliers >= LEAST_INLIERS]
-    return {name for pair in well if known & set(pair) for name in pair} - known
+    return {name for pair in well if known & set(pair) for name in pair}
 
 
 def _best_matched(names: Collection[str], counts: Mapping[Pair, PairCounts]) -> str:
