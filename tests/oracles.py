@@ -346,20 +346,23 @@ def bundle_adjustment(cameras, points: np.ndarray, xy: np.ndarray, weight: np.nd
 # -- checks of models ------------------------------------------------------------------------------
 
 
-def grouped(tested, contradicted, most: float, least: int) -> tuple[list[set], dict]:
+def grouped(tested, contradicted, undecided, most: float, least: int) -> tuple[list[set], dict]:
     """Groups of views, the largest first, and what contradicts what: set by set, sum by sum.
 
     Two groups agree if, in one of the two directions, at most the share `most` of the points of one
-    is contradicted by the other, and if both directions have `least` points. The pair of groups is
-    joined whose lesser share, with one contradiction more, is lowest.
+    is contradicted by the other, and if both directions have `least` points. Every undecided point
+    makes up for one and a half contradictions. The pair of groups is joined whose lesser share, with
+    one contradiction more, is lowest.
     """
 
-    def directions(one: frozenset, other: frozenset) -> list[tuple[int, int]]:
+    def directions(one: frozenset, other: frozenset) -> list[tuple[int, float]]:
         """(points, contradictions) of both directions, the better one first; none if too few."""
         sums = []
         for group, against in ((one, other), (other, one)):
             n = sum(int(tested[i, j]) for i in group for j in against)
-            sums.append((n, sum(int(contradicted[i, j]) for i in group for j in against)))
+            no = sum(int(contradicted[i, j]) for i in group for j in against)
+            perhaps = sum(int(undecided[i, j]) for i in group for j in against)
+            sums.append((n, max(no - 1.5 * perhaps, 0.0)))
         if min(n for n, _ in sums) < least:
             return []
         return sorted(sums, key=lambda each: each[1] / each[0])
@@ -377,7 +380,7 @@ def grouped(tested, contradicted, most: float, least: int) -> tuple[list[set], d
         _, one, other = min(agreeing, key=lambda each: each[0])
         groups = [group for group in groups if group not in (one, other)] + [one | other]
     against = {
-        frozenset((one, other)): directions(one, other)[0]
+        frozenset((one, other)): tuple(map(int, directions(one, other)[0]))
         for i, one in enumerate(groups)
         for other in groups[i + 1 :]
         if directions(one, other)

@@ -129,7 +129,6 @@ def test_a_change_of_light_contradicts_little_and_another_photo_much(halves):
             each[:, k].sum() for each in (found.tested, found.contradicted, found.beyond_light())
         )
         assert contradicted > 0.3 * tested > 100
-        assert (found.beyond_light() == np.maximum(found.contradicted - found.undecided, 0)).all()
         shares[label] = beyond / contradicted
     assert shares["light"] < 0.4 and shares["other"] > 0.8
 

@@ -53,8 +53,7 @@ def test_views_are_grouped_as_by_a_slow_search_among_sets(seed):
     undecided = rng.integers(0, 40, tested.shape)
     found = Agreement(tested, contradicted, undecided)
     got = group_views(found)
-    beyond = np.maximum(contradicted - undecided, 0)
-    want = grouped(found.tested, beyond, MAX_CONTRADICTED, MIN_TESTED)
+    want = grouped(tested, contradicted, undecided, MAX_CONTRADICTED, MIN_TESTED)
     assert [set(group) for group in got.groups] == want[0]
     said = {
         frozenset(map(frozenset, c.groups)): (c.tested, c.contradicted) for c in got.contradictions

@@ -12,8 +12,8 @@ too. Only views that see a point from nearly the same side are compared.
 
 Where the sun has moved between two photos, the same surface gives blocks of low correlations, too.
 But then as many correlations lie between those that agree and those that contradict, and of another
-surface few do. So the number of these *undecided* points is what the light explains, and only the
-contradictions beyond it count.
+surface few do. So these *undecided* points say how many contradictions the light explains, and only
+the contradictions beyond it count.
 
 Source: Zach, Irschara and Bischof 2008, "What can missing correspondences tell us about 3D
 structure and motion?", and Heinly, Dunn and Frahm 2014, "Correcting for duplicate scene structure
@@ -63,6 +63,10 @@ MOST = 0.7
 BLOCK, BLOCK_OF = 6, 8
 """A contradiction counts if so many of the nearest tested points, itself among them, are
 contradictions too."""
+LIGHT = 1.5
+"""A change of light explains so many contradictions for each undecided point. On *statue*, 95 of 100
+right pairs of photos have fewer than 0.6 contradictions for 0.4 undecided points, and 95 of 100
+wrong ones have more."""
 MIN_COMPARED = 20
 """Two views are compared only on this many points or more."""
 
@@ -79,8 +83,22 @@ class Agreement(NamedTuple):
     """int (v, v): other points in these blocks, where a patch neither agrees nor contradicts."""
 
     def beyond_light(self) -> np.ndarray:
-        """int (v, v): the contradictions that a difference in light does not explain."""
-        return np.maximum(self.contradicted - self.undecided, 0)
+        """float64 (v, v): the contradictions that a difference in light does not explain."""
+        return np.maximum(self.contradicted - LIGHT * self.undecided, 0.0)
+
+    def joined(self, first: int, second: int) -> "Agreement":
+        """The counts after two views, or groups of views, became one: their sums.
+
+        It keeps the index of the first.
+        """
+        return Agreement(*(_joined(counts, first, second) for counts in self))
+
+
+def _joined(counts: np.ndarray, first: int, second: int) -> np.ndarray:
+    both = counts.copy()
+    both[first] += both[second]
+    both[:, first] += both[:, second]
+    return np.delete(np.delete(both, second, 0), second, 1)
 
 
 AGREES, CONTRADICTS, UNDECIDED, UNKNOWN = range(4)

@@ -15,9 +15,10 @@ are taken for each other have 0.69; faces of rendered prisms that differ in one 
 MIN_TESTED = 30
 """Fewer tested points say nothing about two groups."""
 
-MIN_SHARED = 30
+MIN_SHARED = 100
 """Two groups that do not contradict each other are one part if they see at least so many of the
-same points. COLMAP asks for as many inliers before it registers an image."""
+same points, which is the smallest share of a pair's matches that the mapper is given. False pairs
+share points, too: on *statue*, 10 of 23 wrong joins of groups have fewer, and 3 of 23 right ones."""
 
 
 class OpposedGroups(NamedTuple):
@@ -57,28 +58,23 @@ def group_views(agreement: Agreement) -> Grouping:
 
     In each step, the two groups are joined whose share of contradictions is surely lowest: one
     contradiction is added, so that of two shares of zero the one with more tests is lower. Counts
-    of groups are sums over their views. It ends when only groups are left that contradict each
-    other, or about which nothing can be said. The order of views has an effect only among equals.
+    of groups are sums over their views, and what the light explains is subtracted from the sums.
+    It ends when only groups are left that contradict each other, or about which nothing can be
+    said. The order of views has an effect only among equals.
     """
-    tested = agreement.tested.astype(float)
-    contradicted = agreement.beyond_light().astype(float)
-    members = [[k] for k in range(len(tested))]
+    members = [[k] for k in range(len(agreement.tested))]
     while len(members) > 1:
-        shares = share(tested, contradicted)
+        beyond = agreement.beyond_light()
         with np.errstate(invalid="ignore"):
-            open_to = shares <= MAX_CONTRADICTED
-        sure = np.where(open_to, share(tested, contradicted + 1), np.inf)
+            open_to = share(agreement.tested, beyond) <= MAX_CONTRADICTED
+        sure = np.where(open_to, share(agreement.tested, beyond + 1), np.inf)
         sure[np.tril_indices(len(members))] = np.inf
         first, second = np.unravel_index(np.argmin(sure), sure.shape)
         if not np.isfinite(sure[first, second]):
             break
         members[first] = sorted(members[first] + members.pop(second))
-        for counts in (tested, contradicted):
-            counts[first] += counts[second]
-            counts[:, first] += counts[:, second]
-        tested, contradicted = (
-            np.delete(np.delete(each, second, 0), second, 1) for each in (tested, contradicted)
-        )
+        agreement = agreement.joined(first, second)
+    tested, contradicted = agreement.tested, agreement.beyond_light()
     shares = share(tested, contradicted)
     found = []
     for i, j in zip(*np.triu_indices(len(members), 1), strict=True):
