@@ -5,7 +5,7 @@ made again without them. So other ways to join the groups of photos are tried un
 with one, or until no pair is left that joins the groups. The two hypotheses are described in
 `jaxsfm.sfm.hypotheses`. The second is tried if something speaks against the first one. If both
 stand, both models are returned. Models in which photos contradict each other to the end are taken
-apart (`jaxsfm.sfm.told_apart`).
+apart (`jaxsfm.sfm.told_apart`). Models that share photos are joined (`jaxsfm.sfm.joined_models`).
 """
 
 import dataclasses
@@ -112,7 +112,10 @@ def build_checked_models(
         red = best.contradicted() > 0
         if red:
             best, parts = rounds.told_apart(best)
-            checks = _checks(best, following, parts)
+        joined = rounds.joined(best)
+        if red or joined is not best:
+            best, complete = joined, False
+            checks = _checks(best, following, parts or rounds.fallen_apart(best))
         checks = _without_strays(best, checks, following)
         if not complete:
             checks = rounds.with_second_places(best, checks)

@@ -5,21 +5,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.join_cameras import coloured, joined_cameras
 from jaxsfm.colmap.model import Model, point_colours
 from jaxsfm.colmap.poses import CameraPose, model_poses
-from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import named
-from jaxsfm.sfm.common_frame import (
-    CommonFrame,
-    CommonPoints,
-    common_points,
-    find_frame,
-    moved_points,
-)
+from jaxsfm.sfm.common_frame import CommonFrame, moved_points
 from jaxsfm.sfm.evaluation import pose_error
+from jaxsfm.sfm.model_join import ERROR_PX, adjusted, find_join, joined, sizes
 from jaxsfm.sfm.old_frame import move_back
 
 if TYPE_CHECKING:
@@ -27,13 +20,9 @@ if TYPE_CHECKING:
 
 MIN_SHARED = 2
 """The least number of photos that two models must share: one does not say how large a model is."""
-MIN_COMMON = 15
-"""The least number of common points that fall together: that of COLMAP's mapper for a pair."""
-MIN_SHARE = 0.5
-"""The least share of the common points that fall together."""
-ERROR_PX, ERROR_SHARE = 4.0, 0.0025
-"""The largest error of a right observation in pixels, as in COLMAP, and as a share of the longer
-side of photos that are larger than 1600 pixels."""
+ERROR_SHARE = 0.0025
+"""The largest error of a right observation, as a share of the longer side of photos that are larger
+than 1600 pixels."""
 TURNED_DEG = 3.0
 """A shared photo whose directions in the two models differ by more lies elsewhere in the second."""
 
@@ -68,43 +57,39 @@ def merge_models(
     Raises:
       UserError: the models share too few photos or points, or too few of these fall together.
     """
-    a, b = (Model.from_colmap(each, _sizes(each)) for each in (first, second))
+    a, b = (Model.from_colmap(each, sizes(each)) for each in (first, second))
     names = {view.name for view in a.views}
-    shared = sorted(names & {view.name for view in b.views})
+    shared = names & {view.name for view in b.views}
     if len(shared) < MIN_SHARED:
         raise UserError(
             f"the models share {len(shared)} photos by name, and at least {MIN_SHARED} are needed "
             f"(the first model has e.g. {named(sorted(names))}, the second "
             f"{named(sorted(view.name for view in b.views))})"
         )
-    points = common_points(a, b, shared)
     longer = float(np.median([max(view.size) for view in a.views]))
-    limit_px = max(ERROR_PX, ERROR_SHARE * longer)
-    frame = find_frame(a, b, shared, points, error_px=limit_px)
-    agreed = int(frame.agree.sum()) if frame else 0
-    if frame is None or agreed < max(MIN_COMMON, MIN_SHARE * len(points.first)):
+    error_px = max(ERROR_PX, ERROR_SHARE * longer)
+    join = find_join(a, b, error_px=error_px)
+    if join.frame is None or join.agreed < join.needed:
         raise UserError(
-            f"the models do not agree: of {len(points.first)} points that both have in "
-            f"{len(shared)} shared photos, {agreed} fall together, and at least "
-            f"{max(MIN_COMMON, round(MIN_SHARE * len(points.first)))} must"
+            f"the models do not agree: of {len(join.points.first)} points that both have in "
+            f"{len(shared)} shared photos, {join.agreed} fall together, and at least "
+            f"{join.needed} must"
         )
-    joined = _joined(a, b, frame, points)
+    b = _with_new_ids(b, max(view.image_id for view in a.views) + 1)
+    both = joined(a, b, join, joined_cameras(a, b, shared))
     colours = np.concatenate([point_colours(first), point_colours(second)])
-    before = [a.tracks.points, moved_points(b.tracks.points, frame.similarity)]
-    model = _adjusted(joined, limit_px, refine_intrinsics, threads)
+    before = [a.tracks.points, moved_points(b.tracks.points, join.frame.similarity)]
+    model = adjusted(both, error_px=error_px, refine_intrinsics=refine_intrinsics, threads=threads)
     move_back(model, model_poses(first))
     coloured(model, np.concatenate(before), colours)
-    return Merged(model, len(shared), len(points.first), agreed, _elsewhere(a, b, shared, frame))
+    elsewhere = _elsewhere(a, b, join.shared, join.frame)
+    return Merged(model, len(shared), len(join.points.first), join.agreed, elsewhere)
 
 
-def _sizes(model: "pycolmap.Reconstruction") -> dict:
-    """The sizes of the photos, as they are stored."""
-    sizes = {}
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        camera = model.camera(image.camera_id)
-        sizes[image.name] = (camera.width, camera.height), (1.0, 1.0)
-    return sizes
+def _with_new_ids(model: Model, start: int) -> Model:
+    """The model with other ids of its photos, from `start` on."""
+    views = [dataclasses.replace(view, image_id=start + k) for k, view in enumerate(model.views)]
+    return model.with_views(views)
 
 
 def _pose(model: Model, name: str) -> CameraPose:
@@ -119,59 +104,3 @@ def _elsewhere(a: Model, b: Model, shared: list[str], frame: CommonFrame) -> lis
         if pose_error(frame.similarity.moved(_pose(b, name)), _pose(a, name)).rotation_deg
         > TURNED_DEG
     ]
-
-
-def _joined(a: Model, b: Model, frame: CommonFrame, points: CommonPoints) -> Model:
-    """The first model with the photos, points and observations that only the second one has."""
-    number = {view.name: k for k, view in enumerate(a.views)}
-    cameras = joined_cameras(a, b, number.keys() & {view.name for view in b.views})
-    views, place = list(a.views), np.zeros(len(b.views), np.int64)
-    image_id = max(view.image_id for view in a.views)
-    for k, view in enumerate(b.views):
-        if view.name in number:
-            place[k] = number[view.name]
-            continue
-        image_id += 1
-        pose = frame.similarity.moved(CameraPose(view.rotation, view.centre))
-        place[k] = len(views)
-        views.append(
-            dataclasses.replace(
-                view,
-                image_id=image_id,
-                rotation=pose.rotation,
-                centre=pose.centre,
-                camera=cameras[view.camera.camera_id],
-            )
-        )
-    same = points.select(frame.agree)
-    target = np.full(len(b.tracks.points), -1)
-    target[same.second] = same.first
-    alone = np.flatnonzero(target < 0)
-    target[alone] = len(a.tracks.points) + np.arange(len(alone))
-    added = moved_points(b.tracks.points[alone], frame.similarity)
-    point, view = target[b.tracks.point], place[b.tracks.view]
-    taken = a.tracks.point * len(views) + a.tracks.view
-    new = np.flatnonzero(~np.isin(point * len(views) + view, taken))
-    tracks = Tracks(
-        np.concatenate([a.tracks.points, added]),
-        np.concatenate([a.tracks.point, point[new]]),
-        np.concatenate([a.tracks.view, view[new]]),
-        np.concatenate([a.tracks.xy, b.tracks.xy[new]]),
-    )
-    return dataclasses.replace(a, views=views, tracks=tracks)
-
-
-def _adjusted(
-    model: Model, limit_px: float, refine_intrinsics: bool, threads: int
-) -> "pycolmap.Reconstruction":
-    """Filter the observations and adjust the bundle, twice; the first filter is coarse."""
-
-    def once(slack: float) -> "pycolmap.Reconstruction":
-        made = model.select(model.errors_px() < slack * limit_px).to_colmap()
-        bundle_adjust(
-            made, loss_px=limit_px / 4, refine_intrinsics=refine_intrinsics, threads=threads
-        )
-        return made
-
-    model = Model.from_colmap(once(4.0), model.sizes)
-    return once(1.0)

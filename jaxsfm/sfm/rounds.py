@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
 from jaxsfm.colmap.mapper import Attempt, MapOptions
+from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.two_views import TwoView, read_two_views, verify
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
 from jaxsfm.sfm.checker import Checker, VerifiedPairs
+from jaxsfm.sfm.joined_models import Joiner
 from jaxsfm.sfm.mapper_runs import MapperRuns
 from jaxsfm.sfm.round import FEWER, Hypothesis, Refuted, Round
 from jaxsfm.sfm.told_apart import told_apart
@@ -113,6 +115,22 @@ class Rounds:
         found = told_apart(made.models, made.checks, self._checker, self._options)
         whole = dataclasses.replace(made, models=found.models, checks=found.checks)
         return whole, found.told_apart
+
+    def joined(self, made: Round) -> Round:
+        """The models of a round, joined where they share photos; the same round if none are."""
+        if len(made.models) < 2:
+            return made
+        self.go_back_to(made)
+        joiner = Joiner(
+            self._checker,
+            self._options,
+            lambda model: with_all_points(model, self._database, self._options),
+        )
+        found = joiner.join(list(zip(made.models, made.checks, strict=True)))
+        if len(found) == len(made.models):
+            return made
+        models, checks = map(list, zip(*found, strict=True))
+        return dataclasses.replace(made, models=models, checks=checks)
 
     def with_second_places(
         self, made: Round, checks: Sequence[ModelCheck | None]

@@ -57,6 +57,17 @@ class FakeModel(frozenset[Pair]):
         return 3
 
 
+class FakeJoiner(NamedTuple):
+    """Joins nothing."""
+
+    checker: object
+    options: MapOptions
+    triangulated: Callable
+
+    def join(self, models: list) -> list:
+        return models
+
+
 class FakePhotos:
     gray = None
 
@@ -100,11 +111,13 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         places: Callable[[frozenset[Pair]], dict] = lambda pairs: {},
         gone: bool = False,
         left_out: Callable[[frozenset[Pair]], bool] = lambda pairs: False,
+        joiner: type = FakeJoiner,
+        searched_too: dict | None = None,
     ) -> Run:
         given: list[set[Pair]] = []
         started: list[frozenset[Pair]] = []
         told: list[set[Pair]] = []
-        second: dict[frozenset[Pair], tuple] = {}
+        second: dict[frozenset[Pair], tuple] = dict(searched_too or {})
         searched: list[frozenset[Pair]] = []
 
         drafted = config.refinement is not None
@@ -156,6 +169,7 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
             lambda path: {p: v for p, v in (seconds or {}).items() if p in looked_for},
         )
         monkeypatch.setattr(module, "copy_geometries", copy)
+        monkeypatch.setattr(module, "Joiner", joiner)
         strays: list[tuple] = []
         monkeypatch.setattr(mapping, "take_out", lambda model, names: strays.append((model, names)))
         monkeypatch.setattr(mapping, "model_poses", places)
@@ -201,6 +215,21 @@ def test_a_model_without_contradictions_takes_one_round(rounds):
     assert found.figures.verdicts == {} and len(found.figures.attempts) == 1
     assert found.figures.checks == [outcome().check]
     assert found.models == [frozenset(PAIRS)]
+
+
+@pytest.mark.parametrize(("second", "count"), [(101, 3), (100, 3), (99, 2)])
+def test_rounds_end_if_far_fewer_photos_have_consistent_places(rounds, second, count):
+    """Two thirds of the pairs of the best round are enough to go on. The first round stays."""
+
+    def check(pairs):
+        size = 150 if A in pairs else second
+        parts = [["a", "b"]] * (size if C in pairs else 1)
+        refuted = [next(pair for pair in (A, B, C) if pair in pairs)] if C in pairs else []
+        return outcome(refuted=refuted)._replace(parts=parts)
+
+    found = rounds(check)
+    assert len(found.rounds) == (count if count == 2 else 4)
+    assert found.models == [frozenset(PAIRS if count == 2 else set(PAIRS) - {A, B, C})]
 
 
 def test_the_mapper_is_started_again_only_if_no_photos_contradict_each_other(rounds):
@@ -765,6 +794,29 @@ def test_what_is_red_to_the_end_is_told_apart_and_amber(rounds, monkeypatch):
     told = found.figures.checks[0]
     assert told is not None and told.alternative is not None and told.alternative.whole
     assert told.alternative.contradicted == 30 and told.alternative.basis == "pairs"
+
+
+@pytest.mark.parametrize("red", [False, True])
+def test_models_of_the_result_that_share_photos_are_joined(rounds, monkeypatch, red):
+    """Also those that were told apart. Their check is that of the joined model."""
+    parts = [["a", "b"], ["c", "d"]]
+    monkeypatch.setattr(
+        module, "told_apart", lambda models, *_: Parts(models, [outcome()] * 2, parts)
+    )
+    whole = FakeModel({("x", "y")})
+
+    class Joiner(FakeJoiner):
+        def join(self, models):
+            assert len(models) == 2 and all(not done.check.contradictions for _, done in models)
+            return [(whole, outcome(explained=[B]))]
+
+    tries = itertools.cycle([outcome(refuted=[A]), outcome()] if red else [outcome()])
+    places = {whole: ([], set())}
+    found = rounds(lambda pairs: next(tries), models=2, joiner=Joiner, searched_too=places)
+    assert found.models == [whole]
+    (told,) = found.figures.checks
+    assert told is not None and told.told_apart == (parts if red else [])
+    assert found.searched[-1:] == ([] if red else [whole])
 
 
 def test_models_that_nothing_contradicts_are_not_told_apart(rounds, monkeypatch):
