@@ -351,8 +351,8 @@ def grouped(tested, contradicted, undecided, most: float, least: int) -> tuple[l
 
     Two groups agree if, in one of the two directions, at most the share `most` of the points of one
     is contradicted by the other, and if both directions have `least` points. Every undecided point
-    makes up for one and a half contradictions. The pair of groups is joined whose lesser share, with
-    one contradiction more, is lowest.
+    makes up for one and a half contradictions. The pair of groups is joined whose lesser share,
+    with one contradiction more, is lowest.
     """
 
     def directions(one: frozenset, other: frozenset) -> list[tuple[int, float]]:

@@ -64,9 +64,8 @@ BLOCK, BLOCK_OF = 6, 8
 """A contradiction counts if so many of the nearest tested points, itself among them, are
 contradictions too."""
 LIGHT = 1.5
-"""A change of light explains so many contradictions for each undecided point. On *statue*, 95 of 100
-right pairs of photos have fewer than 0.6 contradictions for 0.4 undecided points, and 95 of 100
-wrong ones have more."""
+"""A change of light explains so many contradictions for each undecided point. In a model of
+*statue*, 95 of 100 right pairs of photos have fewer, and 95 of 100 wrong ones have more."""
 MIN_COMPARED = 20
 """Two views are compared only on this many points or more."""
 

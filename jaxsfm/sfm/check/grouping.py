@@ -17,8 +17,9 @@ MIN_TESTED = 30
 
 MIN_SHARED = 100
 """Two groups that do not contradict each other are one part if they see at least so many of the
-same points, which is the smallest share of a pair's matches that the mapper is given. False pairs
-share points, too: on *statue*, 10 of 23 wrong joins of groups have fewer, and 3 of 23 right ones."""
+same points. The mapper is given at least as many matches of a pair, if it has them. False pairs
+give common points, too: of groups of *statue* with 30 or more, 15 of 25 that do not belong together
+and 4 of 23 that do see fewer than 100."""
 
 
 class OpposedGroups(NamedTuple):
@@ -73,7 +74,7 @@ def group_views(agreement: Agreement) -> Grouping:
         if not np.isfinite(sure[first, second]):
             break
         members[first] = sorted(members[first] + members.pop(second))
-        agreement = agreement.joined(first, second)
+        agreement = agreement.joined(int(first), int(second))
     tested, contradicted = agreement.tested, agreement.beyond_light()
     shares = share(tested, contradicted)
     found = []
