@@ -20,7 +20,14 @@ from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, Evidence, matched_points
-from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, OctavePose, PoseHypothesis, follow, trusted
+from jaxsfm.sfm.refine.octave_pose import (
+    MIN_COUNT,
+    MIN_SHARE,
+    OctavePose,
+    PoseHypothesis,
+    follow,
+    trusted,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,6 +52,14 @@ class Placement:
     doubt: str = ""
     """What speaks against the place, in words; the image was taken out again. Empty if nothing
     does."""
+
+    def rests_on_details(self) -> bool:
+        """Whether the place rests on details at full size, which the image shows where it agrees.
+
+        Full size may determine a pose best although noise hides most there: in a night photo of
+        entry-P10, 106 of 18 012 points agree, and the pose is right.
+        """
+        return self.octave_px == 1 and self.agreed >= MIN_SHARE * self.candidates
 
 
 def _structure(model: Model, weak: Sequence[int]) -> tuple[Model, np.ndarray]:
