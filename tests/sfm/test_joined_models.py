@@ -1,4 +1,4 @@
-"""Laws of models that share photos and are joined. The check is made up, the models are COLMAP's."""
+"""Laws of models that share photos and are joined. The check is made up, models are COLMAP's."""
 
 import numpy as np
 import pycolmap
