@@ -102,3 +102,21 @@ def test_three_models_are_joined_one_after_the_other(rendered, monkeypatch):
     checker = FakeChecker()
     ((model, _),) = joined(given, checker)
     assert registered(model) == {*NAMES} and len(checker.asked) == 2
+
+
+def test_points_fall_together_within_twelve_pixels_of_the_photos_at_working_size(
+    rendered, monkeypatch
+):
+    """The photos have three pixels for two working pixels."""
+    found = []
+
+    def find_join(first, second, *, error_px):
+        found.append(error_px)
+        return original(first, second, error_px=error_px)
+
+    original = module.find_join
+    monkeypatch.setattr(module, "find_join", find_join)
+    given = [part(rendered, [0, 1, 2, 3]), part(rendered, [1, 2, 3, 4], ELSEWHERE)]
+    options = MapOptions(refine_intrinsics=False, threads=1, scale=1.5)
+    ((model, _),) = Joiner(FakeChecker(), options, lambda model: model).join(given)
+    assert registered(model) == {*NAMES} and found == [18.0]
