@@ -37,6 +37,14 @@ def upright(stored: np.ndarray, orientation: int) -> np.ndarray:
     return stored.swapaxes(0, 1) if orientation in _TRANSPOSED else stored
 
 
+def as_stored(upright: np.ndarray, orientation: int) -> np.ndarray:
+    """Turn the pixels (h, w, ...) of an upright photo to how they are stored: undoes `upright`."""
+    stored = upright.swapaxes(0, 1) if orientation in _TRANSPOSED else upright
+    if orientation in _MIRRORED_Y:
+        stored = stored[::-1]
+    return stored[:, ::-1] if orientation in _MIRRORED_X else stored
+
+
 def to_stored(size: tuple[int, int], orientation: int) -> np.ndarray:
     """The float64 matrix (3, 3) that maps pixels of the upright photo to those of the stored one.
 

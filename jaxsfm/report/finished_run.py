@@ -26,7 +26,7 @@ from jaxsfm.io.looks import Looks
 from jaxsfm.io.masked_images import with_mask
 from jaxsfm.io.masks import MaskFile, mask_path
 from jaxsfm.io.store import Store
-from jaxsfm.io.work_folder import RECORD
+from jaxsfm.io.work_folder import RECORD, SKY
 from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
 from jaxsfm.report.run_results import EvaluationReport
@@ -197,8 +197,10 @@ def evaluation_report(
     return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
 
 
-def _masks(report: RunReport) -> Path | None:
-    """The folder of the run's masks."""
+def _masks(report: RunReport, home: Path) -> Path | None:
+    """The folder of the run's masks: the user's, or those of the sky in the work folder."""
+    if report.masked_sky:
+        return home / SKY
     folder = report.options.others.get("masks")
     return Path(folder) if isinstance(folder, str) else None
 
@@ -252,7 +254,7 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(where, report.identity, _described(report), _masks(report)),
+        photos=RecordedPhotos(where, report.identity, _described(report), _masks(report, home)),
         model=model,
         colours=colours,
         reference=known,

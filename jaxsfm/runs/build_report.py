@@ -63,6 +63,8 @@ class StageResults:
     looks: UsedLooks | None
     own_cameras: bool
     """Whether each photo has its own camera, because shared ones did not do."""
+    masked_sky: int
+    """The number of photos whose sky was masked."""
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -108,6 +110,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         given=None if about is None else from_json(UsedExternalMatches, about),
         looks=stages.looks,
         own_cameras=stages.own_cameras or None,
+        masked_sky=stages.masked_sky or None,
         turned=_turned(stages.usable, stages.identity.orientations),
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,

@@ -1,7 +1,8 @@
 """The matching and the mapping of a run's photos, look by look.
 
 All photos are matched and mapped at a small size first. Then those that turn out to be stored
-sideways are turned, and those that have found no place are described at full size.
+sideways are turned, the sky is masked if something speaks against the model, and photos that have
+found no place are described at full size.
 """
 
 import dataclasses
@@ -12,6 +13,7 @@ from typing import NamedTuple
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.looks import Looks
 from jaxsfm.io.pairs import Pair
+from jaxsfm.io.work_folder import SKY
 from jaxsfm.report.run_inputs import RunIdentity, UsedLooks
 from jaxsfm.runs.job import Job, pairs_without
 from jaxsfm.runs.matching_looks import (
@@ -22,6 +24,7 @@ from jaxsfm.runs.matching_looks import (
     match_pairs,
 )
 from jaxsfm.runs.run_stages import MappedRun, RunStages
+from jaxsfm.runs.sky_masks import without_sky
 from jaxsfm.runs.turned_photos import Trials, find_turned
 
 logger = logging.getLogger("jaxsfm")
@@ -38,6 +41,8 @@ class MappedLooks(NamedTuple):
     """That of the run, with the orientations that were found."""
     own_cameras: bool = False
     """Whether each photo has its own camera, because shared ones did not do."""
+    masked_sky: int = 0
+    """The number of photos whose sky was masked, because photos contradicted each other with it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,10 +66,10 @@ class RunPhotos:
         left = {name: image for name, image in self.images.items() if name not in lost}
         return dataclasses.replace(self, images=left, pairs=pairs_without(self.pairs, lost))
 
-    def upright(self, turned: Mapping[str, ImageFile]) -> "RunPhotos":
-        """These photos, some of them turned."""
-        images = {**self.images, **turned}
-        identity = self.identity.with_images(turned.values())
+    def with_images(self, changed: Mapping[str, ImageFile]) -> "RunPhotos":
+        """These photos, some of them turned or with masks."""
+        images = {**self.images, **changed}
+        identity = self.identity.with_images(changed.values())
         job = job_of_look(self.job, identity, self.job.config)
         return dataclasses.replace(self, images=images, identity=identity, job=job)
 
@@ -79,22 +84,25 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     trials = Trials(photos.job, photos.identity, photos.images, seconds)
     checked = photos.job.config.checked  # the paper looks at nothing twice
     if checked and (turned := find_turned(mapped, trials, matched.counts)):
-        photos = photos.upright(turned)
+        photos, stages = _changed(photos, turned, stages, "-turned")
         matched, _ = photos.match(seconds)
-        stages = dataclasses.replace(
-            stages, images=[photos.images[image.name] for image in stages.images], look="-turned"
-        )
         mapped = stages.map(matched)
+    masked_sky = 0
+    if checked and not mapped.green():
+        masked = _with_masked_sky(photos, mapped, stages)
+        if masked is not None:
+            photos, matched, stages, mapped = masked
+            masked_sky = sum(image.mask is not None for image in stages.images)
     shared = stages
     if checked and not mapped.settled():
         stages, mapped = _with_own_cameras(matched, mapped, stages)
     own = stages is not shared
     if matched.described == photos.job.config:
-        return MappedLooks(matched, mapped, None, photos.identity, own)
+        return MappedLooks(matched, mapped, None, photos.identity, own, masked_sky)
     looks = UsedLooks(first_px=matched.described.max_size)
     again = mapped.unsettled(matched.counts)
     if again is None:
-        return MappedLooks(matched, mapped, looks, photos.identity, own)
+        return MappedLooks(matched, mapped, looks, photos.identity, own, masked_sky)
     logger.info("%s", again.in_words())
     matched_again = match_again(photos.job, photos.images, matched, again, seconds)
     mapped_again = dataclasses.replace(stages, look=stages.look + "-again").map(matched_again)
@@ -107,7 +115,33 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     )
     if not looks.in_vain:
         matched, mapped = matched_again, mapped_again
-    return MappedLooks(matched, mapped, looks, photos.identity, own)
+    return MappedLooks(matched, mapped, looks, photos.identity, own, masked_sky)
+
+
+def _changed(
+    photos: RunPhotos, changed: Mapping[str, ImageFile], stages: RunStages, look: str
+) -> tuple[RunPhotos, RunStages]:
+    """The photos and the stages of another look, in which some photos are turned or have masks."""
+    photos = photos.with_images(changed)
+    images = [photos.images[image.name] for image in stages.images]
+    return photos, dataclasses.replace(stages, images=images, look=stages.look + look)
+
+
+def _with_masked_sky(
+    photos: RunPhotos, mapped: MappedRun, stages: RunStages
+) -> tuple[RunPhotos, MatchedPairs, RunStages, MappedRun] | None:
+    """The same with the sky masked, if this gives better models; otherwise None."""
+    masked = without_sky(photos.images.values(), stages.folder.path / SKY)
+    if not masked:
+        return None
+    logger.info("something speaks against the model; matching again without the sky")
+    photos, stages = _changed(photos, masked, stages, "-sky")
+    matched, _ = photos.match(stages.seconds)
+    mapped_masked = stages.map(matched)
+    if not mapped_masked.better_than(mapped):
+        return None
+    logger.info("the sky of %d photos is masked, which gave a better model", len(masked))
+    return photos, matched, stages, mapped_masked
 
 
 def _with_own_cameras(

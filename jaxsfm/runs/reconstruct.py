@@ -150,6 +150,7 @@ def reconstruct_folder(
                     weights=from_json(UsedWeights, weights.described(config)),
                     looks=mapped.looks,
                     own_cameras=mapped.own_cameras,
+                    masked_sky=mapped.masked_sky,
                     seconds=seconds,
                 ),
                 config=config,

@@ -54,7 +54,14 @@ class MappedRun:
           counts: of all pairs that were tried.
         """
         names = [image.name for image in self.given.images]
-        return second_look(counts, names, self.photos, self.trusted(), green=self.green())
+        return second_look(counts, names, self.settled_photos(), self.trusted())
+
+    def settled_photos(self) -> set[str]:
+        """The photos that have a sure place in the best model (`jaxsfm.sfm.second_look`)."""
+        checks = [check for check in self.stage.figures.checks if check is not None]
+        if not self.photos or any(check.doubted() for check in checks):
+            return set()
+        return self.photos[0].difference(*(pair for check in checks for pair in check.apart))
 
     def settled(self) -> bool:
         """Whether all photos are in one model, and nothing speaks against it."""

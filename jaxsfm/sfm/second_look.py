@@ -1,8 +1,9 @@
 """Which photos and pairs need a second look, at full size, after a first one at a small size.
 
 Most photos find their places in a model from small descriptions, at a quarter of the network's work
-and a sixteenth of the products of descriptors. A photo is *settled* if it is in the best model and
-no photo contradicts this model. The others get a second look:
+and a sixteenth of the products of descriptors. A photo is *settled* if it is in the best model, its
+neighbours by name agree with its place, and nothing else speaks against the models. The others get a
+second look:
 
 * If most photos are unsettled, or if something speaks against the model, all pairs are matched
   again. The matches of the first look are not used then.
@@ -11,7 +12,7 @@ no photo contradicts this model. The others get a second look:
   trusted pairs between these photos are also matched again. Their matches of the first look stay.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 from jaxsfm.io.images import named
@@ -43,22 +44,18 @@ class SecondLook(NamedTuple):
 def second_look(
     counts: Mapping[Pair, PairCounts],
     photos: Collection[str],
-    models: Sequence[Collection[str]],
+    settled: Collection[str],
     trusted: Collection[Pair],
-    *,
-    green: bool,
 ) -> SecondLook | None:
     """What to look at again; None if all photos are settled.
 
     Args:
       counts: of all pairs that were tried in the first look.
       photos: the names of all photos.
-      models: the photos of each model, the model with most photos first.
+      settled: those of them that are settled.
       trusted: the verified pairs that the models were made from.
-      green: whether nothing speaks against the models.
     """
-    best = set(models[0]) if models and green else set()
-    unsettled = sorted(set(photos) - best)
+    unsettled = sorted(set(photos).difference(settled))
     if not unsettled:
         return None
     if len(unsettled) > MOST_UNSETTLED * len(photos):

@@ -101,8 +101,12 @@ class ModelCheck:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        doubts = self.other_places or self.alternative or self.apart or self.told_apart
-        return "amber" if doubts else "green"
+        return "amber" if self.apart or self.doubted() else "green"
+
+    def doubted(self) -> bool:
+        """Whether more speaks against the model than photos that follow each other (`apart`)."""
+        doubts = self.contradictions, self.other_places, self.alternative, self.told_apart
+        return any(map(bool, doubts))
 
     def photos(self) -> set[str]:
         """The photos of the model."""

@@ -1,0 +1,53 @@
+"""Masks of the sky, for a run whose photos contradict each other.
+
+Outlines before the sky look alike from several sides of a building. On *statue*, photos of all four
+sides were joined in one model; with the sky masked, 110 of 135 photos are in one model and all of
+them are right (docs/decisions/repeated-structure.md).
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.masked_images import with_mask
+from jaxsfm.io.masks import mask_path
+from jaxsfm.io.sky import below_sky
+
+SHARE, MOST = 0.05, 0.95
+"""A photo gets a mask if the sky covers more of it than the first share and less than the second.
+"""
+COMMON = 0.5
+"""Masks are tried if so large a share of the photos gets one."""
+
+
+def without_sky(images: Iterable[ImageFile], folder: Path) -> dict[str, ImageFile]:
+    """The photos that show the sky, with masks that leave it out, by name.
+
+    There are none if few photos show the sky, or if a photo has a mask of the user's.
+
+    Args:
+      folder: for the masks.
+
+    Raises ImageError if a photo cannot be decoded.
+    """
+    images = list(images)
+    if any(image.mask for image in images):
+        return {}
+    masks = {image.name: below_sky(image) for image in images}
+    shown = {n: used for n, used in masks.items() if SHARE < (~used).mean() < MOST}
+    if len(shown) < COMMON * len(images):
+        return {}
+    for name, used in shown.items():
+        _write(mask_path(folder, name), used)
+    return {i.name: with_mask(i, mask_path(folder, i.name)) for i in images if i.name in shown}
+
+
+def _write(path: Path, used: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    written, data = cv2.imencode(".png", used.astype(np.uint8) * 255)
+    assert written
+    write_atomic(path, data.tobytes())

@@ -1,0 +1,50 @@
+"""Which photos of a mapped run have a sure place."""
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from jaxsfm.runs.run_stages import MappedRun
+from jaxsfm.sfm.check.model_check import Alternative, Contradiction, ModelCheck, OtherPlace
+
+SURE = ModelCheck(groups=[["a", "b", "c", "d"]], contradictions=[], other_places=[])
+
+
+def settled(*checks: ModelCheck | None, models: tuple[str, ...] = ("abcd", "ef")) -> set[str]:
+    stage: Any = SimpleNamespace(figures=SimpleNamespace(checks=[*checks]))
+    nothing: Any = None
+    run = MappedRun(nothing, stage, nothing)
+    run.__dict__["photos"] = [set(names) for names in models]  # it would read the models
+    return run.settled_photos()
+
+
+def test_photos_of_the_best_model_are_settled_but_those_of_which_neighbours_disagree():
+    assert settled(SURE, None) == set("abcd")
+    apart = dataclasses.replace(SURE, apart=[["a", "b"], ["b", "e"]])
+    assert settled(apart, None) == set("cd")
+    assert apart.verdict == "amber" and not apart.doubted()
+    assert settled(models=()) == set()
+
+
+@pytest.mark.parametrize(
+    "doubt",
+    [
+        {"contradictions": [Contradiction(images=["a"], others=["b"], tested=9, contradicted=9)]},
+        {
+            "other_places": [
+                OtherPlace(image="a", pairs=["b"], agreed=9, contradicted=0, rotation_deg=90.0)
+            ]
+        },
+        {"alternative": Alternative(basis="order", images=4, elsewhere=["a"], contradicted=0)},
+        {"told_apart": [["a", "b"], ["c", "d"]]},
+    ],
+)
+@pytest.mark.parametrize("which", [0, 1])
+def test_no_photo_is_settled_if_anything_else_speaks_against_a_model(doubt, which):
+    """Also if it is a smaller model."""
+    checks = [SURE, SURE]
+    checks[which] = dataclasses.replace(SURE, **doubt)
+    assert checks[which].doubted() and checks[which].verdict != "green"
+    assert settled(*checks) == set()

@@ -1,0 +1,133 @@
+"""Masks of the sky, and when a run tries them."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.masks import MaskFile, read_mask
+from jaxsfm.runs import mapping_looks, sky_masks
+from jaxsfm.runs.mapping_looks import map_in_looks
+from jaxsfm.runs.sky_masks import without_sky
+
+SIZE = (10, 10)
+
+
+def image(name: str) -> ImageFile:
+    return ImageFile(name=name, path=Path(name), size=SIZE, sha256=name)
+
+
+@pytest.fixture
+def skies(monkeypatch):
+    """Says how much of each photo shows the sky, in hundredths."""
+
+    def of(shares: dict[str, int]) -> None:
+        def below_sky(image: ImageFile) -> np.ndarray:
+            return (np.arange(100) >= shares[image.name]).reshape(10, 10)
+
+        monkeypatch.setattr(sky_masks, "below_sky", below_sky)
+
+    return of
+
+
+def test_photos_that_show_the_sky_get_masks_of_the_rest(tmp_path, skies):
+    skies({"sub/a.jpg": 40, "b.jpg": 6, "c.jpg": 5, "d.jpg": 95})
+    found = without_sky(map(image, ["sub/a.jpg", "b.jpg", "c.jpg", "d.jpg"]), tmp_path)
+    assert [*found] == ["sub/a.jpg", "b.jpg"]
+    mask = found["sub/a.jpg"].mask
+    assert mask is not None and mask.path == tmp_path / "sub/a.jpg.png"
+    assert read_mask(mask).sum() == 60
+    assert sorted(p.name for p in tmp_path.rglob("*.png")) == ["a.jpg.png", "b.jpg.png"]
+
+
+def test_masks_are_not_made_if_few_photos_show_the_sky(tmp_path, skies):
+    skies({"a": 40, "b": 0, "c": 0})
+    assert without_sky(map(image, "abc"), tmp_path) == {} == without_sky([], tmp_path)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_masks_of_the_user_are_believed(tmp_path, skies):
+    skies({"a": 40, "b": 40})
+    own = dataclasses.replace(image("a"), mask=MaskFile(Path("m.png"), "m"))
+    assert without_sky([own, image("b")], tmp_path) == {}
+
+
+class Matched(str):
+    """The matches of a look, which described the photos at full size."""
+
+    described = SimpleNamespace(checked=True)
+    counts: dict = {}
+
+
+@dataclasses.dataclass(frozen=True)
+class Mapped:
+    """Models with so many photos in the best one."""
+
+    right: bool
+    size: int
+
+    def green(self) -> bool:
+        return self.right
+
+    def settled(self) -> bool:
+        return True
+
+    def better_than(self, other: "Mapped") -> bool:
+        return (self.right, self.size) > (other.right, other.size)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stages:
+    made: dict[str, Mapped]
+    images: list[ImageFile]
+    folder: Any
+    look: str = ""
+    seconds: dict = dataclasses.field(default_factory=dict)
+
+    def map(self, matched: object) -> Mapped:
+        assert matched == self.look and all(i.mask for i in self.images) == (self.look == "-sky")
+        return self.made[self.look]
+
+
+@dataclasses.dataclass(frozen=True)
+class Photos:
+    images: dict[str, ImageFile]
+    job: Any
+    identity: str = ""
+    look: str = ""
+
+    def with_images(self, changed: dict[str, ImageFile]) -> "Photos":
+        return dataclasses.replace(self, images={**self.images, **changed}, look="-sky")
+
+    def match(self, seconds: dict) -> tuple["Matched", dict]:
+        return Matched(self.look), {}
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "masked"),
+    [
+        (Mapped(False, 55), Mapped(False, 108), 2),
+        (Mapped(False, 20), Mapped(True, 12), 2),
+        (Mapped(False, 55), Mapped(False, 55), 0),
+        (Mapped(True, 12), Mapped(True, 20), 0),  # not tried
+    ],
+)
+def test_the_sky_is_masked_if_this_helps_where_something_speaks_against_the_model(
+    monkeypatch, tmp_path, skies, first, second, masked
+):
+    skies({"a": 40, "b": 40})
+    monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
+    images = {name: image(name) for name in "ab"}
+    photos: Any = Photos(images, SimpleNamespace(config=Matched.described))
+    stages: Any = Stages(
+        {"": first, "-sky": second}, [*images.values()], SimpleNamespace(path=tmp_path)
+    )
+    matched: Any = Matched("")
+    found = map_in_looks(photos, matched, stages)
+    assert found.masked_sky == masked and (tmp_path / "sky").exists() == (not first.right)
+    assert found.mapped is (second if masked else first)
+    assert found.matched == ("-sky" if masked else "")
