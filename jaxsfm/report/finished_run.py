@@ -197,7 +197,7 @@ def evaluation_report(
     return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
 
 
-def _masks(report: RunReport, home: Path) -> Path | None:
+def masks_folder(report: RunReport, home: Path) -> Path | None:
     """The folder of the run's masks: the user's, or those of the sky in the work folder."""
     if report.masked_sky:
         return home / SKY
@@ -254,7 +254,9 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(where, report.identity, _described(report), _masks(report, home)),
+        photos=RecordedPhotos(
+            where, report.identity, _described(report), masks_folder(report, home)
+        ),
         model=model,
         colours=colours,
         reference=known,

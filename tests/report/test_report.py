@@ -1,8 +1,11 @@
 """The summary of a run."""
 
+from pathlib import Path
+
 import pytest
 
 from jaxsfm.io.images import ImageError, inspect_image
+from jaxsfm.report.finished_run import masks_folder
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.summary import summary_lines
 
@@ -135,6 +138,19 @@ def test_skipped_and_lost_images_have_one_line_each_whatever_their_names(tmp_pat
     assert [line for line in lines if line.startswith("lost")] == [
         r"lost             lost\n.jpg: no plane (5 tentative matches)"
     ]
+
+
+def test_a_masked_sky_is_said_and_its_masks_are_found_in_the_work_folder():
+    """Otherwise the masks are those of the user, if there are any."""
+    masked = report(masked_sky=3)
+    said = "sky              masked in 3 photos, which gave a better model (the masks are in sky)"
+    assert said in summary_lines(masked)
+    assert not any(line.startswith("sky") for line in summary_lines(report()))
+    home = Path("out")
+    assert masks_folder(masked, home) == home / "sky"
+    assert masks_folder(report(), home) is None
+    own = report(options=OPTIONS | {"masks": "/m"})
+    assert masks_folder(own, home) == Path("/m")
 
 
 @pytest.mark.parametrize(
