@@ -87,16 +87,15 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
         photos, stages = _changed(photos, turned, stages, "-turned")
         matched, _ = photos.match(seconds)
         mapped = stages.map(matched)
-    masked_sky = 0
+    shared = stages
+    if checked and not mapped.settled():
+        stages, mapped = _with_own_cameras(matched, mapped, stages)
+    own, masked_sky = stages is not shared, 0
     if checked and not mapped.green():
         masked = _with_masked_sky(photos, mapped, stages)
         if masked is not None:
             photos, matched, stages, mapped = masked
             masked_sky = sum(image.mask is not None for image in stages.images)
-    shared = stages
-    if checked and not mapped.settled():
-        stages, mapped = _with_own_cameras(matched, mapped, stages)
-    own = stages is not shared
     if matched.described == photos.job.config:
         return MappedLooks(matched, mapped, None, photos.identity, own, masked_sky)
     looks = UsedLooks(first_px=matched.described.max_size)

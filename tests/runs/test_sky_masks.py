@@ -74,7 +74,7 @@ class Mapped:
         return self.right
 
     def settled(self) -> bool:
-        return True
+        return True  # own cameras are not tried
 
     def better_than(self, other: "Mapped") -> bool:
         return (self.right, self.size) > (other.right, other.size)
