@@ -115,7 +115,10 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,
-        checks=made.mapping.checks,
+        checks=[
+            check and dataclasses.replace(check, without_sky=stages.masked_sky > 0)
+            for check in made.mapping.checks
+        ],
         georeference=stages.georeference,
         lost=[],
         seconds=stages.seconds,

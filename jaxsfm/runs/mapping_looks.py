@@ -7,6 +7,7 @@ found no place are described at full size.
 
 import dataclasses
 import logging
+import shutil
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
@@ -22,10 +23,12 @@ from jaxsfm.runs.matching_looks import (
     job_of_look,
     match_again,
     match_pairs,
+    timed,
 )
 from jaxsfm.runs.run_stages import MappedRun, RunStages
 from jaxsfm.runs.sky_masks import without_sky
 from jaxsfm.runs.turned_photos import Trials, find_turned
+from jaxsfm.sfm.round import FEWER
 
 logger = logging.getLogger("jaxsfm")
 
@@ -42,7 +45,7 @@ class MappedLooks(NamedTuple):
     own_cameras: bool = False
     """Whether each photo has its own camera, because shared ones did not do."""
     masked_sky: int = 0
-    """The number of photos whose sky was masked, because photos contradicted each other with it."""
+    """The number of photos whose sky was masked, because something spoke against the model."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,7 +94,7 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     if checked and not mapped.settled():
         stages, mapped = _with_own_cameras(matched, mapped, stages)
     own, masked_sky = stages is not shared, 0
-    if checked and not mapped.green():
+    if checked and mapped.doubted():
         masked = _with_masked_sky(photos, mapped, stages)
         if masked is not None:
             photos, matched, stages, mapped = masked
@@ -130,14 +133,18 @@ def _with_masked_sky(
     photos: RunPhotos, mapped: MappedRun, stages: RunStages
 ) -> tuple[RunPhotos, MatchedPairs, RunStages, MappedRun] | None:
     """The same with the sky masked, if this gives better models; otherwise None."""
-    masked = without_sky(photos.images.values(), stages.folder.path / SKY)
+    folder = stages.folder.path / SKY
+    with timed(stages.seconds, "sky"):
+        masked = without_sky(photos.images.values(), folder)
     if not masked:
         return None
     logger.info("something speaks against the model; matching again without the sky")
     photos, stages = _changed(photos, masked, stages, "-sky")
     matched, _ = photos.match(stages.seconds)
     mapped_masked = stages.map(matched)
-    if not mapped_masked.better_than(mapped):
+    enough = mapped_masked.largest() >= (1 - FEWER) * mapped.largest()
+    if not (enough and mapped_masked.better_than(mapped)):
+        shutil.rmtree(folder)
         return None
     logger.info("the sky of %d photos is masked, which gave a better model", len(masked))
     return photos, matched, stages, mapped_masked

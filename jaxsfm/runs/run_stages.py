@@ -20,6 +20,7 @@ from jaxsfm.io.store import digest
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.runs.matching_looks import MatchedPairs, timed
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.georeference.georeference import Georeference, MeasuredPositions, move_models
 from jaxsfm.sfm.mapping import green
 from jaxsfm.sfm.reconstruction import (
@@ -59,22 +60,31 @@ class MappedRun:
     def settled_photos(self) -> set[str]:
         """The photos that have a sure place in the best model (`jaxsfm.sfm.second_look`)."""
         checks = [check for check in self.stage.figures.checks if check is not None]
-        if not self.photos or any(check.doubted() for check in checks):
+        if not self.photos or self.doubted():
             return set()
         return self.photos[0].difference(*(pair for check in checks for pair in check.apart))
 
     def settled(self) -> bool:
         """Whether all photos are in one model, and nothing speaks against it."""
-        return self.green() and max(map(len, self.photos), default=0) == len(self.given.images)
+        return self.green() and self.largest() == len(self.given.images)
 
     def better_than(self, other: "MappedRun") -> bool:
         """Whether there are more photos in the best model. Models that something speaks against are
-        worse than others."""
+        worse than others, and so are models that are too small to be checked, and none."""
 
         def rank(run: MappedRun) -> tuple[bool, int]:
-            return run.green(), max(map(len, run.photos), default=0)
+            largest = run.largest()
+            return run.green() and largest >= MIN_VIEWS, largest
 
         return rank(self) > rank(other)
+
+    def largest(self) -> int:
+        """The number of photos in the best model."""
+        return max(map(len, self.photos), default=0)
+
+    def doubted(self) -> bool:
+        """Whether more speaks against a model than photos that follow each other."""
+        return any(check is not None and check.doubted() for check in self.stage.figures.checks)
 
     @functools.cached_property
     def photos(self) -> list[set[str]]:

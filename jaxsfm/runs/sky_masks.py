@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jaxsfm.io.atomic import write_atomic
-from jaxsfm.io.images import ImageFile
+from jaxsfm.io.atomic import atomic_folder
+from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.masked_images import with_mask
 from jaxsfm.io.masks import mask_path
 from jaxsfm.io.sky import below_sky
@@ -27,27 +27,34 @@ COMMON = 0.5
 def without_sky(images: Iterable[ImageFile], folder: Path) -> dict[str, ImageFile]:
     """The photos that show the sky, with masks that leave it out, by name.
 
-    There are none if few photos show the sky, or if a photo has a mask of the user's.
+    There are none if few photos show the sky, or if a photo has a mask of the user's. A photo that
+    cannot be decoded gets no mask.
 
     Args:
-      folder: for the masks.
-
-    Raises ImageError if a photo cannot be decoded.
+      folder: for the masks; it is made anew.
     """
     images = list(images)
     if any(image.mask for image in images):
         return {}
-    masks = {image.name: below_sky(image) for image in images}
-    shown = {n: used for n, used in masks.items() if SHARE < (~used).mean() < MOST}
-    if len(shown) < COMMON * len(images):
+    masks = {image.name: data for image in images if (data := _mask(image)) is not None}
+    if not masks or len(masks) < COMMON * len(images):
         return {}
-    for name, used in shown.items():
-        _write(mask_path(folder, name), used)
-    return {i.name: with_mask(i, mask_path(folder, i.name)) for i in images if i.name in shown}
+    with atomic_folder(folder) as fresh:
+        for name, data in masks.items():
+            path = mask_path(fresh, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+    return {i.name: with_mask(i, mask_path(folder, i.name)) for i in images if i.name in masks}
 
 
-def _write(path: Path, used: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _mask(image: ImageFile) -> bytes | None:
+    """The mask of a photo as a PNG file, which is small; None if it gets none."""
+    try:
+        used = below_sky(image)
+    except ImageError:  # a photo in no pair may never have been decoded
+        return None
+    if not SHARE < (~used).mean() < MOST:
+        return None
     written, data = cv2.imencode(".png", used.astype(np.uint8) * 255)
     assert written
-    write_atomic(path, data.tobytes())
+    return data.tobytes()

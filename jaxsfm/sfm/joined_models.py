@@ -31,6 +31,8 @@ JOIN_ERROR_PX = 12.0
 models are bent: of 2548 common points of two right models of *statue* (43 and 17 photos), 17 fall
 together within 2.7 pixels, 1867 within 8 and 2451 within 16. COLMAP allows as much for a photo that
 it adds."""
+MIN_OBSERVATIONS = 30
+"""A photo that sees fewer points has no sure place: COLMAP registers none with fewer inliers."""
 
 logger = logging.getLogger("jaxsfm")
 
@@ -40,8 +42,8 @@ class Joiner(NamedTuple):
 
     checker: Checker
     options: MapOptions
-    triangulated: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction]"
-    """Gives a model the points of the matches in the database."""
+    finished: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction]"
+    """Gives a joined model the points that the models of the run have."""
 
     def join(self, models: Sequence[CheckedModel]) -> list[CheckedModel]:
         """Join models that share photos, those first that share most.
@@ -89,9 +91,24 @@ class Joiner(NamedTuple):
             refine_intrinsics=self.options.refine_intrinsics,
             threads=self.options.threads,
         )
-        both = self.triangulated(both)
+        if _loses_observations(both, first, second):
+            return None
         (done,) = self.checker.check([both], ())
-        return (both, done) if _agrees(done) else None
+        return (self.finished(both), done) if _agrees(done) else None
+
+
+def _loses_observations(
+    both: "pycolmap.Reconstruction",
+    first: "pycolmap.Reconstruction",
+    second: "pycolmap.Reconstruction",
+) -> bool:
+    """Whether a photo that had `MIN_OBSERVATIONS` before does not have them in the joined model."""
+
+    def seen(model: "pycolmap.Reconstruction") -> set[str]:
+        images = (model.image(i) for i in model.reg_image_ids())
+        return {image.name for image in images if image.num_points3D >= MIN_OBSERVATIONS}
+
+    return not seen(first) | seen(second) <= seen(both)
 
 
 def _agrees(done: Checked | None) -> bool:

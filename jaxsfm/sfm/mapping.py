@@ -94,7 +94,7 @@ def build_checked_models(
         rounds = Rounds(
             given, database, Path(scratch), config=config, options=options, on_image=on_image
         )
-        best, other = by_votes(rounds, view_graph=config.view_graph), None
+        best, other = rounds.joined(by_votes(rounds, view_graph=config.view_graph)), None
         checks, complete = _checks(best, following, rounds.fallen_apart(best)), False
         if green(checks):
             checks, complete = rounds.with_second_places(best, checks), True
@@ -103,7 +103,7 @@ def build_checked_models(
         if found and ordered(found, names) and not green(checks):
             logger.info("something speaks against the model; following the order of the names")
             rounds.doubt(checks)
-            other = by_order(rounds, found)
+            other = rounds.joined(by_order(rounds, found))
             if other.at_least_as_good_as(best):
                 best, other = other, best
                 checks, complete = _checks(best, following, rounds.fallen_apart(best)), False
@@ -112,10 +112,8 @@ def build_checked_models(
         red = best.contradicted() > 0
         if red:
             best, parts = rounds.told_apart(best)
-        joined = rounds.joined(best)
-        if red or joined is not best:
-            best, complete = joined, False
-            checks = _checks(best, following, parts or rounds.fallen_apart(best))
+            best = rounds.joined(best)
+            checks = _checks(best, following, _still_apart(parts, best))
         checks = _without_strays(best, checks, following)
         if not complete:
             checks = rounds.with_second_places(best, checks)
@@ -155,6 +153,18 @@ def _checks(
         return dataclasses.replace(each.check, apart=apart, told_apart=list(parts))
 
     return [each and with_neighbours(each) for each in made.checks]
+
+
+def _still_apart(parts: Sequence[list[str]], made: Round) -> list[list[str]]:
+    """The parts that were told apart, after models were joined: those whose photos are in one model
+    are one. There are none if all are one."""
+    models = [each.check.photos() for each in made.checks if each is not None]
+    joined: dict[int, list[str]] = {}
+    for k, part in enumerate(parts):
+        inside = [i for i, photos in enumerate(models) if photos.issuperset(part)]
+        joined.setdefault(inside[0] if inside else -1 - k, []).extend(part)
+    found = sorted((sorted(set(part)) for part in joined.values()), key=lambda p: (-len(p), p))
+    return found if len(found) > 1 else []
 
 
 def _without_strays(

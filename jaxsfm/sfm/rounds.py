@@ -43,12 +43,12 @@ class Rounds:
     ) -> None:
         self.given, self._database = given, database
         self._second_database = scratch / "second.db"
-        self._options = options
+        self._options, self._refined = options, config.refinement is not None
         self._mapper = MapperRuns(
             database,
             scratch,
             options,
-            share=config.refinement is not None,
+            share=self._refined,
             on_image=on_image,
         )
         self._checker = Checker(given, config, options.seed, self._mapper.with_all_points)
@@ -117,20 +117,27 @@ class Rounds:
         return whole, found.told_apart
 
     def joined(self, made: Round) -> Round:
-        """The models of a round, joined where they share photos; the same round if none are."""
-        if len(made.models) < 2:
+        """The models of a round, joined where they share photos; the same round if none are.
+
+        Where photos contradict each other, the models are told apart first.
+        """
+        if len(made.models) < 2 or made.contradicted():
             return made
         self.go_back_to(made)
-        joiner = Joiner(
-            self._checker,
-            self._options,
-            lambda model: with_all_points(model, self._database, self._options),
-        )
+        joiner = Joiner(self._checker, self._options, self._with_points_of_database)
         found = joiner.join(list(zip(made.models, made.checks, strict=True)))
         if len(found) == len(made.models):
             return made
         models, checks = map(list, zip(*found, strict=True))
         return dataclasses.replace(made, models=models, checks=checks)
+
+    def _with_points_of_database(
+        self, model: "pycolmap.Reconstruction"
+    ) -> "pycolmap.Reconstruction":
+        """A joined model with COLMAP's numbers of keypoints, unless it is refined afterwards."""
+        if self._refined:
+            return model
+        return with_all_points(model, self._database, self._options)
 
     def with_second_places(
         self, made: Round, checks: Sequence[ModelCheck | None]

@@ -156,3 +156,15 @@ def test_a_red_model_tells_of_second_places_too():
     check = dataclasses.replace(check_of("red"), other_places=places)
     labels = [line[:17].strip() for line in verdict_lines([model_verdict(check)])]
     assert labels == ["verdict", "contradiction", "second place", "would decide", "what next"]
+
+
+def test_a_model_without_the_sky_is_amber_at_best_and_its_masks_are_to_be_looked_at():
+    """What masked pixels show contradicts nothing, so nothing else may speak against the model."""
+    check = dataclasses.replace(check_of("green"), without_sky=True)
+    told = model_verdict(check)
+    assert told.colour == "amber" and not told.decisive
+    assert "before the sky was masked" in told.advice and "folder sky" in told.advice
+    red = dataclasses.replace(check_of("red"), without_sky=True)
+    assert red.verdict == "red" and "sky" not in model_verdict(red).advice
+    apart = dataclasses.replace(check, apart=[[NAMES[1], NAMES[2]]])
+    assert NAMES[2] in model_verdict(apart).advice

@@ -26,7 +26,7 @@ class Mapped:
     def green(self) -> bool:
         return self.looks_right
 
-    better_than = MappedRun.better_than
+    better_than, largest = MappedRun.better_than, MappedRun.largest
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxsfm.io.images import ImageFile
+from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.masks import MaskFile, read_mask
 from jaxsfm.runs import mapping_looks, sky_masks
 from jaxsfm.runs.mapping_looks import map_in_looks
+from jaxsfm.runs.run_stages import MappedRun
 from jaxsfm.runs.sky_masks import without_sky
 
 SIZE = (10, 10)
@@ -36,18 +37,34 @@ def skies(monkeypatch):
 
 def test_photos_that_show_the_sky_get_masks_of_the_rest(tmp_path, skies):
     skies({"sub/a.jpg": 40, "b.jpg": 6, "c.jpg": 5, "d.jpg": 95})
-    found = without_sky(map(image, ["sub/a.jpg", "b.jpg", "c.jpg", "d.jpg"]), tmp_path)
+    folder = tmp_path / "sky"
+    found = without_sky(map(image, ["sub/a.jpg", "b.jpg", "c.jpg", "d.jpg"]), folder)
     assert [*found] == ["sub/a.jpg", "b.jpg"]
     mask = found["sub/a.jpg"].mask
-    assert mask is not None and mask.path == tmp_path / "sub/a.jpg.png"
+    assert mask is not None and mask.path == folder / "sub/a.jpg.png"
     assert read_mask(mask).sum() == 60
     assert sorted(p.name for p in tmp_path.rglob("*.png")) == ["a.jpg.png", "b.jpg.png"]
 
 
 def test_masks_are_not_made_if_few_photos_show_the_sky(tmp_path, skies):
     skies({"a": 40, "b": 0, "c": 0})
-    assert without_sky(map(image, "abc"), tmp_path) == {} == without_sky([], tmp_path)
-    assert not [*tmp_path.iterdir()]
+    folder = tmp_path / "sky"
+    assert without_sky(map(image, "abc"), folder) == {} == without_sky([], folder)
+    assert not folder.exists()
+
+
+def test_a_photo_that_cannot_be_decoded_gets_no_mask_and_old_masks_go(tmp_path, monkeypatch):
+    def below_sky(image: ImageFile) -> np.ndarray:
+        if image.name == "c":
+            raise ImageError("c: damaged")
+        return np.arange(100).reshape(10, 10) >= 40
+
+    monkeypatch.setattr(sky_masks, "below_sky", below_sky)
+    folder = tmp_path / "sky"
+    folder.mkdir()
+    (folder / "old.png").touch()
+    assert [*without_sky(map(image, "abc"), folder)] == ["a", "b"]
+    assert sorted(path.name for path in folder.iterdir()) == ["a.png", "b.png"]
 
 
 def test_masks_of_the_user_are_believed(tmp_path, skies):
@@ -69,15 +86,23 @@ class Mapped:
 
     right: bool
     size: int
+    few_apart: bool = False
+    """Only photos that follow each other speak against it."""
+
+    @property
+    def photos(self) -> list[range]:
+        return [range(self.size)] if self.size else []
 
     def green(self) -> bool:
         return self.right
 
+    def doubted(self) -> bool:
+        return not (self.right or self.few_apart)
+
     def settled(self) -> bool:
         return True  # own cameras are not tried
 
-    def better_than(self, other: "Mapped") -> bool:
-        return (self.right, self.size) > (other.right, other.size)
+    better_than, largest = MappedRun.better_than, MappedRun.largest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,21 +129,26 @@ class Photos:
         return dataclasses.replace(self, images={**self.images, **changed}, look="-sky")
 
     def match(self, seconds: dict) -> tuple["Matched", dict]:
-        return Matched(self.look), {}
+        raise NotImplementedError
 
 
 @pytest.mark.parametrize(
     ("first", "second", "masked"),
     [
         (Mapped(False, 55), Mapped(False, 108), 2),
-        (Mapped(False, 20), Mapped(True, 12), 2),
+        (Mapped(False, 20), Mapped(True, 18), 2),
+        (Mapped(False, 20), Mapped(True, 17), 0),  # much fewer photos
+        (Mapped(False, 2), Mapped(True, 2), 0),  # too small to be checked
+        (Mapped(False, 0), Mapped(True, 0), 0),
         (Mapped(False, 55), Mapped(False, 55), 0),
-        (Mapped(True, 12), Mapped(True, 20), 0),  # not tried
+        (Mapped(True, 12), Mapped(True, 20), None),
+        (Mapped(False, 12, few_apart=True), Mapped(True, 20), None),
     ],
 )
 def test_the_sky_is_masked_if_this_helps_where_something_speaks_against_the_model(
     monkeypatch, tmp_path, skies, first, second, masked
 ):
+    """None stands for not tried."""
     skies({"a": 40, "b": 40})
     monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
     images = {name: image(name) for name in "ab"}
@@ -126,8 +156,13 @@ def test_the_sky_is_masked_if_this_helps_where_something_speaks_against_the_mode
     stages: Any = Stages(
         {"": first, "-sky": second}, [*images.values()], SimpleNamespace(path=tmp_path)
     )
+    tried: list[str] = []
+    monkeypatch.setattr(
+        Photos, "match", lambda self, _: (tried.append(self.look) or Matched(self.look), {})
+    )
     matched: Any = Matched("")
     found = map_in_looks(photos, matched, stages)
-    assert found.masked_sky == masked and (tmp_path / "sky").exists() == (not first.right)
+    assert found.masked_sky == (masked or 0) and (tmp_path / "sky").exists() == bool(masked)
+    assert tried == (["-sky"] if masked is not None else [])
     assert found.mapped is (second if masked else first)
     assert found.matched == ("-sky" if masked else "")

@@ -120,3 +120,21 @@ def test_points_fall_together_within_twelve_pixels_of_the_photos_at_working_size
     options = MapOptions(refine_intrinsics=False, threads=1, scale=1.5)
     ((model, _),) = Joiner(FakeChecker(), options, lambda model: model).join(given)
     assert registered(model) == {*NAMES} and found == [18.0]
+
+
+@pytest.mark.parametrize(("left", "count"), [(30, 1), (29, 2)])
+def test_no_photo_loses_its_observations_in_a_join(rendered, monkeypatch, left, count):
+    """A photo with fewer than 30 has no sure place, and each had more."""
+
+    def adjusted(model, **options):
+        both = original(model, **options)
+        image = next(i for i in both.images.values() if i.name == NAMES[4])
+        for k, point in enumerate(list(image.get_observation_points2D())):
+            if k >= left and both.exists_point3D(point.point3D_id):
+                both.delete_point3D(point.point3D_id)
+        return both
+
+    original = module.adjusted
+    monkeypatch.setattr(module, "adjusted", adjusted)
+    given = [part(rendered, [0, 1, 2, 3]), part(rendered, [1, 2, 3, 4], ELSEWHERE)]
+    assert len(joined(given, FakeChecker())) == count

@@ -25,6 +25,7 @@ from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.hypotheses import MAX_ROUNDS
 from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
+from jaxsfm.sfm.round import NOTHING_REFUTED, Round
 from jaxsfm.sfm.told_apart import Parts
 
 A, B, C, D, E = PAIRS = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d"), ("d", "e")]
@@ -815,6 +816,7 @@ def test_models_of_the_result_that_share_photos_are_joined(rounds, monkeypatch, 
     found = rounds(lambda pairs: next(tries), models=2, joiner=Joiner, searched_too=places)
     assert found.models == [whole]
     (told,) = found.figures.checks
+    # The joined model has the photo `a` alone, so it does not hold a whole part.
     assert told is not None and told.told_apart == (parts if red else [])
     assert found.searched[-1:] == ([] if red else [whole])
 
@@ -900,3 +902,21 @@ def test_strong_pairs_need_a_right_rotation_also_beside_second_geometries(rounds
         seconds={E: view()},
     )
     assert found.rounds == [set(turns), turns.keys() - {strong}]
+
+
+@pytest.mark.parametrize(
+    ("models", "left"),
+    [
+        (["ab", "cd", "e"], [["a", "b"], ["c", "d"], ["e"]]),
+        (["abcd", "e"], [["a", "b", "c", "d"], ["e"]]),  # joined by photos that both share
+        (["abc", "cd"], [["a", "b"], ["c", "d"], ["e"]]),
+        (["abcde"], []),
+    ],
+)
+def test_parts_that_were_joined_are_one_part(models, left):
+    checks = [
+        outcome()._replace(check=dataclasses.replace(outcome().check, groups=[[*photos]]))
+        for photos in models
+    ]
+    made = Round("pairs", [], {}, [*checks, None], NOTHING_REFUTED)
+    assert mapping._still_apart([["a", "b"], ["c", "d"], ["e"]], made) == left

@@ -93,15 +93,19 @@ class ModelCheck:
     told_apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Groups of photos, the largest first, that were in one model with others which they
     contradict, or in a model of an earlier round that something spoke against. Each group of three
-    photos or more is a model of its own now. They are the same for all models of a run: where there
-    are any, the scene repeats itself, also elsewhere."""
+    photos or more is in a model without the others now. They are the same for all models of a run:
+    where there are any, the scene repeats itself, also elsewhere."""
+
+    without_sky: bool = False
+    """Whether the sky was masked because something spoke against a model with it. What masked
+    pixels show contradicts nothing, so this check is weaker than the one before."""
 
     @property
     def verdict(self) -> VerdictColour:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        return "amber" if self.apart or self.doubted() else "green"
+        return "amber" if self.apart or self.without_sky or self.doubted() else "green"
 
     def doubted(self) -> bool:
         """Whether more speaks against the model than photos that follow each other (`apart`)."""
