@@ -130,6 +130,21 @@ def test_after_a_draft_no_connected_image_may_be_missing(monkeypatch, tmp_path):
     assert len(build_models(tmp_path / "d.db", chain, draft)[1]) == 1 == len(calls)
 
 
+@pytest.mark.parametrize("draft", [True, False])
+@pytest.mark.parametrize(
+    ("images", "registered", "tried"), [(41, 21, False), (41, 20, True), (40, 21, True)]
+)
+def test_of_many_images_half_may_be_missing(
+    monkeypatch, tmp_path, draft, images, registered, tried
+):
+    names = "".join(chr(200 + k) for k in range(images))
+    chain = {pair: two_view() for pair in zip(names[:-1], names[1:], strict=True)}
+    calls = runs(monkeypatch, [[model(names[:registered])]] * 5)
+    options = dataclasses.replace(ONE, draft=draft)
+    build_models(tmp_path / "d.db", chain, options)
+    assert (len(calls) > 1) == tried
+
+
 def test_a_draft_is_adjusted_less_often_and_takes_no_image_for_a_single_pair():
     colmap, draft = (
         mapper.incremental_options(dataclasses.replace(ONE, draft=draft)) for draft in (False, True)
