@@ -3,6 +3,7 @@
 import dataclasses
 
 from jaxsfm.report.run_report import RunReport
+from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import (
     Alternative,
     Contradiction,
@@ -36,3 +37,13 @@ def with_verdicts(report: RunReport, *colours: VerdictColour | None) -> RunRepor
         models=report.models[:1] * len(colours),
         checks=[colour and check_of(colour) for colour in colours],
     )
+
+
+def outcome(*parts: list[str]) -> Checked:
+    """A check of a model of these parts, the first of which contradicts all others."""
+    against = [
+        Contradiction(images=parts[0], others=part, tested=100, contradicted=50)
+        for part in parts[1:]
+    ]
+    check = ModelCheck(groups=[*parts], contradictions=against, other_places=[])
+    return Checked(check, {}, {}, set(), set(), [*parts])

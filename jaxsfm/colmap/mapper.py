@@ -217,10 +217,9 @@ def with_left_out_images(
     Images are connected if verified pairs join them to the best model. If a draft leaves out one of
     them, the incremental mapper is run with all that it does otherwise. After that, at most
     `MISSING` of them may be left out; of more than `MANY` images, `MISSING_OF_MANY` in either case.
-    Then it is started from other initial pairs
-    (`initial_pairs`, each image once, with lower demands). If there is still no model, the global
-    mapper is tried. An attempt that registers more images replaces the former ones, except for
-    models of other images.
+    Then it is started from other initial pairs (`initial_pairs`, each image once, with lower
+    demands). If there is still no model, the global mapper is tried. An attempt that registers more
+    images replaces the former ones, except for models of other images.
 
     Returns:
       `first` itself if nothing was tried.

@@ -162,6 +162,13 @@ class Model:
         return np.where(np.isfinite(errors), errors, np.inf)
 
 
+def stored_sizes(model: pycolmap.Reconstruction) -> Sizes:
+    """The sizes of a model's photos as they are stored, for working in original pixels."""
+    images = (model.image(image_id) for image_id in model.reg_image_ids())
+    cameras = {image.name: model.camera(image.camera_id) for image in images}
+    return {name: ((c.width, c.height), (1.0, 1.0)) for name, c in cameras.items()}
+
+
 def point_colours(reconstruction: pycolmap.Reconstruction) -> np.ndarray:
     """uint8 (n, 3): RGB of the points, in the order of `Model.from_colmap`."""
     ids = sorted(reconstruction.point3D_ids())

@@ -13,7 +13,7 @@ import pycolmap
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.colmap.view import View
 from jaxsfm.io.orientation import QUARTERS, UPRIGHT, stored_axes, upright_size
 
@@ -37,12 +37,7 @@ def adjust_as_one(
 
     Raises UserError if the camera's model is one that cannot be turned.
     """
-    sizes = {}
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        camera = model.camera(image.camera_id)
-        sizes[image.name] = (camera.width, camera.height), (1.0, 1.0)
-    stored = Model.from_colmap(model, sizes)
+    stored = Model.from_colmap(model, stored_sizes(model))
     start = max(stored.views, key=lambda view: (codes[view.name] == UPRIGHT, -view.image_id))
     shared = _turned(start.camera, _inverse(codes[start.name]))
     views = [_in_frame(v, shared, _inverse(codes[v.name])) for v in stored.views]

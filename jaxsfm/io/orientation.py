@@ -15,6 +15,8 @@ UPRIGHT = 1
 CODES = range(1, 9)
 QUARTERS = (1, 6, 3, 8)
 """The code of a photo that is seen upright after 0, 1, 2, 3 quarter turns clockwise."""
+_UNDONE_BY = {6: 8, 8: 6}
+"""Quarter turns are undone by each other; half turns and mirrors undo themselves."""
 _TRANSPOSED, _MIRRORED_X, _MIRRORED_Y = {5, 6, 7, 8}, {2, 3, 7, 8}, {3, 4, 6, 7}
 
 
@@ -37,12 +39,9 @@ def upright(stored: np.ndarray, orientation: int) -> np.ndarray:
     return stored.swapaxes(0, 1) if orientation in _TRANSPOSED else stored
 
 
-def as_stored(upright: np.ndarray, orientation: int) -> np.ndarray:
-    """Turn the pixels (h, w, ...) of an upright photo to how they are stored: undoes `upright`."""
-    stored = upright.swapaxes(0, 1) if orientation in _TRANSPOSED else upright
-    if orientation in _MIRRORED_Y:
-        stored = stored[::-1]
-    return stored[:, ::-1] if orientation in _MIRRORED_X else stored
+def as_stored(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Undo `upright`: turn the pixels (h, w, ...) of an upright photo to how they are stored."""
+    return upright(pixels, _UNDONE_BY.get(orientation, orientation))
 
 
 def to_stored(size: tuple[int, int], orientation: int) -> np.ndarray:

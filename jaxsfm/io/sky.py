@@ -2,7 +2,7 @@
 
 The sky has nothing to match, but the outline of a building before it looks the same from several
 sides. The rule is simple and may take a white wall or a ceiling for the sky, so nothing is masked
-by it unless the photos contradict each other otherwise (`jaxsfm.runs.sky_masks`).
+by it unless something speaks against the model (`jaxsfm.runs.sky_masks`).
 """
 
 import cv2
@@ -38,8 +38,8 @@ def sky(rgb: np.ndarray) -> np.ndarray:
     slopes = (cv2.Sobel(gray, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
     flat = cv2.blur(np.hypot(*slopes), (WINDOW, WINDOW)) < FLAT
     coloured = (gray > BRIGHT) | ((blue > red + BLUER) & (blue > BLUE))
-    pieces = cv2.connectedComponentsWithStats((flat & coloured).astype(np.uint8))[1:3]
-    labels, areas = pieces[0], pieces[1][:, cv2.CC_STAT_AREA]
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((flat & coloured).astype(np.uint8))
+    areas = stats[:, cv2.CC_STAT_AREA]
     rows = max(1, round(TOP * len(rgb)))
     high = [k for k in np.unique(labels[:rows]) if k and areas[k] >= LEAST * gray.size]
     found = np.isin(labels, high).astype(np.uint8)

@@ -99,12 +99,13 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
         if masked is not None:
             photos, matched, stages, mapped = masked
             masked_sky = sum(image.mask is not None for image in stages.images)
+    found = MappedLooks(matched, mapped, None, photos.identity, own, masked_sky)
     if matched.described == photos.job.config:
-        return MappedLooks(matched, mapped, None, photos.identity, own, masked_sky)
+        return found
     looks = UsedLooks(first_px=matched.described.max_size)
     again = mapped.unsettled(matched.counts)
     if again is None:
-        return MappedLooks(matched, mapped, looks, photos.identity, own, masked_sky)
+        return found._replace(looks=looks)
     logger.info("%s", again.in_words())
     matched_again = match_again(photos.job, photos.images, matched, again, seconds)
     mapped_again = dataclasses.replace(stages, look=stages.look + "-again").map(matched_again)
@@ -115,9 +116,9 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
         whole=again.whole,
         in_vain=mapped.better_than(mapped_again),
     )
-    if not looks.in_vain:
-        matched, mapped = matched_again, mapped_again
-    return MappedLooks(matched, mapped, looks, photos.identity, own, masked_sky)
+    if looks.in_vain:
+        return found._replace(looks=looks)
+    return found._replace(matched=matched_again, mapped=mapped_again, looks=looks)
 
 
 def _changed(

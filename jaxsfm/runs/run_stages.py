@@ -154,7 +154,7 @@ class RunStages:
 
             mapped = MappedRun(given, map_matches(given, cache, on_image), cache)
             # The global mapper does not report images before it ends.
-            bar.update(max(map(len, mapped.photos), default=0) - bar.n)
+            bar.update(mapped.largest() - bar.n)
         return mapped
 
     def refine(self, mapped: MappedRun, target: Path) -> tuple[Reconstructed, Georeference | None]:

@@ -1,4 +1,4 @@
-"""Masks of the sky, for a run whose photos contradict each other.
+"""Masks of the sky, for a run in which something speaks against the model.
 
 Outlines before the sky look alike from several sides of a building. On *statue*, 135 photos of four
 sides, the largest model has 55 photos, of which 50 are right. With the sky masked it has 95, of

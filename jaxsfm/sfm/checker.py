@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("jaxsfm")
 
+CheckedModel = tuple["pycolmap.Reconstruction", Checked | None]
+"""A model and its check; None where it was not checked."""
+
 
 class VerifiedPairs(NamedTuple):
     """What the mapper starts from."""

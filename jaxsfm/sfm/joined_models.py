@@ -13,16 +13,14 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.mapper import MapOptions, registered
-from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.sfm.check.check_model import Checked
-from jaxsfm.sfm.checker import Checker
-from jaxsfm.sfm.model_join import ERROR_PX, adjusted, find_join, joined, sizes
+from jaxsfm.sfm.checker import CheckedModel, Checker
+from jaxsfm.sfm.model_join import ERROR_PX, adjusted, find_join, joined
 
 if TYPE_CHECKING:
     import pycolmap
 
-CheckedModel = tuple["pycolmap.Reconstruction", Checked | None]
-"""A model and its check; None where it was not checked."""
 MIN_SHARED = 3
 """The least number of photos that two models must share. Two share a pair, which may be false in
 both models."""
@@ -79,7 +77,7 @@ class Joiner(NamedTuple):
         self, first: "pycolmap.Reconstruction", second: "pycolmap.Reconstruction"
     ) -> CheckedModel | None:
         """The two models as one; None if they do not agree."""
-        a, b = (Model.from_colmap(each, sizes(each)) for each in (first, second))
+        a, b = (Model.from_colmap(each, stored_sizes(each)) for each in (first, second))
         join = find_join(a, b, error_px=JOIN_ERROR_PX * self.options.scale)
         if join.agreed < join.needed:
             return None

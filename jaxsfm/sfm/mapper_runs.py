@@ -81,6 +81,15 @@ class MapperRuns:
         self.attempts += more.attempts[len(made.attempts) :]
         return more
 
+    def as_mapped(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+        """A model that was joined from others, as the mapper would have left it.
+
+        If the mapper is given all matches, their points are triangulated, and the model has COLMAP's
+        numbers of keypoints. If it is given a share, the model stays as it is: the points of all
+        matches return later.
+        """
+        return model if self._share else with_all_points(model, self._database, self._options)
+
     def with_all_points(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
         """A model with the points of all matches of the pairs that are in the database now.
 

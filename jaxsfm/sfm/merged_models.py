@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxsfm.colmap.join_cameras import coloured, joined_cameras
-from jaxsfm.colmap.model import Model, point_colours
+from jaxsfm.colmap.model import Model, point_colours, stored_sizes
 from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import named
 from jaxsfm.sfm.common_frame import CommonFrame, moved_points
 from jaxsfm.sfm.evaluation import pose_error
-from jaxsfm.sfm.model_join import ERROR_PX, adjusted, find_join, joined, sizes
+from jaxsfm.sfm.model_join import ERROR_PX, adjusted, find_join, joined
 from jaxsfm.sfm.old_frame import move_back
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def merge_models(
     Raises:
       UserError: the models share too few photos or points, or too few of these fall together.
     """
-    a, b = (Model.from_colmap(each, sizes(each)) for each in (first, second))
+    a, b = (Model.from_colmap(each, stored_sizes(each)) for each in (first, second))
     names = {view.name for view in a.views}
     shared = names & {view.name for view in b.views}
     if len(shared) < MIN_SHARED:

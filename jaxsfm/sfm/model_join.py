@@ -50,16 +50,6 @@ class Join(NamedTuple):
         return max(MIN_COMMON, round(MIN_SHARE * len(self.points.first)))
 
 
-def sizes(model: "pycolmap.Reconstruction") -> dict:
-    """The sizes of a model's photos, as they are stored."""
-    found = {}
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        camera = model.camera(image.camera_id)
-        found[image.name] = (camera.width, camera.height), (1.0, 1.0)
-    return found
-
-
 def find_join(first: Model, second: Model, *, error_px: float) -> Join:
     """What two models have in common.
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
 from jaxsfm.colmap.mapper import Attempt, MapOptions
-from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.two_views import TwoView, read_two_views, verify
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair
@@ -43,12 +42,12 @@ class Rounds:
     ) -> None:
         self.given, self._database = given, database
         self._second_database = scratch / "second.db"
-        self._options, self._refined = options, config.refinement is not None
+        self._options = options
         self._mapper = MapperRuns(
             database,
             scratch,
             options,
-            share=self._refined,
+            share=config.refinement is not None,
             on_image=on_image,
         )
         self._checker = Checker(given, config, options.seed, self._mapper.with_all_points)
@@ -124,20 +123,12 @@ class Rounds:
         if len(made.models) < 2 or made.contradicted():
             return made
         self.go_back_to(made)
-        joiner = Joiner(self._checker, self._options, self._with_points_of_database)
+        joiner = Joiner(self._checker, self._options, self._mapper.as_mapped)
         found = joiner.join(list(zip(made.models, made.checks, strict=True)))
         if len(found) == len(made.models):
             return made
         models, checks = map(list, zip(*found, strict=True))
         return dataclasses.replace(made, models=models, checks=checks)
-
-    def _with_points_of_database(
-        self, model: "pycolmap.Reconstruction"
-    ) -> "pycolmap.Reconstruction":
-        """A joined model with COLMAP's numbers of keypoints, unless it is refined afterwards."""
-        if self._refined:
-            return model
-        return with_all_points(model, self._database, self._options)
 
     def with_second_places(
         self, made: Round, checks: Sequence[ModelCheck | None]

@@ -7,13 +7,11 @@ from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.mapper import MapOptions, part_of
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
-from jaxsfm.sfm.checker import Checker
+from jaxsfm.sfm.checker import CheckedModel, Checker
 
 if TYPE_CHECKING:
     import pycolmap
 
-CheckedModel = tuple["pycolmap.Reconstruction", Checked | None]
-"""A model and its check; None where it was not checked."""
 LOSS_PX = 2.0
 """Scale of the loss of the bundle adjustment, working pixels. Keypoints that are not refined are
 one or two pixels off, and false matches of the former model much further."""

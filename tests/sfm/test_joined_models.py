@@ -4,11 +4,11 @@ import numpy as np
 import pycolmap
 import pytest
 from room_scene import errors, noisy_model
+from verdicts import outcome
 
 from jaxsfm.colmap.mapper import MapOptions, part_of, registered
 from jaxsfm.sfm import joined_models as module
 from jaxsfm.sfm.check.check_model import Checked
-from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
 from jaxsfm.sfm.joined_models import Joiner
 
 NAMES = [f"{k}.png" for k in range(5)]
@@ -16,16 +16,6 @@ OPTIONS = MapOptions(refine_intrinsics=False, threads=1)
 ELSEWHERE = pycolmap.Sim3d(
     2.5, pycolmap.Rotation3d(np.array([0.1, -0.7, 0.2, 0.678])), np.array([3.0, -1.0, 8.0])
 )
-
-
-def outcome(*groups: list[str]) -> Checked:
-    """A check of these groups, in which the first one contradicts the others."""
-    against = [
-        Contradiction(images=groups[0], others=other, tested=100, contradicted=50)
-        for other in groups[1:]
-    ]
-    check = ModelCheck(groups=[*groups], contradictions=against, other_places=[])
-    return Checked(check, {}, {}, set(), set(), [*groups])
 
 
 class FakeChecker:

@@ -63,7 +63,7 @@ class FakeJoiner(NamedTuple):
 
     checker: object
     options: MapOptions
-    triangulated: Callable
+    finished: Callable
 
     def join(self, models: list) -> list:
         return models

@@ -4,26 +4,16 @@ import numpy as np
 import pycolmap
 import pytest
 from room_scene import arrays, errors, noisy_model
+from verdicts import outcome
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.sfm import told_apart as module
 from jaxsfm.sfm.check.check_model import Checked
-from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
 from jaxsfm.sfm.told_apart import told_apart
 
 NAMES = [f"{k}.png" for k in range(5)]
 OPTIONS = MapOptions(refine_intrinsics=False, threads=1)
-
-
-def outcome(*parts: list[str]) -> Checked:
-    """A check in which the first part contradicts all others."""
-    against = [
-        Contradiction(images=parts[0], others=part, tested=100, contradicted=50)
-        for part in parts[1:]
-    ]
-    check = ModelCheck(groups=[*parts], contradictions=against, other_places=[])
-    return Checked(check, {}, {}, set(), set(), [*parts])
 
 
 class FakeChecker:

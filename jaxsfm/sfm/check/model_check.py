@@ -95,7 +95,6 @@ class ModelCheck:
     contradict, or in a model of an earlier round that something spoke against. Each group of three
     photos or more is in a model without the others now. They are the same for all models of a run:
     where there are any, the scene repeats itself, also elsewhere."""
-
     without_sky: bool = False
     """Whether the sky was masked because something spoke against a model with it. What masked
     pixels show contradicts nothing, so this check is weaker than the one before."""
@@ -110,7 +109,7 @@ class ModelCheck:
     def doubted(self) -> bool:
         """Whether more speaks against the model than photos that follow each other (`apart`)."""
         doubts = self.contradictions, self.other_places, self.alternative, self.told_apart
-        return any(map(bool, doubts))
+        return any(doubts)
 
     def photos(self) -> set[str]:
         """The photos of the model."""
