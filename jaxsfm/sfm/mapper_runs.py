@@ -84,9 +84,9 @@ class MapperRuns:
     def as_mapped(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
         """A model that was joined from others, as the mapper would have left it.
 
-        If the mapper is given all matches, their points are triangulated, and the model has COLMAP's
-        numbers of keypoints. If it is given a share, the model stays as it is: the points of all
-        matches return later.
+        If the mapper is given all matches, their points are triangulated, and the model has
+        COLMAP's numbers of keypoints. If it is given a share, the model stays as it is: the points
+        of all matches return later.
         """
         return model if self._share else with_all_points(model, self._database, self._options)
 
