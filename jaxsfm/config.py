@@ -31,6 +31,16 @@ EXTRACTED_BY = (
 )
 """Fields of `Config` that the features of an image depend on."""
 
+LATER_SETTINGS = (
+    "first_look",
+    "aligned_octaves",
+    "closer_looks",
+    "view_graph",
+    "checked",
+    "refinement",
+)
+"""Fields of `Config` that the matches of a run do not depend on."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Refinement:
@@ -135,6 +145,9 @@ class Config:
     """Number of sizes (working size, half of it, ...) at which the matches of a single pair are
     aligned to a fraction of a pixel (`jaxsfm.sfm.refine.pair_alignment`). With 0 they stay as they
     were verified. In models the tracks are aligned instead."""
+    closer_looks: int = 0
+    """How often the photos of a single pair are looked at as seen from one place, at most, if the
+    first look leaves the pair weak (`jaxsfm.sfm.two_photos`). With 0 there is one look only."""
     view_graph: bool = False
     """Whether only pairs that the view graph trusts are given to the mapper
     (`jaxsfm.sfm.view_graph`)."""
@@ -156,7 +169,7 @@ class Config:
     def matching(self) -> dict[str, object]:
         """The settings that matches depend on, as plain data."""
         parts = dataclasses.asdict(self)
-        for later in ("first_look", "aligned_octaves", "view_graph", "checked", "refinement"):
+        for later in LATER_SETTINGS:
             del parts[later]
         return parts
 
@@ -176,6 +189,8 @@ class Config:
             )
         if not self.enlarge >= 1:
             raise ValueError(f"enlarge must be at least 1; got {self.enlarge}")
+        if self.closer_looks < 0:
+            raise ValueError(f"closer_looks must be at least 0; got {self.closer_looks}")
         for name, least in (("octaves", 1), ("aligned_octaves", 0)):
             count = getattr(self, name)
             if not least <= count <= MAX_OCTAVES:
@@ -223,6 +238,7 @@ _DEFAULT = Config(
     centred=True,
     pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
     aligned_octaves=4,
+    closer_looks=2,
     view_graph=True,
     checked=True,
     refinement=Refinement(),

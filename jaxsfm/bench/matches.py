@@ -20,8 +20,7 @@ from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.extraction import image_features
-from jaxsfm.matching.pair_matching import match_features
-from jaxsfm.sfm.refine.pair_alignment import align
+from jaxsfm.sfm.two_photos.matched import match_photos
 
 FEATURES = 8
 """How many images' features are held: those of two images for each of four methods."""
@@ -35,6 +34,9 @@ class Matches(NamedTuple):
     xy1: np.ndarray
     seconds: float
     """Time of extracting both images and of matching; the first image of a size also compiles."""
+    evidence: float | None = None
+    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos`); None if the method does
+    not say it."""
 
 
 class Matcher:
@@ -71,10 +73,11 @@ class Matcher:
         results = []
         for seed in seeds:
             start = time.monotonic()
-            found = match_features(features0, features1, config=config, seed=seed)
-            xy1, _ = align(found, image0, image1, config=config)
+            weights = self._weights_of(config)
+            found = match_photos(weights, features0, features1, config=config, seed=seed)
             taken = seconds0 + seconds1 + time.monotonic() - start
-            results.append(Matches(found.keypoints0.astype(np.float64), xy1, taken))
+            xy0, xy1 = found.result.keypoints0.astype(np.float64), found.aligned.keypoints1
+            results.append(Matches(xy0, xy1, taken, found.evidence))
         return results
 
     def _naive(self, image0: ImageFile, image1: ImageFile, config: Config, seed: int) -> Matches:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsfm.core.grid import cell_rows_cols
+from jaxsfm.core.grid import FINE_STRIDE, cell_rows_cols, cell_to_px
 from jaxsfm.core.numerics import at_least_float32, inverse_norm
 from jaxsfm.core.pair_shape import Products
 from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart
@@ -117,4 +117,48 @@ def join_octaves(features: DenseFeatures, *, products: Products = "float32") -> 
         coarse_grid=features.coarse_grid,
         fine_grid=features.fine_grid,
         coarse_parts=tuple(part._replace(flat=part.flat.astype(products)) for part in parts),
+    )
+
+
+def smaller(
+    features: DenseFeatures, octave: int, *, fine_stride: int = FINE_STRIDE
+) -> DenseFeatures:
+    """The features of an image at 1 / 2^`octave` of its size, without describing it again.
+
+    Octave `octave` of the image is the first octave of the smaller one. The octaves that then lack at
+    the end are zero, so they add nothing to a product, and the arrays keep their number. Only the
+    keypoints of the first octave are relocalized, so those of the smaller image lie at the centres of
+    its fine cells. They are in its pixels: pixel (u, v) of a halved image lies at (2 u + 0.5,
+    2 v + 0.5) of the image.
+
+    Args:
+      fine_stride: stride of the fine maps, pixels.
+
+    Raises:
+      ValueError: the image has no such octave.
+    """
+    count = len(features.coarse)
+    if not 0 <= octave < count:
+        raise ValueError(f"octave must lie in 0..{count - 1}; got {octave}")
+    if octave == 0:
+        return features
+
+    def moved(octaves: tuple[Array, ...]) -> tuple[Array, ...]:
+        left = octaves[octave:]
+        rows, channels = left[0].shape
+        lacking = (
+            jnp.zeros((octave_capacity(rows, k), channels), left[0].dtype)
+            for k in range(len(left), count)
+        )
+        return (*left, *lacking)
+
+    coarse_grid, fine_grid = features.coarse_grid >> octave, features.fine_grid >> octave
+    row, col = cell_rows_cols(features.fine[octave].shape[0], jnp.maximum(fine_grid[1], 1))
+    centres = cell_to_px(jnp.stack([col, row], axis=-1).astype(jnp.float32), stride=fine_stride)
+    return DenseFeatures(
+        coarse=moved(features.coarse),
+        fine=moved(features.fine),
+        keypoints=jnp.where((row < fine_grid[0])[:, None], centres, 0.0),
+        coarse_grid=coarse_grid,
+        fine_grid=fine_grid,
     )

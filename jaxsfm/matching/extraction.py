@@ -95,6 +95,24 @@ def image_features(weights: Weights, image: ImageFile, *, config: Config) -> Ima
     return found
 
 
+def describe_pixels(
+    weights: Weights, image: ImageFile, working: WorkingImage, *, config: Config
+) -> ImageFeatures:
+    """The features of pixels that have been read (`jaxsfm.io.photo_views`).
+
+    Args:
+      image: the photo that the pixels are from. Coordinates are mapped to the pixels of a photo of
+        its size and orientation, by the scale of `working`.
+    """
+    announce_compilation()
+    mesh = select_devices(ONE_AT_A_TIME)
+    ((_, found),) = _results(
+        (_Batch([(image, working)], 1), _start(weights, [working], config, mesh, 1))
+    )
+    assert isinstance(found, ImageFeatures)
+    return found
+
+
 def extract_images(
     weights: Weights,
     images: Iterable[ImageFile],

@@ -1,0 +1,89 @@
+"""How strongly matches speak for it that two photos show the same.
+
+The number of inliers does not say it: a plane of thirty inliers can be true or chance. It depends on
+how many matches were tried, how large the photos are and how near a match must be. The evidence of a
+plane is -log10 of the expected number of such planes among matches that are placed at random. So it
+can be compared between looks at different sizes of the photos.
+
+Source: Moisan and Stival 2004, "A probabilistic criterion to detect rigid point matches between two
+images and estimate the fundamental matrix", equation 12, for homographies.
+"""
+
+import math
+
+import numpy as np
+from scipy.special import gammaln
+
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.pairs import PairResult
+
+MINIMAL = 4
+"""The number of matches that determine a homography."""
+MATCHES_OF_A_CELL = 4
+"""About so many fine matches come from one coarse match and agree with each other by construction.
+So they are counted once: by the coarse cells that they lie in."""
+BY_CHANCE = 15.0
+"""Planes with less evidence than this do not count. Matches are not placed at random: repeated
+structure and neighbouring cells give false planes an evidence of up to 35 (photos of different
+places, docs/decisions/hard-pairs.md)."""
+
+
+def log10_choose(n: float, k: float) -> float:
+    """log10 of the number of ways to choose k of n; n and k need not be whole."""
+    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)) / math.log(10)
+
+
+def evidence_of_plane(members: float, candidates: float, chance: float) -> float:
+    """-log10 of the expected number of planes with as many members among random matches.
+
+    Args:
+      members: the number of matches of the plane, those that determine it included.
+      candidates: the number of all matches, at least `members`.
+      chance: the probability that a random match lies near where a plane puts it, in (0, 1).
+    """
+    if members <= MINIMAL:
+        return -math.inf
+    tests = math.log10(candidates) + log10_choose(candidates, members)
+    tests += log10_choose(members, MINIMAL)
+    return -(tests + (members - MINIMAL) * math.log10(chance))
+
+
+def _coarse_cells(cells: np.ndarray, columns: int) -> int:
+    """The number of coarse cells that fine cells lie in."""
+    rows, cols = cells // columns // 2, cells % columns // 2
+    return len(np.unique(rows * columns + cols))
+
+
+def plane_evidence(
+    result: PairResult,
+    features0: ImageFeatures,
+    features1: ImageFeatures,
+    *,
+    threshold_px: float,
+    fine_stride: int,
+) -> np.ndarray:
+    """The evidence of each plane of a pair, float64 (p,).
+
+    Args:
+      features0, features1: the features that were matched.
+      threshold_px: the largest error of an inlier, working pixels of the second photo.
+      fine_stride: the side of a fine cell, working pixels.
+    """
+    rows1, columns1 = (int(n) for n in features1.dense.fine_grid)
+    columns0 = int(features0.dense.fine_grid[1])
+    area = rows1 * columns1 * fine_stride**2
+    chance = min(math.pi * threshold_px**2 / area, 0.5)
+    candidates = max(result.num_tentative / MATCHES_OF_A_CELL, 10.0)
+    evidence = []
+    for plane in range(len(result.homographies)):
+        cells = result.cells[result.plane == plane]
+        members = min(
+            _coarse_cells(cells[:, 0], columns0), _coarse_cells(cells[:, 1], columns1), candidates
+        )
+        evidence.append(evidence_of_plane(members, candidates, chance))
+    return np.asarray(evidence, np.float64)
+
+
+def total(evidence: np.ndarray) -> float:
+    """The evidence of a pair: what its planes have beyond chance, added up."""
+    return float(np.maximum(evidence - BY_CHANCE, 0.0).sum())

@@ -1,0 +1,93 @@
+"""One look at two photos: their matches, how strong they are, and how the photos were seen."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import PairResult
+from jaxsfm.io.photo_views import PhotoView
+from jaxsfm.matching.pair_matching import match_features
+from jaxsfm.sfm.two_photos.common_view import Located, mapped, upright
+from jaxsfm.sfm.two_photos.evidence import BY_CHANCE, plane_evidence, total
+
+Views = tuple[PhotoView | None, PhotoView | None]
+"""How both photos were seen; None stands for the whole photo."""
+WHOLE: Views = (None, None)
+
+
+class Look(NamedTuple):
+    """The outcome of matching two photos once."""
+
+    result: PairResult
+    """In pixels of the stored photos."""
+    plane_evidence: np.ndarray
+    """float64 (p,): the evidence of each plane (`jaxsfm.sfm.two_photos.evidence`)."""
+    views: Views = WHOLE
+
+    @property
+    def evidence(self) -> float:
+        """The evidence of all planes."""
+        return total(self.plane_evidence)
+
+    def located(self, image0: ImageFile, image1: ImageFile) -> Located:
+        """The matches of the planes that are stronger than chance, or else of the strongest one."""
+        good = np.flatnonzero(self.plane_evidence > BY_CHANCE)
+        if not len(good) and len(self.plane_evidence):
+            good = np.asarray([self.plane_evidence.argmax()])
+        keep = np.isin(self.result.plane, good)
+        return Located(
+            upright(self.result.keypoints0[keep], image0),
+            upright(self.result.keypoints1[keep], image1),
+        )
+
+
+def moved(result: PairResult, matrix0: np.ndarray, matrix1: np.ndarray) -> PairResult:
+    """Matches whose coordinates are mapped, in each photo by an affine matrix (3, 3)."""
+    h = matrix1 @ result.homographies @ np.linalg.inv(matrix0)
+    return dataclasses.replace(
+        result,
+        keypoints0=mapped(matrix0, result.keypoints0).astype(np.float32),
+        keypoints1=mapped(matrix1, result.keypoints1).astype(np.float32),
+        homographies=h / np.linalg.norm(h, axis=(1, 2), keepdims=True),
+    )
+
+
+def to_stored(views: Views, images: tuple[ImageFile, ImageFile]) -> tuple[np.ndarray, np.ndarray]:
+    """For both photos the matrix (3, 3) from the pixels of the view to those of the stored photo."""
+    first, second = (
+        np.eye(3) if view is None else np.linalg.inv(view.from_stored(image))
+        for view, image in zip(views, images, strict=True)
+    )
+    return first, second
+
+
+def look(
+    features0: ImageFeatures,
+    features1: ImageFeatures,
+    images: tuple[ImageFile, ImageFile],
+    *,
+    views: Views = WHOLE,
+    config: Config,
+    seed: int,
+) -> Look:
+    """Match two photos.
+
+    Args:
+      features0, features1: of the photos, of their octaves, or of `views` of them.
+      images: the photos.
+    """
+    found = match_features(features0, features1, config=config, seed=seed)
+    evidence = plane_evidence(
+        found,
+        features0,
+        features1,
+        threshold_px=config.threshold_px,
+        fine_stride=config.fine_stride,
+    )
+    return Look(
+        moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views
+    )

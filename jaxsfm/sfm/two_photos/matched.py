@@ -1,0 +1,136 @@
+"""Two photos, matched with as many looks as they need.
+
+Most pairs are matched at the first look. A pair that this leaves weak is looked at again at other
+scales, then turned, and at last as seen from one place, under the strongest geometry so far. A closer
+look counts only if it is stronger than the look that led to it.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import PairResult
+from jaxsfm.io.photo_views import read_view
+from jaxsfm.io.photos import intensities
+from jaxsfm.io.weights import Weights
+from jaxsfm.sfm.refine.pair_alignment import AlignedMatches, align, align_matches
+from jaxsfm.sfm.two_photos.common_view import common_views, mapped
+from jaxsfm.sfm.two_photos.look import Look, look, moved, to_stored
+from jaxsfm.sfm.two_photos.scale_search import at_other_scales, describe_view, turned
+
+ENOUGH = 400.0
+"""A first look with so much evidence is not followed by another (docs/decisions/hard-pairs.md)."""
+TURNED_BELOW = 50.0
+"""Photos are turned only if no look has this much evidence: three more descriptions of a photo."""
+HALF_SURE, STEEPNESS = 60.0, 15.0
+"""The logistic curve from evidence to confidence, fitted to pairs of WxBS and to photos of different
+places (docs/decisions/hard-pairs.md)."""
+
+
+class TwoPhotos(NamedTuple):
+    """The matches of two photos, and how sure they are."""
+
+    result: PairResult
+    """In pixels of the stored photos, as they were verified."""
+    aligned: AlignedMatches
+    """The same matches, moved to a fraction of a pixel where the photos allow it."""
+    evidence: float
+    """`jaxsfm.sfm.two_photos.evidence`."""
+    looks: int
+    """How many looks were taken, the first one included."""
+
+    @property
+    def confidence(self) -> float:
+        """The probability that the photos show the same and that most matches are right."""
+        return confidence(self.evidence)
+
+
+def confidence(evidence: float) -> float:
+    """The probability that a pair with this evidence is right."""
+    return 1 / (1 + math.exp(-(evidence - HALF_SURE) / STEEPNESS))
+
+
+def match_photos(
+    weights: Weights,
+    features0: ImageFeatures,
+    features1: ImageFeatures,
+    *,
+    config: Config,
+    seed: int = 0,
+) -> TwoPhotos:
+    """Match two photos with as many looks as they need (`Config.closer_looks`).
+
+    Args:
+      features0, features1: the features of both photos, made with the same config.
+
+    Raises:
+      ImageError: a photo cannot be decoded again.
+    """
+    images = (features0.image, features1.image)
+    looks = [look(features0, features1, images, config=config, seed=seed)]
+    if config.closer_looks and looks[0].evidence < ENOUGH:
+        looks += at_other_scales(features0, features1, config=config, seed=seed)
+        if _best(looks).evidence < TURNED_BELOW:
+            looks += turned(weights, features0, images[1], config=config, seed=seed)
+        for _ in range(config.closer_looks):
+            best = _best(looks)
+            closer = _closer(weights, best, features0, features1, config=config, seed=seed)
+            if closer is None:
+                break
+            looks.append(closer)
+            if closer.evidence <= best.evidence:
+                break
+    best = _best(looks)
+    return TwoPhotos(best.result, _aligned(best, images, config), best.evidence, len(looks))
+
+
+def _best(looks: list[Look]) -> Look:
+    """The look with the most evidence; the earliest of equal ones."""
+    return max(looks, key=lambda each: each.evidence)
+
+
+def _closer(
+    weights: Weights,
+    best: Look,
+    features0: ImageFeatures,
+    features1: ImageFeatures,
+    *,
+    config: Config,
+    seed: int,
+) -> Look | None:
+    """A look at both photos as seen from one place; None if the best look determines no place."""
+    images = (features0.image, features1.image)
+    views = common_views(best.located(*images), *images)
+    if views is None:
+        return None
+    seen0, seen1 = (
+        describe_view(weights, image, view, config=config)
+        for image, view in zip(images, views, strict=True)
+    )
+    return look(seen0, seen1, images, views=views, config=config, seed=seed)
+
+
+def _aligned(best: Look, images: tuple[ImageFile, ImageFile], config: Config) -> AlignedMatches:
+    """The matches of a look, aligned where they were seen alike."""
+    if None in best.views or not config.aligned_octaves or not best.result.num_inliers:
+        return align(best.result, *images, config=config)
+    gray0, gray1 = (
+        intensities(read_view(image, view))
+        for image, view in zip(images, best.views, strict=True)
+        if view is not None
+    )
+    back = to_stored(best.views, images)
+    found = align_matches(
+        moved(best.result, np.linalg.inv(back[0]), np.linalg.inv(back[1])),
+        gray0,
+        gray1,
+        (1.0, 1.0),
+        (1.0, 1.0),
+        octaves=config.aligned_octaves,
+        max_error_px=config.threshold_px,
+    )
+    return found._replace(keypoints1=mapped(back[1], found.keypoints1))
