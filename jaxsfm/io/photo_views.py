@@ -23,6 +23,11 @@ class PhotoView(NamedTuple):
         """The float64 matrix (3, 3) that maps pixels of the stored photo to those of the view."""
         return self.matrix @ np.linalg.inv(to_stored(image.size, image.orientation))
 
+    @property
+    def zoom(self) -> float:
+        """Pixels of the view per pixel of the photo."""
+        return float(np.sqrt(abs(np.linalg.det(self.matrix[:2, :2]))))
+
     def as_photo(self, image: ImageFile) -> ImageFile:
         """The view as a photo of its own, upright and of its size; its pixels are those of
         `read_view`."""
@@ -38,10 +43,9 @@ def read_view(image: ImageFile, view: PhotoView) -> WorkingImage:
     Raises:
       ImageError: the photo cannot be decoded.
     """
-    scale = float(np.sqrt(abs(np.linalg.det(view.matrix[:2, :2]))))
     longest = max(image.upright_size)
     # The photo is never reduced below the smallest working image.
-    reduced = round(longest * min(scale, 1.0))
+    reduced = round(longest * min(view.zoom, 1.0))
     least = -(-MIN_VIEWED * longest // min(image.upright_size))
     working = read_image(image, max_size=max(reduced, min(least, longest)), upright=True)
     to_view = (view.matrix @ Pixels(working.scale).matrix())[:2]

@@ -16,6 +16,8 @@ from jaxsfm.io.photo_views import PhotoView
 SIZE = 1200
 """The longer side of the common view, pixels. Larger ones take longer and find no more
 (docs/decisions/hard-pairs.md)."""
+SMALL_SIZE = 600
+"""The same for views that only tell which of several geometries is true."""
 MOST_ENLARGED = 4.0
 """No photo is enlarged more than this to fill the view; beyond, there is nothing to see."""
 GROWN = 0.3
@@ -28,8 +30,9 @@ OUTLYING = 2.0
 """Per cent of the matches that may lie outside the box on each of its sides."""
 MOST_STRETCHED = 8.0
 """A map that stretches one direction so many times as much as another shows nothing."""
-LEAST_SIDE = 64
-"""Pixels. A narrower view has too few cells to match."""
+RATIOS = (0.5, 0.75, 1.0)
+"""The shorter side of a view as a share of the longer one. The box grows to the next of them, because
+each other size of a view would be another program to compile."""
 ROUNDS = 20
 """Rounds of the robust fit; its weights are then settled."""
 
@@ -95,8 +98,6 @@ def common_views(
     larger = int(np.linalg.det(affine[:2, :2]) > 1)
     xy, image = ((matches.xy0, image0), (matches.xy1, image1))[larger]
     frame = _frame(xy, image.upright_size, size)
-    if min(frame.size) < LEAST_SIDE:
-        return None
     to_frame = affine if larger else np.linalg.inv(affine)
     other = PhotoView(frame.matrix @ to_frame, frame.size)
     return (other, frame) if larger else (frame, other)
@@ -108,10 +109,15 @@ def _frame(xy: np.ndarray, photo: tuple[int, int], size: int) -> PhotoView:
     grown = GROWN * (high - low) + MARGIN * max(photo)
     low = np.maximum(low - grown, -0.5)
     high = np.minimum(high + grown, np.asarray(photo) - 0.5)
-    zoom = min(size / float((high - low).max()), MOST_ENLARGED)
-    width, height = (max(1, round(side)) for side in (high - low) * zoom)
+    centre, sides = (low + high) / 2, high - low
+    longer = int(sides[1] > sides[0])
+    ratio = min(each for each in RATIOS if each * sides[longer] >= sides[1 - longer])
+    canvas = np.full(2, float(size))
+    canvas[1 - longer] = round(ratio * size)
+    zoom = min(size / float(sides[longer]), MOST_ENLARGED)
+    corner = centre - canvas / zoom / 2
     # The corner of the box is the corner of the view's top-left pixel, (-0.5, -0.5).
     matrix = np.asarray(
-        [[zoom, 0, -zoom * low[0] - 0.5], [0, zoom, -zoom * low[1] - 0.5], [0, 0, 1.0]]
+        [[zoom, 0, -zoom * corner[0] - 0.5], [0, zoom, -zoom * corner[1] - 0.5], [0, 0, 1.0]]
     )
-    return PhotoView(matrix, (width, height))
+    return PhotoView(matrix, (int(canvas[0]), int(canvas[1])))

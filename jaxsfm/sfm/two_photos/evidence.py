@@ -22,6 +22,9 @@ MINIMAL = 4
 MATCHES_OF_A_CELL = 4
 """About so many fine matches come from one coarse match and agree with each other by construction.
 So they are counted once: by the coarse cells that they lie in."""
+ENLARGED = 2.0
+"""Cells of a photo that is enlarged more than this see the same pixels, so they are counted in larger
+cells: in a thermal photo that is enlarged four times, false matches agree with their neighbours."""
 BY_CHANCE = 15.0
 """Planes with less evidence than this do not count. Matches are not placed at random: repeated
 structure and neighbouring cells give false planes an evidence of up to 35 (photos of different
@@ -48,9 +51,9 @@ def evidence_of_plane(members: float, candidates: float, chance: float) -> float
     return -(tests + (members - MINIMAL) * math.log10(chance))
 
 
-def _coarse_cells(cells: np.ndarray, columns: int) -> int:
-    """The number of coarse cells that fine cells lie in."""
-    rows, cols = cells // columns // 2, cells % columns // 2
+def _coarse_cells(cells: np.ndarray, columns: int, times: float) -> int:
+    """The number of coarse cells that fine cells lie in; the coarse cells are `times` as large."""
+    rows, cols = ((side / (2 * times)).astype(int) for side in (cells // columns, cells % columns))
     return len(np.unique(rows * columns + cols))
 
 
@@ -61,6 +64,7 @@ def plane_evidence(
     *,
     threshold_px: float,
     fine_stride: int,
+    zooms: tuple[float, float],
 ) -> np.ndarray:
     """The evidence of each plane of a pair, float64 (p,).
 
@@ -68,17 +72,21 @@ def plane_evidence(
       features0, features1: the features that were matched.
       threshold_px: the largest error of an inlier, working pixels of the second photo.
       fine_stride: the side of a fine cell, working pixels.
+      zooms: working pixels per pixel of each photo.
     """
     rows1, columns1 = (int(n) for n in features1.dense.fine_grid)
     columns0 = int(features0.dense.fine_grid[1])
     area = rows1 * columns1 * fine_stride**2
     chance = min(math.pi * threshold_px**2 / area, 0.5)
-    candidates = max(result.num_tentative / MATCHES_OF_A_CELL, 10.0)
+    larger = [max(zoom / ENLARGED, 1.0) for zoom in zooms]
+    candidates = max(result.num_tentative / MATCHES_OF_A_CELL / max(larger) ** 2, 10.0)
     evidence = []
     for plane in range(len(result.homographies)):
         cells = result.cells[result.plane == plane]
         members = min(
-            _coarse_cells(cells[:, 0], columns0), _coarse_cells(cells[:, 1], columns1), candidates
+            _coarse_cells(cells[:, 0], columns0, larger[0]),
+            _coarse_cells(cells[:, 1], columns1, larger[1]),
+            candidates,
         )
         evidence.append(evidence_of_plane(members, candidates, chance))
     return np.asarray(evidence, np.float64)

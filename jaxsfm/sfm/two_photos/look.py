@@ -38,7 +38,11 @@ class Look(NamedTuple):
         good = np.flatnonzero(self.plane_evidence > BY_CHANCE)
         if not len(good) and len(self.plane_evidence):
             good = np.asarray([self.plane_evidence.argmax()])
-        keep = np.isin(self.result.plane, good)
+        return self.on_planes(good, image0, image1)
+
+    def on_planes(self, planes: np.ndarray, image0: ImageFile, image1: ImageFile) -> Located:
+        """The matches of some planes, which are given by their indices."""
+        keep = np.isin(self.result.plane, planes)
         return Located(
             upright(self.result.keypoints0[keep], image0),
             upright(self.result.keypoints1[keep], image1),
@@ -81,12 +85,17 @@ def look(
       images: the photos.
     """
     found = match_features(features0, features1, config=config, seed=seed)
+    zoom0, zoom1 = (
+        1 / float(np.mean(features.scale)) if view is None else view.zoom
+        for features, view in zip((features0, features1), views, strict=True)
+    )
     evidence = plane_evidence(
         found,
         features0,
         features1,
         threshold_px=config.threshold_px,
         fine_stride=config.fine_stride,
+        zooms=(zoom0, zoom1),
     )
     return Look(
         moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views

@@ -5,6 +5,7 @@ scales, then turned, and at last as seen from one place, under the strongest geo
 look counts only if it is stronger than the look that led to it.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -18,14 +19,18 @@ from jaxsfm.io.photo_views import read_view
 from jaxsfm.io.photos import intensities
 from jaxsfm.io.weights import Weights
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches, align, align_matches
-from jaxsfm.sfm.two_photos.common_view import common_views, mapped
+from jaxsfm.sfm.two_photos.closer_look import closer_look, proposals
+from jaxsfm.sfm.two_photos.common_view import SIZE, SMALL_SIZE, mapped
 from jaxsfm.sfm.two_photos.look import Look, look, moved, to_stored
-from jaxsfm.sfm.two_photos.scale_search import at_other_scales, describe_view, turned
+from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
 
 ENOUGH = 400.0
 """A first look with so much evidence is not followed by another (docs/decisions/hard-pairs.md)."""
 TURNED_BELOW = 50.0
 """Photos are turned only if no look has this much evidence: three more descriptions of a photo."""
+SURE = 150.0
+"""A look with so much evidence is followed by a closer one at once. Below, the planes of all looks
+are tried one after the other."""
 HALF_SURE, STEEPNESS = 60.0, 15.0
 """The logistic curve from evidence to confidence, fitted to pairs of WxBS and to photos of different
 places (docs/decisions/hard-pairs.md)."""
@@ -76,13 +81,17 @@ def match_photos(
         looks += at_other_scales(features0, features1, config=config, seed=seed)
         if _best(looks).evidence < TURNED_BELOW:
             looks += turned(weights, features0, images[1], config=config, seed=seed)
+        closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
+        if _best(looks).evidence < SURE:
+            tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
+            looks += [each for each in tried if each is not None]
         for _ in range(config.closer_looks):
             best = _best(looks)
-            closer = _closer(weights, best, features0, features1, config=config, seed=seed)
-            if closer is None:
+            found = closer(best.located(*images), size=SIZE)
+            if found is None:
                 break
-            looks.append(closer)
-            if closer.evidence <= best.evidence:
+            looks.append(found)
+            if found.evidence <= best.evidence:
                 break
     best = _best(looks)
     return TwoPhotos(best.result, _aligned(best, images, config), best.evidence, len(looks))
@@ -91,27 +100,6 @@ def match_photos(
 def _best(looks: list[Look]) -> Look:
     """The look with the most evidence; the earliest of equal ones."""
     return max(looks, key=lambda each: each.evidence)
-
-
-def _closer(
-    weights: Weights,
-    best: Look,
-    features0: ImageFeatures,
-    features1: ImageFeatures,
-    *,
-    config: Config,
-    seed: int,
-) -> Look | None:
-    """A look at both photos as seen from one place; None if the best look determines no place."""
-    images = (features0.image, features1.image)
-    views = common_views(best.located(*images), *images)
-    if views is None:
-        return None
-    seen0, seen1 = (
-        describe_view(weights, image, view, config=config)
-        for image, view in zip(images, views, strict=True)
-    )
-    return look(seen0, seen1, images, views=views, config=config, seed=seed)
 
 
 def _aligned(best: Look, images: tuple[ImageFile, ImageFile], config: Config) -> AlignedMatches:
