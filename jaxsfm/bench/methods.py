@@ -17,6 +17,7 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
     "no-enlarging": lambda c: dataclasses.replace(c, enlarge=1.0),
     "no-consensus": lambda c: _with_pair(c, consensus=0),
     "no-competition": lambda c: _with_pair(c, plane_rounds=0),
+    "no-closer-looks": lambda c: dataclasses.replace(c, closer_looks=0),
     "no-alignment": lambda c: dataclasses.replace(c, aligned_octaves=0),
     "norm": lambda c: dataclasses.replace(c, keypoints="relocalized"),
     "learned": lambda c: dataclasses.replace(c, keypoints="learned"),
@@ -31,8 +32,8 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
 """Changes of a preset, by the name that follows PRESET- in a method's name.
 
 Each change leaves out one idea of the preset or exchanges it for another one. `no-placing` changes
-models and leaves matches as they are; `no-alignment` changes the matches of single pairs and leaves
-models as they are.
+models and leaves matches as they are; `no-alignment` and `no-closer-looks` change the matches of
+single pairs and leave models as they are.
 """
 KEYPOINTS: dict[str, Keypoints] = {"grid": "grid", "reloc": "relocalized", "learned": "learned"}
 """Methods that differ only in the place of a keypoint within its cell."""
@@ -45,7 +46,7 @@ NAIVE = "paper-naive"
 
 def _configs() -> dict[str, Config]:
     paper, default = preset("paper"), preset("default")
-    unrefined = dataclasses.replace(default, aligned_octaves=0, refinement=None)
+    unrefined = dataclasses.replace(default, aligned_octaves=0, closer_looks=0, refinement=None)
     ablated = {
         f"{name}-{idea}": without(preset(name))
         for name in ("default", "robust")

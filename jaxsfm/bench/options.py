@@ -6,6 +6,7 @@ Nothing heavy is imported here, so that `jaxsfm bench NAME --help` is quick.
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
@@ -107,7 +108,8 @@ class PairOptions(SetOptions, NetworkOptions, SeedOptions):
         strecha. grid, reloc, learned: the preset default without alignment;
         keypoints are at the centres of cells (grid), at the largest norms (reloc) or at the largest
         learned scores (learned). PRESET-no-IDEA: default or robust without one idea, which is
-        octaves, centring, consensus, competition or alignment; for robust also enlarging.
+        octaves, centring, consensus, competition, closer-looks or alignment; for robust also
+        enlarging.
         PRESET-norm, PRESET-learned, PRESET-alexnet, PRESET-bfloat16: default or robust with this
         keypoint rule, network or number format of the network. PRESET-products-float16,
         PRESET-products-bfloat16: with descriptors of this type.
@@ -130,10 +132,14 @@ class WxbsOptions(PairOptions):
     Attributes:
       root: Folder of the categories: CATEGORY/NAME/{01,02}.png and corrs.txt.
       sets: CATEGORY or CATEGORY/NAME, separated by commas or blanks. Without it, all pairs.
+      protocol: How matches are judged. ours: the best of five fundamental matrices, limits of 1 to 20
+        px. lo: as published for other methods: one run of MAGSAC++ (0.25 px, 100,000 iterations),
+        limits of 0 to 10 px.
     """
 
     root: Path
     sets: tuple[str, ...] | None = None
+    protocol: Literal["ours", "lo"] = "ours"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

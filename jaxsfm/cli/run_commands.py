@@ -131,7 +131,8 @@ def match(
       out: File.npz to write. keypoints0 and keypoints1 (n x 2) are the matches, in pixels of the
         original images; the centre of the top-left pixel is (0, 0). aligned (n) says whether
         keypoints1 is accurate to a fraction of a pixel. plane (n) is the index of the match's
-        homography. homographies (p x 3 x 3) map the first image to the second.
+        homography. homographies (p x 3 x 3) map the first image to the second. confidence is the
+        probability that the photos show the same and that most matches are right.
       plot: File.png or File.jpg to write: a picture of the matches, with one colour for each plane.
       mask0: Image of the size of the first photo, whose black pixels are not used.
       mask1: The same for the second photo.
@@ -147,8 +148,7 @@ def match(
     from jaxsfm.io.masked_images import with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
-    from jaxsfm.matching.pair_matching import match_features
-    from jaxsfm.sfm.refine.pair_alignment import align
+    from jaxsfm.sfm.two_photos.matched import match_photos
 
     check_seed(seed)
     files = [
@@ -157,9 +157,10 @@ def match(
     ]
     weights = chosen_weights(network, config.backbone)
     features = [image_features(weights, file, config=config) for file in files]
-    result = match_features(features[0], features[1], config=config, seed=seed)
-    keypoints1, aligned = align(result, files[0], files[1], config=config)
-    result = dataclasses.replace(result, keypoints1=keypoints1.astype(np.float32))
+    found = match_photos(weights, features[0], features[1], config=config, seed=seed)
+    aligned = found.aligned.aligned
+    keypoints1 = found.aligned.keypoints1.astype(np.float32)
+    result = dataclasses.replace(found.result, keypoints1=keypoints1)
     with atomic_file(out) as file:
         np.savez(
             file,
@@ -168,6 +169,7 @@ def match(
             aligned=aligned,
             plane=result.plane,
             homographies=result.homographies,
+            confidence=found.confidence,
         )
     if plot is not None:
         from jaxsfm.report.plot import draw_matches, save_figure
@@ -185,7 +187,8 @@ def match(
         save_figure(figure, plot)
     print(
         f"{result.num_inliers} matches on {len(result.homographies)} planes "
-        f"({result.num_tentative} tentative, {aligned.sum()} aligned): {out}"
+        f"({aligned.sum()} aligned), confidence {100 * found.confidence:.0f} %, after "
+        f"{'one look' if found.looks == 1 else f'{found.looks} looks'}: {out}"
     )
     return 0
 

@@ -143,8 +143,8 @@ def smaller(
     if octave == 0:
         return features
 
-    def moved(octaves: tuple[Array, ...]) -> tuple[Array, ...]:
-        left = octaves[octave:]
+    def moved(octaves: Sequence) -> tuple[Array, ...]:
+        left = [jnp.asarray(each) for each in octaves[octave:]]
         rows, channels = left[0].shape
         lacking = (
             jnp.zeros((octave_capacity(rows, k), channels), left[0].dtype)
@@ -152,7 +152,8 @@ def smaller(
         )
         return (*left, *lacking)
 
-    coarse_grid, fine_grid = features.coarse_grid >> octave, features.fine_grid >> octave
+    coarse_grid = jnp.asarray(features.coarse_grid) >> octave
+    fine_grid = jnp.asarray(features.fine_grid) >> octave
     row, col = cell_rows_cols(features.fine[octave].shape[0], jnp.maximum(fine_grid[1], 1))
     centres = cell_to_px(jnp.stack([col, row], axis=-1).astype(jnp.float32), stride=fine_stride)
     return DenseFeatures(

@@ -133,6 +133,16 @@ def fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.nda
     return min(refined, key=lambda found: found[1])[0] if refined else None
 
 
+def single_fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray) -> np.ndarray | None:
+    """The F of one run of OpenCV's MAGSAC++ as others report it for WxBS: 0.25 px and 100,000
+    iterations. OpenCV seeds it itself. None if there is none."""
+    if len(xy0) < 8:
+        return None
+    xy0, xy1 = np.asarray(xy0, np.float64), np.asarray(xy1, np.float64)
+    found, _ = cv2.findFundamentalMat(xy0, xy1, cv2.USAC_MAGSAC, 0.25, 0.999999, 100_000)
+    return None if found is None or found.shape != (3, 3) else found
+
+
 def homography(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.ndarray | None:
     """The H (float64 (3, 3)) with x1 ~ H x0 of matches (n, 2), pixels; None if there is none."""
     return _estimate(cv2.findHomography, xy0, xy1, 4, seed)

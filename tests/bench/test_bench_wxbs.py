@@ -11,7 +11,13 @@ from epipolar import two_views
 from strategies import rng_of
 
 from jaxsfm.bench.methods import CONFIGS, method_config
-from jaxsfm.bench.wxbs import mean_average_accuracy, means, symmetric_epipolar_error
+from jaxsfm.bench.wxbs import (
+    PUBLISHED_THRESHOLDS_PX,
+    half_of,
+    mean_average_accuracy,
+    means,
+    symmetric_epipolar_error,
+)
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.config import preset
@@ -46,14 +52,30 @@ def test_mean_average_accuracy_counts_whole_pixels():
     assert mean_average_accuracy(np.asarray([1.0, 20.1])) == 0.5
 
 
+def test_published_limits_are_those_up_to_ten_pixels():
+    limits = PUBLISHED_THRESHOLDS_PX
+    assert mean_average_accuracy(np.zeros(4), limits) == 1
+    assert mean_average_accuracy(np.asarray([0.5, 10.5]), limits) == pytest.approx(10 / 22)
+
+
+def test_a_pair_is_in_the_same_half_wherever_it_is_run():
+    """The hash is of the name alone, so a figure of one half can be repeated by others."""
+    assert half_of("WGBS/kn-church") == "half A" and half_of("WGALBS/tyn") == "half B"
+
+
 def test_means_average_pairs_before_seeds():
     rows = [
-        {"category": c, "method": "paper", "scores": s}
-        for c, s in (("A", [0.0, 1.0]), ("A", [1.0, 0.0]), ("B", [0.2, 0.4]))
+        {"category": c, "method": "paper", "scores": s, "half": h}
+        for c, s, h in (
+            ("A", [0.0, 1.0], "half A"),
+            ("A", [1.0, 0.0], "half B"),
+            ("B", [0.2, 0.4], "half B"),
+        )
     ]
     got = means(rows)["paper"]
     assert got["A"] == {"mean": 0.5, "min": 0.5, "max": 0.5}
-    assert got["B"]["min"] == 0.2 and set(got) == {"A", "B", "all"}
+    assert got["B"]["min"] == 0.2 and set(got) == {"A", "B", "half A", "half B", "all"}
+    assert got["half A"] == {"mean": 0.5, "min": 0.0, "max": 1.0}
     assert got["all"]["mean"] == pytest.approx((1 + 1 + 0.6) / 6)
 
 
@@ -102,6 +124,15 @@ def test_a_rendered_pair_scores_well_and_repeats(root, tmp_path, capsys):
     assert figures["summary"]["paper"]["WG"] == figures["summary"]["paper"]["all"]
 
 
+@pytest.mark.slow
+def test_the_published_protocol_is_run(root, tmp_path):
+    out = tmp_path / "figures.json"
+    args = ["--root", str(root), "--methods", "rootsift", "--seeds", "1", "--protocol", "lo"]
+    assert main(["bench", "wxbs", *args, "--json", str(out)]) == 0
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["maa"]["mean"] > 0.5 and row["evidence"] is None
+
+
 def test_categories_and_pairs_are_chosen_by_name(root, tmp_path, capsys):
     for chosen in ("WG", "WG/room"):
         args = ["--root", str(root), "--sets", chosen, "--methods", "rootsift", "--seeds", "1"]
@@ -146,7 +177,8 @@ def test_damaged_inputs_are_named_before_the_first_run(root, tmp_path, capsys, d
 
 def test_reference_means_of_seeds_hold_their_bounds():
     for scores in itertools.product([0.0, 0.5, 1.0], repeat=2):
-        figure = means([{"category": "A", "method": "m", "scores": list(scores)}])["m"]["all"]
+        row = {"category": "A", "method": "m", "scores": list(scores), "half": "half A"}
+        figure = means([row])["m"]["all"]
         assert figure["min"] <= figure["mean"] <= figure["max"]
 
 
@@ -156,7 +188,7 @@ def test_an_ablation_leaves_out_or_exchanges_one_idea():
     assert changed.pair.consensus == 0 and changed != preset("default")
     assert CONFIGS["paper-naive"] == CONFIGS["paper"]  # they differ in how keypoints are found
     assert len(set(CONFIGS.values())) == len(CONFIGS) - 1
-    assert sum(name.startswith(("default-", "robust-")) for name in CONFIGS) == 23
+    assert sum(name.startswith(("default-", "robust-")) for name in CONFIGS) == 25
     low = method_config("default-bfloat16")
     assert low == dataclasses.replace(preset("default"), convolutions="bfloat16")
     half = method_config("robust-products-float16")

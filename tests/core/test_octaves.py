@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from strategies import random_features, rng_of, seeds
 
 from jaxsfm.config import Config, preset
-from jaxsfm.core.octaves import halve, join_octaves, octave_capacity
+from jaxsfm.core.octaves import halve, join_octaves, octave_capacity, smaller
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.io.features import pad_features
 from jaxsfm.io.images import WorkingImage
@@ -90,6 +90,47 @@ def test_an_octave_is_the_smaller_image_described_alone(weights, photos, size):
             cells_of(ours, grid), cells_of(expected, grid), **tolerances.FEATURES
         )
         assert not np.asarray(ours)[grid[0] * grid[1] :].any()
+
+
+@pytest.mark.slow
+def test_a_smaller_image_is_had_without_describing_it(weights, photos):
+    """All but the keypoints, which lie at the centres of their cells."""
+    small = photos[2][:192, :256]
+    whole = np.repeat(np.repeat(small, 2, axis=0), 2, axis=1)
+    ours = smaller(of(weights, whole, octaves=3), 1)
+    alone = of(weights, small, octaves=3)
+    np.testing.assert_array_equal(ours.coarse_grid, alone.coarse_grid)
+    np.testing.assert_array_equal(ours.fine_grid, alone.fine_grid)
+    grid = np.asarray(alone.fine_grid)
+    for k in range(2):
+        part = cells_of(ours.fine[k], grid >> k), cells_of(alone.fine[k], grid >> k)
+        np.testing.assert_allclose(*part, **tolerances.FEATURES)
+    assert not np.asarray(ours.fine[2]).any() and len(ours.fine) == 3
+    centres = np.asarray(of(weights, small, keypoints="grid").keypoints)
+    np.testing.assert_array_equal(cells_of(ours.keypoints, grid), cells_of(centres, grid))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds, st.sampled_from([(8, 12), (5, 7), (9, 4)]), st.integers(0, 2))
+def test_lacking_octaves_add_nothing_to_a_product(seed, shape, octave):
+    features = random_features(seed, shape, 3)
+    ours = join(smaller(features, octave))
+    left = features._replace(
+        coarse=features.coarse[octave:],
+        fine=features.fine[octave:],
+        coarse_grid=features.coarse_grid >> octave,
+        fine_grid=features.fine_grid >> octave,
+    )
+    for few, all_of_them in ((join(left).coarse, ours.coarse), (join(left).fine, ours.fine)):
+        channels = few.shape[1]
+        np.testing.assert_allclose(all_of_them[:, :channels], few, **tolerances.UNIT)
+        assert not np.asarray(all_of_them[:, channels:]).any()
+
+
+@pytest.mark.parametrize("octave", [-1, 3])
+def test_an_image_has_no_octave_beyond_its_last(octave):
+    with pytest.raises(ValueError, match="0..2"):
+        smaller(random_features(0, (8, 12), 3), octave)
 
 
 @pytest.mark.slow

@@ -190,4 +190,5 @@ def test_without_octaves_keypoints_stay_where_they_were():
 
 def test_alignment_is_no_part_of_what_a_stored_match_depends_on():
     config = preset("default")
-    assert config.matching() == dataclasses.replace(config, aligned_octaves=0).matching()
+    for setting in ("aligned_octaves", "closer_looks"):
+        assert config.matching() == dataclasses.replace(config, **{setting: 0}).matching()

@@ -1,0 +1,255 @@
+"""Laws of two photos: evidence, views from one place, turns, and what closer looks bring."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from strategies import rng_of, seeds
+
+from jaxsfm.config import preset
+from jaxsfm.core.types import Status
+from jaxsfm.io.images import ImageFile, inspect_image, read_image
+from jaxsfm.io.orientation import CODES, to_stored
+from jaxsfm.io.pairs import PairResult
+from jaxsfm.io.photo_views import PhotoView, read_view
+from jaxsfm.matching.extraction import image_features
+from jaxsfm.sfm.two_photos import evidence, scale_search
+from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
+from jaxsfm.sfm.two_photos.common_view import Located, affine_between, common_views, mapped
+from jaxsfm.sfm.two_photos.look import Look, moved
+from jaxsfm.sfm.two_photos.matched import confidence, match_photos
+
+
+def photo(size: tuple[int, int], orientation: int = 1) -> ImageFile:
+    return ImageFile(
+        name="a.png", path=Path("a.png"), size=size, sha256="0" * 64, orientation=orientation
+    )
+
+
+def affine(rng: np.random.Generator, scale: float = 1.0) -> np.ndarray:
+    """A map that turns by any angle, stretches up to twice, and moves."""
+    turn, slant = rng.uniform(-math.pi, math.pi), rng.uniform(0.7, 1.4)
+    cos, sin = math.cos(turn), math.sin(turn)
+    matrix = np.eye(3)
+    matrix[:2, :2] = scale * np.asarray([[cos, -sin], [sin, cos]]) @ np.diag([slant, 1 / slant])
+    matrix[:2, 2] = rng.uniform(-50, 50, 2)
+    return matrix
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(5, 60), st.integers(60, 900), st.floats(1e-4, 0.3))
+def test_evidence_is_the_expected_number_of_such_planes_by_chance(members, candidates, chance):
+    """Counted with whole numbers: n C(n, k) C(k, 4) p^(k - 4)."""
+    ways = candidates * math.comb(candidates, members) * math.comb(members, 4)
+    expected = -(math.log10(ways) + (members - 4) * math.log10(chance))
+    assert evidence.evidence_of_plane(members, candidates, chance) == pytest.approx(expected)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(20, 90), st.integers(200, 900), st.floats(1e-4, 1e-2))
+def test_evidence_grows_with_members_and_falls_with_what_was_tried(members, candidates, chance):
+    ours = evidence.evidence_of_plane(members, candidates, chance)
+    assert evidence.evidence_of_plane(members + 1, candidates, chance) > ours
+    assert evidence.evidence_of_plane(members, candidates, chance * 2) < ours
+    if members < candidates / 2:
+        assert evidence.evidence_of_plane(members, 2 * candidates, chance) < ours
+
+
+def test_four_matches_are_no_evidence():
+    assert evidence.evidence_of_plane(4, 100, 1e-3) == -math.inf
+    assert evidence.total(np.asarray([-math.inf, evidence.BY_CHANCE, 0.0])) == 0
+    assert evidence.total(np.asarray([evidence.BY_CHANCE + 3, 2.0])) == 3
+
+
+def test_cells_of_an_enlarged_photo_are_counted_in_larger_cells():
+    cells = np.arange(64)  # 8 x 8 fine cells are 4 x 4 coarse ones, and 2 x 2 of twice their size
+    assert [evidence._coarse_cells(cells, 8, times) for times in (1.0, 2.0)] == [16, 4]
+
+
+def test_confidence_grows_from_none_to_certainty():
+    values = [confidence(e) for e in (0.0, 30.0, 60.0, 90.0, 400.0)]
+    assert values == sorted(values) and values[0] < 0.05 and values[-1] > 0.99
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.sampled_from([0.3, 1.0, 2.5]))
+def test_an_affine_map_is_found_among_false_matches(seed, scale):
+    rng = rng_of(seed)
+    truth = affine(rng, scale)
+    xy0 = rng.uniform(0, 500, (120, 2))
+    xy1 = mapped(truth, xy0)
+    xy1[:30] = rng.uniform(0, 500, (30, 2))
+    found = affine_between(Located(xy0, xy1))
+    assert found is not None
+    np.testing.assert_allclose(mapped(found, xy0), mapped(truth, xy0), atol=1.0)
+
+
+def test_matches_that_determine_no_view_give_none():
+    line = np.column_stack([np.arange(9.0), np.zeros(9)])
+    mirrored = rng_of(0).uniform(0, 300, (40, 2))
+    for xy0, xy1 in ((line[:2], line[:2]), (line, line), (mirrored, mirrored * [-1, 1])):
+        assert common_views(Located(xy0, xy1), photo((400, 300)), photo((400, 300))) is None
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.sampled_from([0.3, 0.8, 1.3, 3.0]))
+def test_matching_points_lie_at_one_pixel_of_the_common_view(seed, scale):
+    rng = rng_of(seed)
+    truth = affine(rng, scale)
+    xy0 = rng.uniform([100, 100], [300, 250], (60, 2))
+    both = Located(xy0, mapped(truth, xy0))
+    views = common_views(both, photo((800, 600)), photo((2000, 2000)), size=500)
+    assume(views is not None)  # photo 1 may not show the points
+    at0, at1 = (mapped(view.matrix, xy) for view, xy in zip(views, both, strict=True))
+    np.testing.assert_allclose(at0, at1, atol=1e-6)
+    assert views[0].size == views[1].size and max(views[0].size) == 500
+    frame = views[int(np.linalg.det(truth[:2, :2]) > 1)]
+    assert frame.matrix[0, 1] == frame.matrix[1, 0] == 0  # the larger picture is only cut
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_the_common_view_does_not_depend_on_the_order_of_the_photos(seed):
+    rng = rng_of(seed)
+    xy0 = rng.uniform([100, 100], [300, 250], (60, 2))
+    xy1 = mapped(affine(rng, 1.5), xy0)
+    a, b = photo((800, 600)), photo((900, 900))
+    one, other = common_views(Located(xy0, xy1), a, b), common_views(Located(xy1, xy0), b, a)
+    assume(one is not None and other is not None)
+    assert one is not None and other is not None
+    np.testing.assert_allclose(one[0].matrix, other[1].matrix, atol=1e-6)
+    np.testing.assert_allclose(one[1].matrix, other[0].matrix, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory, photos):
+    """A photo, and the same zoomed in three times and turned by a quarter: ImageFiles."""
+    folder = tmp_path_factory.mktemp("two")
+    whole = photos[3][:384, :512, ::-1]
+    part = cv2.resize(whole[100:260, 150:350], None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+    shown = {"whole": whole, "part": part, "turned": np.rot90(part), "other": photos[0][..., ::-1]}
+    for name, pixels in shown.items():
+        cv2.imwrite(str(folder / f"{name}.png"), pixels)
+    return {name: inspect_image(folder / f"{name}.png") for name in shown}
+
+
+@pytest.mark.parametrize("orientation", CODES)
+def test_a_view_of_the_whole_photo_is_the_photo(pictures, orientation):
+    image = dataclasses.replace(pictures["whole"], orientation=orientation)
+    view = PhotoView(np.eye(3), image.upright_size)
+    working = read_image(image, max_size=4096, upright=True)
+    seen = read_view(image, view)
+    np.testing.assert_array_equal(seen.rgb, working.rgb)
+    assert seen.scale == (1.0, 1.0) and seen.used is None
+    back = np.linalg.inv(view.from_stored(image))
+    np.testing.assert_allclose(back, to_stored(image.size, orientation), atol=1e-9)
+
+
+def test_what_lies_outside_the_photo_is_not_used(pictures):
+    shifted = np.eye(3)
+    shifted[0, 2] = 100.0
+    seen = read_view(pictures["whole"], PhotoView(shifted, (512, 384)))
+    assert seen.used is not None
+    assert not seen.used[:, :98].any() and seen.used[:, 102:].all()
+
+
+def test_a_reduced_view_has_the_photos_means(pictures):
+    half = np.asarray([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+    seen = read_view(pictures["whole"], PhotoView(half, (256, 192)))
+    whole = read_image(pictures["whole"], max_size=4096).rgb.astype(float)
+    means = whole.reshape(192, 2, 256, 2, 3).mean((1, 3))
+    assert np.abs(seen.rgb - means).max() <= 1
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_a_turned_view_is_the_photo_after_quarter_turns(pictures, quarters):
+    view = scale_search.turned_view(pictures["whole"], quarters)
+    whole = read_image(pictures["whole"], max_size=4096).rgb
+    np.testing.assert_array_equal(
+        read_view(pictures["whole"], view).rgb, np.rot90(whole, -quarters)
+    )
+
+
+def result(xy0: np.ndarray, h: np.ndarray, plane: np.ndarray) -> PairResult:
+    """Matches on planes h (p, 3, 3), without noise."""
+    on_plane = np.stack([mapped(h[p], xy[None])[0] for p, xy in zip(plane, xy0, strict=True)])
+    return PairResult(
+        pair=("a", "b"),
+        cells=np.zeros((len(xy0), 2), np.int32),
+        keypoints0=xy0.astype(np.float32),
+        keypoints1=on_plane.astype(np.float32),
+        plane=plane,
+        homographies=h,
+        num_tentative=len(xy0),
+        num_dropped=0,
+        status=Status.VERIFIED,
+    )
+
+
+def test_moved_matches_stay_on_their_planes_and_come_back():
+    rng = rng_of(3)
+    h = np.stack([affine(rng), affine(rng, 2.0)])
+    found = result(rng.uniform(0, 300, (40, 2)), h, np.arange(40) % 2)
+    m0, m1 = affine(rng, 0.5), affine(rng, 2.0)
+    there = moved(found, m0, m1)
+    for p in range(2):
+        mine = there.plane == p
+        at = np.column_stack([there.keypoints0[mine], np.ones(20)]) @ there.homographies[p].T
+        np.testing.assert_allclose(at[:, :2] / at[:, 2:], there.keypoints1[mine], atol=0.01)
+    back = moved(there, np.linalg.inv(m0), np.linalg.inv(m1))
+    np.testing.assert_allclose(back.keypoints0, found.keypoints0, atol=1e-3)
+    np.testing.assert_allclose(back.keypoints1, found.keypoints1, atol=1e-3)
+
+
+def test_proposals_are_ordered_by_evidence_and_none_is_made_twice():
+    rng = rng_of(5)
+    h = np.stack([affine(rng, s) for s in (0.5, 1.0, 2.0)])
+    a, b = photo((800, 600)), photo((800, 600))
+    looks = [
+        Look(result(rng.uniform(0, 400, (60, 2)), h, np.arange(60) % 3), np.asarray(evidence))
+        for evidence in ([20.0, 90.0, 5.0], [30.0, 80.0, 10.0])
+    ]
+    made = [affine_between(each) for each in proposals(looks, (a, b))]
+    assert len(made) <= MOST_PROPOSALS
+    # A whole look mixes its planes; the strongest single plane comes before the others.
+    single = [int(np.argmin([np.abs(m - x).max() for x in h])) for m in made if m is not None]
+    exact = [k for k, m in zip(single, made, strict=True) if np.abs(m - h[k]).max() < 1e-3]
+    assert exact == [1, 0, 2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("second", "turns"), [("part", 0), ("turned", 1)])
+def test_a_part_zoomed_in_and_turned_is_matched_by_closer_looks(weights, pictures, second, turns):
+    config = preset("default")
+    first, other = (
+        image_features(weights, pictures[name], config=config) for name in ("whole", second)
+    )
+    found = match_photos(weights, first, other, config=config)
+    at = (mapped(np.eye(3), found.result.keypoints0) - [150, 100] + 0.5) * 3 - 0.5
+    if turns:  # np.rot90 turns counterclockwise: (x, y) becomes (y, width - 1 - x)
+        at = np.column_stack([at[:, 1], 599 - at[:, 0]])
+    error = np.linalg.norm(found.aligned.keypoints1 - at, axis=1)
+    assert found.looks > 1 and found.confidence > 0.9
+    assert np.median(error) < 1.5 and (error < 9).mean() > 0.9
+    once = match_photos(weights, first, other, config=dataclasses.replace(config, closer_looks=0))
+    assert once.looks == 1 and once.evidence < found.evidence / 2
+
+
+@pytest.mark.slow
+def test_photos_of_different_things_stay_without_confidence(weights, pictures):
+    config = preset("default")
+    both = [image_features(weights, pictures[name], config=config) for name in ("whole", "other")]
+    assert match_photos(weights, both[0], both[1], config=config).confidence < 0.5
+
+
+@pytest.mark.slow
+def test_a_strong_pair_is_looked_at_once(weights, pictures):
+    config = preset("default")
+    features = image_features(weights, pictures["part"], config=config)
+    found = match_photos(weights, features, features, config=config)
+    assert found.looks == 1 and found.confidence > 0.99
