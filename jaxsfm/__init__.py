@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from jaxsfm.sfm.evaluation import evaluate as evaluate
     from jaxsfm.sfm.reconstruction import reconstruct as reconstruct
     from jaxsfm.sfm.refine.pair_alignment import align as align
+    from jaxsfm.sfm.two_photos.matched import match_photos as match_photos
 
 _HOME = {
     "Config": "config",
@@ -55,6 +56,7 @@ _HOME = {
     "align": "sfm.refine.pair_alignment",
     "extract": "matching.pipeline",
     "match": "matching.pipeline",
+    "match_photos": "sfm.two_photos.matched",
     "open_images": "matching.pipeline",
     "reconstruct": "sfm.reconstruction",
     "RunOptions": "runs.run_options",

@@ -35,8 +35,8 @@ class Matches(NamedTuple):
     seconds: float
     """Time of extracting both images and of matching; the first image of a size also compiles."""
     evidence: float | None = None
-    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos`); None if the method does
-    not say it."""
+    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos`); None if the method
+    does not say it."""
 
 
 class Matcher:

@@ -132,9 +132,9 @@ class WxbsOptions(PairOptions):
     Attributes:
       root: Folder of the categories: CATEGORY/NAME/{01,02}.png and corrs.txt.
       sets: CATEGORY or CATEGORY/NAME, separated by commas or blanks. Without it, all pairs.
-      protocol: How matches are judged. ours: the best of five fundamental matrices, limits of 1 to 20
-        px. lo: as published for other methods: one run of MAGSAC++ (0.25 px, 100,000 iterations),
-        limits of 0 to 10 px.
+      protocol: How matches are judged. ours: the best of five fundamental matrices, limits of 1 to
+        20 px. lo: as published for other methods, with one run of MAGSAC++ (0.25 px, 100,000
+        iterations) and limits of 0 to 10 px.
     """
 
     root: Path

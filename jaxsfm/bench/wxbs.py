@@ -31,7 +31,8 @@ PUBLISHED_THRESHOLDS_PX = np.arange(11)
 """The limits of the figures that are published as mAA at 10 px (Edstedt et al. 2024, "RoMa: Robust
 Dense Feature Matching": DKM 58.9, RoMa 80.1, on all test pairs)."""
 HALVES = ("half A", "half B")
-"""The pairs are split by a hash of their names. Choices are made on half A and reported on half B."""
+"""The pairs are split by a hash of their names, so that choices can be made on half A and reported
+on half B."""
 Means = dict[str, dict[str, Spread]]
 """mAA by method and category."""
 
@@ -73,7 +74,7 @@ def symmetric_epipolar_error(f: np.ndarray, xy0: np.ndarray, xy1: np.ndarray) ->
 
 
 def mean_average_accuracy(errors: np.ndarray, thresholds: np.ndarray = THRESHOLDS_PX) -> float:
-    """The share of errors (pixels) within t, averaged over the thresholds t = 1, 2, ..., 20."""
+    """The share of errors (pixels) within t, averaged over the thresholds t (1, 2, ..., 20)."""
     return float((errors[None] <= thresholds[:, None]).mean())
 
 

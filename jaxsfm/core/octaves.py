@@ -125,11 +125,11 @@ def smaller(
 ) -> DenseFeatures:
     """The features of an image at 1 / 2^`octave` of its size, without describing it again.
 
-    Octave `octave` of the image is the first octave of the smaller one. The octaves that then lack at
-    the end are zero, so they add nothing to a product, and the arrays keep their number. Only the
-    keypoints of the first octave are relocalized, so those of the smaller image lie at the centres of
-    its fine cells. They are in its pixels: pixel (u, v) of a halved image lies at (2 u + 0.5,
-    2 v + 0.5) of the image.
+    Octave `octave` of the image is the first octave of the smaller one. The octaves that then lack
+    at the end are zero, so they add nothing to a product, and the arrays keep their number. Only
+    the keypoints of the first octave are relocalized, so those of the smaller image lie at the
+    centres of its fine cells. They are in its pixels: pixel (u, v) of a halved image lies at (2 u +
+    0.5, 2 v + 0.5) of the image.
 
     Args:
       fine_stride: stride of the fine maps, pixels.

@@ -1,8 +1,8 @@
 """Closer looks: both photos are described again as seen from one place.
 
 A weak look may have a true plane among false ones, or two looks may have different ones. So each
-plane is a proposal of its own, and a look at a small common view tells which of them is true: under a
-true geometry the photos look alike and the evidence grows, under a false one it goes.
+plane is a proposal of its own, and a look at a small common view tells which of them is true: under
+a true geometry the photos look alike and the evidence grows, under a false one it goes.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Both photos as seen from one place.
 
 A first look finds a rough geometry, if only from a few matches. With it, the part that both photos
-show is cut out of them, at one size, and one photo is turned and slanted by the affine map that leads
-to the other. The network, which knows neither scale nor rotation, then sees twice the same.
+show is cut out of them, at one size, and one photo is turned and slanted by the affine map that
+leads to the other. The network, which knows neither scale nor rotation, then sees twice the same.
 """
 
 from typing import NamedTuple
@@ -31,8 +31,8 @@ OUTLYING = 2.0
 MOST_STRETCHED = 8.0
 """A map that stretches one direction so many times as much as another shows nothing."""
 RATIOS = (0.5, 0.75, 1.0)
-"""The shorter side of a view as a share of the longer one. The box grows to the next of them, because
-each other size of a view would be another program to compile."""
+"""The shorter side of a view as a share of the longer one. The box grows to the next of them,
+because each other size of a view would be another program to compile."""
 ROUNDS = 20
 """Rounds of the robust fit; its weights are then settled."""
 
@@ -83,11 +83,11 @@ def affine_between(matches: Located) -> np.ndarray | None:
 def common_views(
     matches: Located, image0: ImageFile, image1: ImageFile, *, size: int = SIZE
 ) -> tuple[PhotoView, PhotoView] | None:
-    """A view of each photo in which matching points lie at about the same pixel; None if the matches
-    determine none.
+    """A view of each photo in which matching points lie at about the same pixel; None if the
+    matches determine none.
 
-    The photo that shows the common part larger is cut and resized, and the other one is warped to it,
-    so that no detail is lost. The views have the same size.
+    The photo that shows the common part larger is cut and resized, and the other one is warped to
+    it, so that no detail is lost. The views have the same size.
 
     Args:
       size: the longer side of the views, pixels.

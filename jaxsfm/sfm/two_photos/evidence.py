@@ -1,9 +1,9 @@
 """How strongly matches speak for it that two photos show the same.
 
-The number of inliers does not say it: a plane of thirty inliers can be true or chance. It depends on
-how many matches were tried, how large the photos are and how near a match must be. The evidence of a
-plane is -log10 of the expected number of such planes among matches that are placed at random. So it
-can be compared between looks at different sizes of the photos.
+The number of inliers does not say it: a plane of thirty inliers can be true or chance. It depends
+on how many matches were tried, how large the photos are and how near a match must be. The evidence
+of a plane is -log10 of the expected number of such planes among matches that are placed at random.
+So it can be compared between looks at different sizes of the photos.
 
 Source: Moisan and Stival 2004, "A probabilistic criterion to detect rigid point matches between two
 images and estimate the fundamental matrix", equation 12, for homographies.
@@ -23,8 +23,9 @@ MATCHES_OF_A_CELL = 4
 """About so many fine matches come from one coarse match and agree with each other by construction.
 So they are counted once: by the coarse cells that they lie in."""
 ENLARGED = 2.0
-"""Cells of a photo that is enlarged more than this see the same pixels, so they are counted in larger
-cells: in a thermal photo that is enlarged four times, false matches agree with their neighbours."""
+"""Neighbouring cells of a photo that is enlarged more than this see the same pixels, so they are
+counted in larger cells. In a thermal photo that is enlarged four times, false matches agree with
+their neighbours."""
 BY_CHANCE = 15.0
 """Planes with less evidence than this do not count. Matches are not placed at random: repeated
 structure and neighbouring cells give false planes an evidence of up to 35 (photos of different

@@ -61,7 +61,7 @@ def moved(result: PairResult, matrix0: np.ndarray, matrix1: np.ndarray) -> PairR
 
 
 def to_stored(views: Views, images: tuple[ImageFile, ImageFile]) -> tuple[np.ndarray, np.ndarray]:
-    """For both photos the matrix (3, 3) from the pixels of the view to those of the stored photo."""
+    """For both photos the matrix (3, 3) from pixels of the view to those of the stored photo."""
     first, second = (
         np.eye(3) if view is None else np.linalg.inv(view.from_stored(image))
         for view, image in zip(views, images, strict=True)

@@ -1,10 +1,11 @@
 """Two photos, matched with as many looks as they need.
 
 Most pairs are matched at the first look. A pair that this leaves weak is looked at again at other
-scales, then turned, and at last as seen from one place, under the strongest geometry so far. A closer
-look counts only if it is stronger than the look that led to it.
+scales, then enlarged, then turned, and at last as seen from one place, under the strongest geometry
+so far. A closer look counts only if it is stronger than the look that led to it.
 """
 
+import dataclasses
 import functools
 import math
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import read_view
 from jaxsfm.io.photos import intensities
 from jaxsfm.io.weights import Weights
+from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches, align, align_matches
 from jaxsfm.sfm.two_photos.closer_look import closer_look, proposals
 from jaxsfm.sfm.two_photos.common_view import SIZE, SMALL_SIZE, mapped
@@ -26,14 +28,17 @@ from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
 
 ENOUGH = 400.0
 """A first look with so much evidence is not followed by another (docs/decisions/hard-pairs.md)."""
+MOST_ENLARGED = 2.0
+"""Small photos are described once more, enlarged so much, if no scale is sure. The preset `robust`
+does so at the first look."""
 TURNED_BELOW = 50.0
 """Photos are turned only if no look has this much evidence: three more descriptions of a photo."""
 SURE = 150.0
 """A look with so much evidence is followed by a closer one at once. Below, the planes of all looks
 are tried one after the other."""
 HALF_SURE, STEEPNESS = 60.0, 15.0
-"""The logistic curve from evidence to confidence, fitted to pairs of WxBS and to photos of different
-places (docs/decisions/hard-pairs.md)."""
+"""The logistic curve from evidence to confidence, fitted to pairs of WxBS and to photos of
+different places (docs/decisions/hard-pairs.md)."""
 
 
 class TwoPhotos(NamedTuple):
@@ -79,6 +84,13 @@ def match_photos(
     looks = [look(features0, features1, images, config=config, seed=seed)]
     if config.closer_looks and looks[0].evidence < ENOUGH:
         looks += at_other_scales(features0, features1, config=config, seed=seed)
+        if _best(looks).evidence < SURE and config.enlarge < MOST_ENLARGED:
+            config = dataclasses.replace(config, enlarge=MOST_ENLARGED)
+            features0, features1 = (
+                image_features(weights, image, config=config) for image in images
+            )
+            looks.append(look(features0, features1, images, config=config, seed=seed))
+            looks += at_other_scales(features0, features1, config=config, seed=seed)
         if _best(looks).evidence < TURNED_BELOW:
             looks += turned(weights, features0, images[1], config=config, seed=seed)
         closer = functools.partial(closer_look, weights, images, config=config, seed=seed)

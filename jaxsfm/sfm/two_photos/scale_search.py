@@ -1,7 +1,7 @@
 """The search for the scale and the turn between two photos.
 
-The network knows neither scale nor rotation. Features are made at several sizes of a photo anyway, so
-a photo that shows things twice as large is matched at half its size, without describing anything
+The network knows neither scale nor rotation. Features are made at several sizes of a photo anyway,
+so a photo that shows things twice as large is matched at half its size, without describing anything
 again. Turned photos have to be described again; half the size is enough to see whether they match.
 """
 
@@ -19,8 +19,8 @@ from jaxsfm.matching.extraction import describe_pixels
 from jaxsfm.sfm.two_photos.look import Look, look
 
 OCTAVES = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1))
-"""The octaves of the first and of the second photo that are matched: relative scales of 2, 1/2, 4 and
-1/4, and 2 and 1/2 once more at half the size, where noise and another sensor disturb less."""
+"""The octaves of the first and of the second photo that are matched: relative scales of 2, 1/2, 4
+and 1/4, and 2 and 1/2 once more at half the size, where noise and another sensor disturb less."""
 TURNED_SIZE = 800
 """The longer side of a turned photo, pixels."""
 TURNED_OCTAVES = (0, 1, 2)
