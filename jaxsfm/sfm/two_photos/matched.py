@@ -1,8 +1,8 @@
 """Two photos, matched with as many looks as they need.
 
 Most pairs are matched at the first look. A pair that this leaves weak is looked at again at other
-scales, then enlarged, then turned, and at last as seen from one place, under the strongest geometry
-so far. A closer look counts only if it is stronger than the look that led to it.
+scales, then enlarged, then as seen from one place, and turned if that did not help. A closer look
+counts only if it is stronger than the look that led to it.
 """
 
 import dataclasses
@@ -33,6 +33,8 @@ MOST_ENLARGED = 2.0
 does so at the first look."""
 TURNED_BELOW = 50.0
 """Photos are turned only if no look has this much evidence: three more descriptions of a photo."""
+HOPELESS = 15.0
+"""A look with less evidence is not followed by a closer one: nothing is likely to come of it."""
 SURE = 150.0
 """A look with so much evidence is followed by a closer one at once. Below, the planes of all looks
 are tried one after the other."""
@@ -91,14 +93,16 @@ def match_photos(
             )
             looks.append(look(features0, features1, images, config=config, seed=seed))
             looks += at_other_scales(features0, features1, config=config, seed=seed)
-        if _best(looks).evidence < TURNED_BELOW:
-            looks += turned(weights, features0, images[1], config=config, seed=seed)
         closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
         if _best(looks).evidence < SURE:
             tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
             looks += [each for each in tried if each is not None]
+        if _best(looks).evidence < TURNED_BELOW:
+            looks += turned(weights, features0, images[1], config=config, seed=seed)
         for _ in range(config.closer_looks):
             best = _best(looks)
+            if best.evidence < HOPELESS:
+                break
             found = closer(best.located(*images), size=SIZE)
             if found is None:
                 break
