@@ -28,6 +28,9 @@ from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
 
 ENOUGH = 400.0
 """A first look with so much evidence is not followed by another (docs/decisions/hard-pairs.md)."""
+ENOUGH_SHARE = 0.2
+"""Nor is one in which so large a share of the matches agrees, and which is more likely right than
+not: small photos have too few cells for much evidence. First looks of hard pairs have 2 to 13 %."""
 MOST_ENLARGED = 2.0
 """Small photos are described once more, enlarged so much, if no scale is sure. The preset `robust`
 does so at the first look."""
@@ -84,7 +87,7 @@ def match_photos(
     """
     images = (features0.image, features1.image)
     looks = [look(features0, features1, images, config=config, seed=seed)]
-    if config.closer_looks and looks[0].evidence < ENOUGH:
+    if config.closer_looks and not is_settled(looks[0]):
         looks += at_other_scales(features0, features1, config=config, seed=seed)
         if _best(looks).evidence < SURE and config.enlarge < MOST_ENLARGED:
             config = dataclasses.replace(config, enlarge=MOST_ENLARGED)
@@ -111,6 +114,13 @@ def match_photos(
                 break
     best = _best(looks)
     return TwoPhotos(best.result, _aligned(best, images, config), best.evidence, len(looks))
+
+
+def is_settled(first: Look) -> bool:
+    """Whether a first look needs no other."""
+    share = first.result.num_inliers / max(first.result.num_tentative, 1)
+    likely = first.evidence > HALF_SURE and share >= ENOUGH_SHARE
+    return likely or first.evidence >= ENOUGH
 
 
 def _best(looks: list[Look]) -> Look:
