@@ -128,7 +128,7 @@ def test_the_common_view_does_not_depend_on_the_order_of_the_photos(seed):
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory, photos):
-    """A photo, a part of it zoomed in 1.3 times, the same turned by a quarter, and another photo."""
+    """A photo, a part of it zoomed in 1.3 times, the same turned by a quarter, and another one."""
     folder = tmp_path_factory.mktemp("two")
     whole = photos[3][:384, :512, ::-1]
     part = cv2.resize(whole[60:300, 80:400], (416, 312), interpolation=cv2.INTER_CUBIC)
