@@ -505,6 +505,7 @@ def calls() -> dict[str, Call]:
         "octaves.halve": Call(octaves.halve, (photo,)),
         "octaves.blend": Call(octaves.blend, (f0.fine, f0.coarse_parts[0].cells, f0.coarse[:, :4])),
         "octaves.join_octaves": Call(octaves.join_octaves, (_dense(),), (2,)),
+        "octaves.smaller": Call(lambda dense: octaves.smaller(dense, 1), (_dense(),), (4,)),
         "pair.pair_key": Call(
             lambda a, b: jax.random.key_data(pair.pair_key(KEY, a, b)), (np.uint32(5), np.uint32(3))
         ),
