@@ -11,6 +11,10 @@ from jaxsfm.io.orientation import UPRIGHT, to_stored
 from jaxsfm.io.pixels import Pixels
 
 
+MIN_VIEWED = 64
+"""Pixels: the shorter side of a photo is not reduced below it, whatever the view is."""
+
+
 class PhotoView(NamedTuple):
     """A part of a photo as another camera would see it if the part were flat and far away."""
 
@@ -54,7 +58,3 @@ def read_view(image: ImageFile, view: PhotoView) -> WorkingImage:
     used = np.ones((height, width), bool) if working.used is None else working.used
     inside = cv2.warpAffine(used.astype(np.uint8), to_view, view.size, flags=cv2.INTER_NEAREST) > 0
     return WorkingImage(rgb, (1.0, 1.0), None if inside.all() else inside)
-
-
-MIN_VIEWED = 64
-"""Pixels: the shorter side of a photo is not reduced below it, whatever the view is."""

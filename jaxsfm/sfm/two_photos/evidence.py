@@ -6,7 +6,7 @@ of a plane is -log10 of the expected number of such planes among matches that ar
 So it can be compared between looks at different sizes of the photos.
 
 Source: Moisan and Stival 2004, "A probabilistic criterion to detect rigid point matches between two
-images and estimate the fundamental matrix", equation 12, for homographies.
+images and estimate the fundamental matrix"; here for homographies.
 """
 
 import math

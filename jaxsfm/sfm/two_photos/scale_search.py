@@ -21,6 +21,8 @@ from jaxsfm.sfm.two_photos.look import Look, look
 OCTAVES = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1))
 """The octaves of the first and of the second photo that are matched: relative scales of 2, 1/2, 4
 and 1/4, and 2 and 1/2 once more at half the size, where noise and another sensor disturb less."""
+LEAST_CELLS = 3
+"""Coarse cells along the shorter side: one window of the coarse-to-fine step."""
 TURNED_SIZE = 800
 """The longer side of a turned photo, pixels."""
 TURNED_OCTAVES = (0, 1, 2)
@@ -48,10 +50,6 @@ def at_other_scales(
         side1 = at_octave(features1, octave1, config=config)
         if all(min(side.dense.coarse_grid) >= LEAST_CELLS for side in (side0, side1)):
             yield look(side0, side1, images, config=config, seed=seed)
-
-
-LEAST_CELLS = 3
-"""Coarse cells along the shorter side: one window of the coarse-to-fine step."""
 
 
 def turned_view(image: ImageFile, quarters: int, *, size: int = TURNED_SIZE) -> PhotoView:
