@@ -10,7 +10,6 @@ from jaxsfm.io.images import ImageFile, WorkingImage, read_image
 from jaxsfm.io.orientation import UPRIGHT, to_stored
 from jaxsfm.io.pixels import Pixels
 
-
 MIN_VIEWED = 64
 """Pixels: the shorter side of a photo is not reduced below it, whatever the view is."""
 
