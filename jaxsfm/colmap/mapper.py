@@ -6,7 +6,7 @@ parts of the scene that nothing connects to it.
 
 import dataclasses
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,6 +37,8 @@ class MapOptions:
     """Settings of the mapper."""
 
     mapper: Mapper = "incremental"
+    in_parts: bool = False
+    """Many photos are mapped in parts (`jaxsfm.sfm.parts`)."""
     refine_intrinsics: bool = True
     seed: int = 0
     threads: int = -1
@@ -120,17 +122,17 @@ def initial_pairs(two_views: Mapping[Pair, TwoView]) -> list[Pair]:
     )
 
 
-def _order(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+def ordered(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
     """The models, the one with most images first, without those of images that a larger one has.
 
     In photos of repeated structure, COLMAP starts the same model again from other pairs: one run
     had seven models of the same 19 photos.
     """
-    ordered = sorted(
+    by_size = sorted(
         models, key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids()))
     )
     kept: list[pycolmap.Reconstruction] = []
-    for model in ordered:
+    for model in by_size:
         if not any(registered(model) <= registered(other) for other in kept):
             kept.append(model)
     return kept
@@ -197,10 +199,18 @@ def build_models(
 
 
 def first_models(
-    database: Path, options: MapOptions, *, on_image: Callable[[], None] = lambda: None
+    database: Path,
+    options: MapOptions,
+    *,
+    names: Sequence[str] = (),
+    on_image: Callable[[], None] = lambda: None,
 ) -> Mapped:
-    """Run the mapper once; see `build_models`."""
-    models = _run(database, options, None, on_image)
+    """Run the mapper once; see `build_models`.
+
+    Args:
+      names: of the images that the incremental mapper may use; by default all.
+    """
+    models = _run(database, options, None, on_image, names)
     return Mapped(models, [_attempt(options.mapper, None, models)])
 
 
@@ -241,7 +251,7 @@ def with_left_out_images(
             attempts.append(_attempt("incremental", pair, other))
             if other and (not models or other[0].num_reg_images() > models[0].num_reg_images()):
                 apart = [m for m in models if not registered(m) <= registered(other[0])]
-                models = _order([other[0], *apart])
+                models = ordered([other[0], *apart])
         if not models and pairs:
             other = _run(database, dataclasses.replace(options, mapper="global"), None, on_image)
             attempts.append(_attempt("global", None, other))
@@ -267,7 +277,11 @@ def _attempt(mapper: Mapper, pair: Pair | None, models: list[pycolmap.Reconstruc
 
 
 def _run(
-    database: Path, options: MapOptions, initial: Pair | None, on_image: Callable[[], None]
+    database: Path,
+    options: MapOptions,
+    initial: Pair | None,
+    on_image: Callable[[], None],
+    names: Sequence[str] = (),
 ) -> list[pycolmap.Reconstruction]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         if options.mapper == "global":
@@ -278,8 +292,9 @@ def _run(
                 database,
                 grace_s=1,  # it cannot be cancelled
             )
-            return _order(list(found.values()))
+            return ordered(list(found.values()))
         p = incremental_options(options)
+        p.image_names = list(names)
         if initial is not None:
             images = read_images(database)
             p.init_image_id1, p.init_image_id2 = (images[name][0] for name in initial)
@@ -300,4 +315,4 @@ def _run(
             ),
             database,
         )
-        return _order(list(found.values()))
+        return ordered(list(found.values()))

@@ -136,7 +136,8 @@ class RunStages:
             described=matched.described,
             cameras=self.cameras,
             options=MapOptions(
-                mapper=options.mapper,
+                mapper="global" if options.mapper == "global" else "incremental",
+                in_parts=options.mapper == "auto",
                 refine_intrinsics=options.refines,
                 seed=options.seed,
                 threads=options.threads,

@@ -18,6 +18,7 @@ from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.mapper_matches import mapper_matches
+from jaxsfm.sfm.parts.map_parts import MANY, map_in_parts
 
 if TYPE_CHECKING:
     import pycolmap
@@ -60,13 +61,25 @@ class MapperRuns:
         self._whole.clear()
 
     def first(self) -> Mapped:
-        """The models of one run of the mapper."""
+        """The models of one run of the mapper, or of runs for parts of many photos.
+
+        If the models of the parts do not agree with each other, the mapper is given all photos.
+        """
         if self._share:
             shutil.copyfile(self._database, self._given)
             keep_inliers(self._given, mapper_matches(read_inliers(self._given)))
-        made = first_models(self._given, self._mapping, on_image=self._on_image)
+        made = self._in_parts() if self._options.in_parts else None
+        if made is None:
+            made = first_models(self._given, self._mapping, on_image=self._on_image)
         self.attempts += made.attempts
         return made
+
+    def _in_parts(self) -> Mapped | None:
+        """The models of runs for parts; None for few photos, and if the models do not agree."""
+        matches = {pair: len(rows) for pair, rows in read_inliers(self._given).matches.items()}
+        if len({name for pair in matches for name in pair}) <= MANY:
+            return None
+        return map_in_parts(self._given, matches, self._mapping, on_image=self._on_image)
 
     def with_left_out_images(self, made: Mapped, two_views: Mapping[Pair, TwoView]) -> Mapped:
         """The models of further runs, if the first run since the database changed left out images.

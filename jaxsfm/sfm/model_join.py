@@ -1,7 +1,7 @@
 """Two models that share photos as one model: whether they agree, and what the one looks like."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -103,20 +103,27 @@ def joined(
 
 
 def adjusted(
-    model: Model, *, error_px: float, refine_intrinsics: bool, threads: int
+    model: Model,
+    *,
+    error_px: float,
+    refine_intrinsics: bool,
+    threads: int,
+    slacks: Sequence[float] = (4.0, 1.0),
 ) -> "pycolmap.Reconstruction":
-    """Filter the observations and adjust the bundle, twice; the first filter is coarse.
+    """Filter the observations and adjust the bundle, again and again; the first filter is coarse.
 
     Args:
       error_px: the largest error of a right observation, pixels of the views.
+      slacks: so many times that error is allowed, one adjustment after the other.
     """
 
     def once(slack: float) -> "pycolmap.Reconstruction":
         made = model.select(model.errors_px() < slack * error_px).to_colmap()
-        bundle_adjust(
-            made, loss_px=error_px / 4, refine_intrinsics=refine_intrinsics, threads=threads
-        )
+        # A larger error at first, so that what is far off still pulls.
+        loss_px = max(slack / 4, 1.0) * error_px / 4
+        bundle_adjust(made, loss_px=loss_px, refine_intrinsics=refine_intrinsics, threads=threads)
         return made
 
-    model = Model.from_colmap(once(4.0), model.sizes)
-    return once(1.0)
+    for slack in slacks[:-1]:
+        model = Model.from_colmap(once(slack), model.sizes)
+    return once(slacks[-1])

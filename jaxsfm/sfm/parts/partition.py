@@ -1,0 +1,113 @@
+"""Parts of a graph of photos: each small enough to be mapped alone, and overlapping with the next.
+
+A part that is too large is cut in two. Its photos are put in order of their distance from a photo
+at its edge, where strong pairs are short ways, and the cut goes where the pairs across it are
+weakest. All of this takes time in proportion to the number of pairs, times the logarithm of the
+number of photos. Where parts are cut, each gets the photos of the other that have most matches with
+it.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from jaxsfm.io.pairs import Pair
+
+MIDDLE = 1 / 3
+"""A part is cut between this share of its photos and the rest, so that both halves shrink."""
+MOST_ADDED = 0.5
+"""A part grows at most by this share by the photos of its neighbours."""
+
+
+class Graph(NamedTuple):
+    """Photos, and how strongly pairs of them belong together."""
+
+    names: list[str]
+    """Sorted."""
+    weights: csr_array
+    """float64 (n, n), symmetric: the number of matches of each pair."""
+
+
+def graph_of(matches: Mapping[Pair, int]) -> Graph:
+    """The graph of pairs with their numbers of matches. Pairs without matches do not count."""
+    some = {pair: count for pair, count in sorted(matches.items()) if count > 0}
+    names = sorted({name for pair in some for name in pair})
+    index = {name: k for k, name in enumerate(names)}
+    ends = np.asarray([[index[a], index[b]] for a, b in some], np.int64).reshape(-1, 2)
+    counts = np.asarray([*some.values()], float)
+    rows, columns = np.concatenate([ends, ends[:, ::-1]]).T
+    shape = (len(names), len(names))
+    weights = coo_array((np.r_[counts, counts], (rows, columns)), shape=shape).tocsr()
+    return Graph(names, csr_array(weights))
+
+
+def overlapping_parts(graph: Graph, *, most: int, overlap: int) -> list[list[str]]:
+    """Parts that cover all photos. The order of pairs and photos has no effect.
+
+    Args:
+      most: the number of photos of a part before its neighbours' photos are added.
+      overlap: about so many photos are in two parts that were cut apart; half of them come from
+        either side.
+
+    Returns:
+      the sorted names of each part, the parts in the order of their first names.
+
+    Raises:
+      ValueError: a number is too small.
+    """
+    if most < 2 or overlap < 0:
+        raise ValueError(f"most must be at least 2 and overlap 0; got {most} and {overlap}")
+    cores: list[np.ndarray] = []
+    todo = [np.arange(len(graph.names))] if graph.names else []
+    while todo:
+        photos = todo.pop()
+        inside = csr_array(graph.weights[photos][:, photos])
+        count, label = connected_components(inside, directed=False)
+        if count > 1:
+            todo += [photos[label == k] for k in range(count)]
+        elif len(photos) <= most:
+            cores.append(photos)
+        else:
+            todo += [photos[side] for side in _halves(inside)]
+    whole = [
+        np.sort(np.r_[core, _beside(graph, cores, k, overlap)]) for k, core in enumerate(cores)
+    ]
+    return sorted([graph.names[i] for i in part] for part in whole)
+
+
+def _halves(weights: csr_array) -> tuple[np.ndarray, np.ndarray]:
+    """The two sides of a cut through a connected graph, int, ascending."""
+    lengths = csr_array((1 / weights.data, weights.indices, weights.indptr), shape=weights.shape)
+    start = int(np.argmax(dijkstra(lengths, directed=False, indices=0)))
+    order = np.argsort(dijkstra(lengths, directed=False, indices=start), kind="stable")
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    edges = weights.tocoo()
+    first, last = np.sort([place[edges.row], place[edges.col]], axis=0)
+    # Pair (first, last) is cut by every cut after `first` and not after `last`.
+    change = np.bincount(first + 1, edges.data, len(order) + 1)
+    change -= np.bincount(last + 1, edges.data, len(order) + 1)
+    across = np.cumsum(change)
+    low = max(1, int(MIDDLE * len(order)))
+    cut = low + int(np.argmin(across[low : len(order) - low + 1]))
+    return np.sort(order[:cut]), np.sort(order[cut:])
+
+
+def _beside(graph: Graph, cores: list[np.ndarray], part: int, overlap: int) -> np.ndarray:
+    """The photos of other parts that are added to a part: of each neighbour half of the overlap, of
+    the strongest neighbours first, at most `MOST_ADDED` of the part."""
+    core = cores[part]
+    matches = np.asarray(graph.weights[core].sum(axis=0)).ravel()
+    matches[core] = 0
+    found: list[tuple[float, np.ndarray]] = []
+    for k, other in enumerate(cores):
+        near = other[matches[other] > 0]
+        if k != part and len(near):
+            best = near[np.lexsort((near, -matches[near]))][: -(-overlap // 2)]
+            found.append((-float(matches[best].sum()), best))
+    found.sort(key=lambda each: (each[0], each[1].tolist()))
+    room = max(overlap, int(MOST_ADDED * len(core)))
+    return np.concatenate([np.zeros(0, np.int64), *(best for _, best in found)])[:room]
