@@ -14,6 +14,10 @@ view it cannot be told from a small rotation. Of all three neighbours of Herz-Je
 fountain-P11, the median rotation is off by 0.16 and 0.27 deg instead of 0.47 and 0.60, and the
 worst by 0.33 and 0.89 deg instead of 1.14 and 1.29. All eight views of Herz-Jesus-P8 find the point
 to 0.4 px, which was 8 px from the centre of the photos."""
+TRUST_RADIUS = 1e8
+"""The radius of the first step of the solver; that of Ceres is 1e4. It holds long rows of photos
+back: bending them changes the errors little. A row of 300 photos, joined from five parts, takes 2.5
+s instead of 7.5, and 15 s to get as far. A step that is too long is taken back."""
 FARTHEST_CENTRE = 0.1
 """A principal point that moves farther than this from the centre of the photo, in units of the
 longer side, is not believed."""
@@ -48,6 +52,7 @@ def bundle_adjust(
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-7
+    options.ceres.solver_options.initial_trust_region_radius = TRUST_RADIUS
     before = {number: _centre(reconstruction.camera(number)) for number in sorted(shared)}
     options.refine_principal_point = refine_intrinsics and shared == views.keys()
     _solve(reconstruction, options, fixed=())

@@ -1,12 +1,13 @@
 """A COLMAP model as arrays: views, points and observations, read from COLMAP and written to it."""
 
 import dataclasses
+import functools
 from collections.abc import Collection, Mapping
 
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.colmap.tracks import Tracks, grouped
 from jaxsfm.colmap.view import View
 from jaxsfm.io.pixels import Pixels
 
@@ -65,12 +66,16 @@ class Model:
             np.int64,
         ).reshape(-1, 3)
         xy = np.empty((len(rows), 2))
-        for k, at in enumerate(pixels):
-            own = rows[:, 1] == k
+        for at, own in zip(pixels, grouped(rows[:, 1], len(views)), strict=True):
             xy[own] = at[rows[own, 2]]
         tracks = Tracks(points.reshape(-1, 3), rows[:, 0], rows[:, 1], xy)
         cameras = {i: reconstruction.camera(i) for i in reconstruction.cameras}
         return cls(views, tracks, cameras)
+
+    @functools.cached_property
+    def rows(self) -> list[np.ndarray]:
+        """For each view the indices of its observations, ascending."""
+        return grouped(self.tracks.view, len(self.views))
 
     @property
     def sizes(self) -> Sizes:
@@ -89,8 +94,7 @@ class Model:
             model.add_camera_with_trivial_rig(cameras[camera_id])
         tracks = self.tracks
         place = np.zeros(len(tracks.xy), np.int64)
-        for k, view in enumerate(self.views):
-            rows = np.flatnonzero(tracks.view == k)
+        for view, rows in zip(self.views, self.rows, strict=True):
             place[rows] = np.arange(len(rows))
             image = pycolmap.Image(
                 name=view.name,
@@ -155,8 +159,7 @@ class Model:
         """
         tracks = self.tracks
         errors = np.empty(len(tracks.xy))
-        for k, view in enumerate(self.views):
-            rows = np.flatnonzero(tracks.view == k)
+        for view, rows in zip(self.views, self.rows, strict=True):
             at, _ = view.project(tracks.points[tracks.point[rows]])
             errors[rows] = np.linalg.norm(at - tracks.xy[rows], axis=1)
         return np.where(np.isfinite(errors), errors, np.inf)

@@ -6,6 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 
+def grouped(of: np.ndarray, count: int) -> list[np.ndarray]:
+    """For each of `count` groups the indices of its entries, ascending.
+
+    Args:
+      of: int (m,), the group of each entry.
+    """
+    order = np.argsort(of, kind="stable")
+    return np.split(order, np.searchsorted(of[order], np.arange(1, count)))
+
+
 class Observations(NamedTuple):
     """Where views see points: observation k is of point `point[k]`, in view `view[k]`."""
 

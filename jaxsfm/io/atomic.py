@@ -5,15 +5,16 @@ Every result that jaxsfm writes goes through this module.
 
 import contextlib
 import json
-import math
 import os
 import shutil
-import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
 import numpy as np
+import safetensors
+import safetensors.numpy
 from numpy.typing import ArrayLike
 
 from jaxsfm.errors import UserError, writing
@@ -22,6 +23,8 @@ Json: TypeAlias = Mapping[str, "Json"] | Sequence["Json"] | str | int | float | 
 """What `json.dumps` writes. What `json.loads` returns is a dict, a list or one of the others."""
 PARTIAL = ".partial"
 """The suffix of a file or folder that is still being written."""
+CHECKSUM = "crc32"
+"""The name of the array that holds the checksum of the others."""
 SPARE_BYTES = 4_000_000
 """Disk space that callers of `check_disk_space` add for what they do not count: the indices of
 tables, poses and the report page."""
@@ -57,42 +60,42 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 
 def save_arrays(path: Path, arrays: Mapping[str, ArrayLike]) -> None:
-    """Write arrays into an .npz file.
+    """Write arrays into a .safetensors file, with a checksum.
 
-    This does not wait for the disk, so a power failure may tear the file. The zip format carries
-    checksums; `load_arrays` treats a torn file as absent. Raises UserError if it cannot be written.
+    This does not wait for the disk, so a power failure may tear the file; `load_arrays` treats a
+    torn file as absent. Reading the matches of a pair takes 0.05 ms, where an .npz file took 0.8:
+    a run reads them four times, and an accelerator matches a pair in 4 ms. Raises UserError if the
+    file cannot be written.
     """
     with writing(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
+    solid = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    solid[CHECKSUM] = np.asarray([_checksum(solid)], np.uint32)
     with atomic_file(path) as file:
-        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]  names are no options
+        file.write(safetensors.numpy.save(solid))
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
     """The arrays that `save_arrays` wrote, or None if the file is missing or damaged.
 
-    Objects are never unpickled, and no more memory is allocated than the file is long.
+    Nothing in such a file can run code, and no more memory is allocated than the file is long.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
-            for info in archive.infolist():
-                _check_member(archive, info)
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except Exception:  # damage raises nearly anything: struct.error, TokenError, MemoryError, ...
+        found = safetensors.numpy.load(path.read_bytes())
+        right = found.pop(CHECKSUM).tolist() == [_checksum(found)]
+    except (OSError, ValueError, KeyError, safetensors.SafetensorError):
         return None
+    return found if right else None
 
 
-def _check_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> None:
-    """Raise ValueError unless an array has as many bytes in the file as its header says."""
-    with archive.open(info) as file:
-        read = np.lib.format
-        version = read.read_magic(file)  # pyright: ignore[reportArgumentType]
-        head = read.read_array_header_1_0 if version == (1, 0) else read.read_array_header_2_0
-        shape, _, dtype = head(file)  # pyright: ignore[reportArgumentType]
-        stored = info.compress_type == zipfile.ZIP_STORED and min(shape, default=0) >= 0
-        if not stored or file.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
-            raise ValueError(f"{info.filename}: {info.file_size} bytes for {shape} {dtype}")
+def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
+    """The CRC-32 of the arrays' names, dtypes, shapes and bytes."""
+    found = 0
+    for name in sorted(arrays):
+        array = arrays[name]
+        found = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), found)
+        found = zlib.crc32(array.reshape(-1).view(np.uint8).data, found)
+    return found
 
 
 def read_json(path: Path) -> Json:

@@ -53,7 +53,7 @@ class Store:
         common = [self.identity.get(name) for name in ("version", "weights", "relocalizer")]
         name = digest(common, depends_on)
         # The sub-folders keep a run of 100 000 pairs from having as many files in one folder.
-        return self.path / kind / name[:2] / f"{name[2:]}.npz"
+        return self.path / kind / name[:2] / f"{name[2:]}.safetensors"
 
     def _setting(self, name: str) -> Mapping[str, Json]:
         """An entry of the identity that is an object, or {} if it is none."""

@@ -53,7 +53,7 @@ def common_points(first: Model, second: Model, shared: Sequence[str]) -> CommonP
         sides = []
         for model in (first, second):
             view = next(k for k, view in enumerate(model.views) if view.name == name)
-            rows = np.flatnonzero(model.tracks.view == view)
+            rows = model.rows[view]
             sides.append((model.tracks.point[rows], model.tracks.xy[rows]))
         (point0, xy0), (point1, xy1) = sides
         if not len(xy0) or not len(xy1):

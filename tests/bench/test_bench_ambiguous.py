@@ -31,13 +31,13 @@ def test_matches_are_taken_from_another_method_only_into_a_new_folder(tmp_path):
     take_matches(second, first)
     assert not second.exists()  # there is nothing to take
     (first / "matches" / "ab").mkdir(parents=True)
-    (first / "matches" / "ab" / "cd.npz").write_bytes(b"matches")
+    (first / "matches" / "ab" / "cd.safetensors").write_bytes(b"matches")
     (first / "run.json").write_text("{}")
     take_matches(second, first)
-    assert (second / "matches" / "ab" / "cd.npz").read_bytes() == b"matches"
-    (first / "matches" / "ab" / "cd.npz").write_bytes(b"others")
+    assert (second / "matches" / "ab" / "cd.safetensors").read_bytes() == b"matches"
+    (first / "matches" / "ab" / "cd.safetensors").write_bytes(b"others")
     take_matches(second, first)
-    assert (second / "matches" / "ab" / "cd.npz").read_bytes() == b"matches"
+    assert (second / "matches" / "ab" / "cd.safetensors").read_bytes() == b"matches"
 
 
 def row(method, outcome, *, position=None, models=(8, 3)):
@@ -145,12 +145,14 @@ def test_a_scene_and_a_set_run_from_end_to_end_and_go_on_where_they_were(strecha
     assert len(list((work / "scene" / "images").glob("*.png"))) == 15
     own, taken = (_files(work / method / "matches") for method in ("default", "colmap"))
     assert own == taken and own
-    before = {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}
+    before = {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.safetensors")}
     assert main([*args, "--sets", "synthetic-street", "--methods", "default"]) == 0
     again = json.loads(out.read_text())["rows"]
     assert [each["groups"] for each in again] == [rows[0]["groups"]]
-    assert before == {path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.npz")}
+    assert before == {
+        path: path.stat().st_mtime_ns for path in work.rglob("matches/*/*.safetensors")
+    }
 
 
 def _files(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*.npz")}
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*.safetensors")}

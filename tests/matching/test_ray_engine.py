@@ -75,8 +75,8 @@ def test_a_killed_worker_and_a_damaged_photo_change_nothing(scene, tmp_path, mon
     assert killed and "Ray lost a worker, another is started" in printed.err
     assert "raylet" not in printed.out + printed.err
     local, ray = (tmp_path / run for run in ("local", "ray"))
-    files = sorted(str(path.relative_to(local)) for path in local.glob("matches/**/*.npz"))
-    assert len(files) == 3 == len(list(ray.glob("matches/**/*.npz")))
+    files = sorted(str(path.relative_to(local)) for path in local.glob("matches/**/*.safetensors"))
+    assert len(files) == 3 == len(list(ray.glob("matches/**/*.safetensors")))
     for name in (*files, "sparse/0/points3D.bin", "unusable.json"):
         assert (local / name).read_bytes() == (ray / name).read_bytes(), name
     assert content(local / "database.db") == content(ray / "database.db")

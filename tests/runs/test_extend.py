@@ -61,7 +61,7 @@ def extended(plain, scene, tmp_path_factory) -> Extended:
         n: c for n, c in before.items() if "stages" not in n
     }
     assert main(["extend", str(run), "--keep-features"]) == 0
-    assert len(list(run.glob("features/*/*.npz"))) == 5
+    assert len(list(run.glob("features/*/*.safetensors"))) == 5
     return Extended(
         run,
         photos,

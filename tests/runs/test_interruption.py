@@ -58,14 +58,14 @@ def test_an_interrupted_run_goes_on_where_it_was(
         interrupt_after(patch, owner, function, calls)
         assert main([*args, str(tmp_path / "cut")]) == 130
     assert "interrupted" in capsys.readouterr().err
-    done = len(list((tmp_path / "cut").glob("features/*/*.npz")))
-    matched = len(list((tmp_path / "cut").glob("matches/*/*.npz")))
+    done = len(list((tmp_path / "cut").glob("features/*/*.safetensors")))
+    matched = len(list((tmp_path / "cut").glob("matches/*/*.safetensors")))
     assert (done, matched) == {"extraction": (1, 0), "matching": (3, 2), "mapping": (3, 3)}[stage]
     extracted = interrupt_after(monkeypatch, Store, "save_features", 99)
     rematched = interrupt_after(monkeypatch, Store, "save_matches", 99)
     assert main([*args, str(tmp_path / "cut")]) == 0
     assert extracted[0] == 3 - done and rematched[0] == 3 - matched
-    for file in sorted((tmp_path / "whole" / "matches").glob("*/*.npz")):
+    for file in sorted((tmp_path / "whole" / "matches").glob("*/*.safetensors")):
         again = tmp_path / "cut" / file.relative_to(tmp_path / "whole")
         assert file.read_bytes() == again.read_bytes()
     for name in ("images.bin", "points3D.bin"):
@@ -112,7 +112,7 @@ def test_what_has_been_started_is_saved(scene, tmp_path, monkeypatch, owner, sta
     monkeypatch.setattr(owner, name, failing)
     command = ["reconstruct", str(scene / "images"), *QUICK, "--out", str(tmp_path / "out")]
     assert main(command) == code
-    assert len(list((tmp_path / "out" / stage).glob("*/*.npz"))) == 1
+    assert len(list((tmp_path / "out" / stage).glob("*/*.safetensors"))) == 1
 
 
 @pytest.mark.slow
@@ -141,7 +141,7 @@ def test_ctrl_c_during_refinement_keeps_features_and_matches(scene, tmp_path, mo
     with monkeypatch.context() as patch:
         patch.setattr(jaxsfm.sfm.refine.one_pass, "bundle_adjust", interrupted)
         assert main(args) == 130
-    assert len(list((tmp_path / "out" / "matches").glob("*/*.npz"))) == 3
+    assert len(list((tmp_path / "out" / "matches").glob("*/*.safetensors"))) == 3
     assert not (tmp_path / "out" / "sparse").exists()
     assert main(args) == 0
     assert (tmp_path / "out" / "sparse" / "0" / "images.bin").is_file()

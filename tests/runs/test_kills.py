@@ -74,7 +74,7 @@ def results(out: Path) -> dict[str, object]:
 
 def assert_whole(out: Path) -> None:
     """Nothing is half there but what says so by its name; call after a kill."""
-    for file in out.glob("*/*/*.npz"):
+    for file in out.glob("*/*/*.safetensors"):
         assert load_arrays(file) is not None, file
     for name in ("run.json", "report.json"):
         if (out / name).exists():

@@ -166,7 +166,7 @@ def test_kept_features_spare_the_next_call_and_change_no_pose(
         options = LocalizeOptions(keep_features=keep)
         row = localize([photos / "photos" / "new.png"], run, options=options)["photos"][0]
         assert row["cam_from_world"] == localized["new.png"]["cam_from_world"]
-        assert len(list(run.glob("features/*/*.npz"))) == 3
+        assert len(list(run.glob("features/*/*.safetensors"))) == 3
     assert computed == [3, 1, 1]  # the run's photos once, the new one in each call
 
 

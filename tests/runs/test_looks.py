@@ -51,7 +51,7 @@ def test_where_the_first_look_settles_all_photos_nothing_is_described_at_full_si
     }
     # One pass more than the preset has, at full size.
     assert len(report["refinement"][0]["passes"]) == 3
-    assert len(list((out / "matches").rglob("*.npz"))) == 3
+    assert len(list((out / "matches").rglob("*.safetensors"))) == 3
 
 
 def test_the_refinement_works_at_full_size(looked):

@@ -81,23 +81,23 @@ class Agreement(NamedTuple):
     undecided: np.ndarray
     """int (v, v): other points in these blocks, where a patch neither agrees nor contradicts."""
 
-    def beyond_light(self) -> np.ndarray:
-        """float64 (v, v): the contradictions that a difference in light does not explain."""
-        return np.maximum(self.contradicted - LIGHT * self.undecided, 0.0)
+    def beyond_light(self, some: "slice | tuple[slice, slice]" = slice(None)) -> np.ndarray:
+        """float64: the contradictions that a difference in light does not explain.
 
-    def joined(self, first: int, second: int) -> "Agreement":
-        """The counts after two views, or groups of views, became one: their sums.
-
-        It keeps the index of the first.
+        Args:
+          some: which of the counts; by default all, (v, v).
         """
-        return Agreement(*(_joined(counts, first, second) for counts in self))
+        return np.maximum(self.contradicted[some] - LIGHT * self.undecided[some], 0.0)
 
+    def copied(self) -> "Agreement":
+        """The same counts in memory of their own."""
+        return Agreement(*(counts.copy() for counts in self))
 
-def _joined(counts: np.ndarray, first: int, second: int) -> np.ndarray:
-    both = counts.copy()
-    both[first] += both[second]
-    both[:, first] += both[:, second]
-    return np.delete(np.delete(both, second, 0), second, 1)
+    def join(self, first: int, second: int) -> None:
+        """Add the counts of a view, or of a group of views, to those of another one, in place."""
+        for counts in self:
+            counts[first] += counts[second]
+            counts[:, first] += counts[:, second]
 
 
 AGREES, CONTRADICTS, UNDECIDED, UNKNOWN = range(4)
@@ -131,13 +131,19 @@ def thinned(model: Model, *, per_view: int = POINTS_PER_VIEW) -> Model:
 
     They are taken evenly by index.
     """
+    rows = thinned_points(model, per_view=per_view)
+    if len(rows) == len(model.tracks.points):
+        return model
+    return model.with_tracks(model.tracks.select_points(rows))
+
+
+def thinned_points(model: Model, *, per_view: int = POINTS_PER_VIEW) -> np.ndarray:
+    """The points that `thinned` takes, int, ascending."""
     count = len(model.tracks.points)
     observed = max(len(model.tracks.point), 1)
     enough = OBSERVED_PER_VIEW * len(model.views) * count // observed
     most = min(per_view * len(model.views), MAX_POINTS, enough)
-    if count <= most:
-        return model
-    return model.with_tracks(model.tracks.select_points(np.arange(most) * count // most))
+    return np.arange(count) if count <= most else np.arange(most) * count // most
 
 
 def agreement(
@@ -146,6 +152,7 @@ def agreement(
     refinement: Refinement,
     *,
     targets: Sequence[int] | None = None,
+    normal: np.ndarray | None = None,
 ) -> Agreement:
     """Compare all views of a model with each other.
 
@@ -153,13 +160,18 @@ def agreement(
       images: those of the views, in the model's pixels.
       refinement: how patches are aligned, and when they agree.
       targets: indices of views. Only what these views show is tested. None: all views.
+      normal: float64 (points, 3), of the model's points; None: from the points.
     """
-    seen, tests = _tested(model, images, refinement, targets)
+    seen, tests = _tested(model, images, refinement, targets, normal)
     return _compare(model.views, seen, tests)
 
 
 def _tested(
-    model: Model, images: DeviceImages, refinement: Refinement, targets: Sequence[int] | None
+    model: Model,
+    images: DeviceImages,
+    refinement: Refinement,
+    targets: Sequence[int] | None,
+    normal: np.ndarray | None,
 ) -> tuple[_Seen, _Tests]:
     """Align all points in the views that should see them."""
     views, tracks = model.views, model.tracks
@@ -170,7 +182,7 @@ def _tested(
         shown[:, targets] = False
     parts = []
     limits = AlignmentLimits.of(refinement)
-    for block in align_blocks(model, images, refinement, limits, targets=targets):
+    for block in align_blocks(model, images, refinement, limits, targets=targets, normal=normal):
         points[block.rows] = block.patches.points
         own, found = block.confirmed, block.found
         shown[block.rows[own], block.patches.reference[own]] = True
@@ -236,10 +248,10 @@ def _compare(views: Sequence[View], seen: _Seen, tests: _Tests) -> Agreement:
         own = np.flatnonzero(tests.view == b)
         rays = views[b].centre - seen.points[tests.point[own]]
         far = np.linalg.norm(rays, axis=1)
-        for a in range(count):
-            both = np.flatnonzero(seen.shown[tests.point[own], a]) if a != b else []
-            if len(both) < MIN_COMPARED:
-                continue
+        shown = seen.shown[tests.point[own]]
+        shown[:, b] = False
+        for a in np.flatnonzero(shown.sum(0) >= MIN_COMPARED):
+            both = np.flatnonzero(shown[:, a])
             other = centres[a] - seen.points[tests.point[own[both]]]
             away = np.linalg.norm(other, axis=1)
             cosine = np.einsum("ni,ni->n", other, rays[both]) / (away * far[both])
@@ -247,7 +259,7 @@ def _compare(views: Sequence[View], seen: _Seen, tests: _Tests) -> Agreement:
             alike = (cosine > np.cos(np.radians(MAX_ANGLE_DEG))) & (
                 ratio < np.log(MAX_DISTANCE_RATIO)
             )
-            rows = own[np.asarray(both)[alike]]
+            rows = own[both[alike]]
             decided = rows[tests.outcome[rows] != UNDECIDED]
             if len(decided) < MIN_COMPARED:
                 continue

@@ -54,6 +54,23 @@ def share(tested: np.ndarray, contradicted: np.ndarray) -> np.ndarray:
     return np.where(enough, np.minimum(ratio, ratio.T), np.nan)
 
 
+def _sure(agreement: Agreement, rows: slice) -> np.ndarray:
+    """float (r, v): how surely some groups and all others are one, the lower the surer; inf where
+    they are not, or where too little was tested."""
+
+    def shares(more: int) -> np.ndarray:
+        beyond = agreement.beyond_light(rows) + more
+        back = agreement.beyond_light((slice(None), rows)).T + more
+        forth, back = (
+            each / np.maximum(tests, 1)
+            for each, tests in ((beyond, agreement.tested[rows]), (back, agreement.tested.T[rows]))
+        )
+        enough = np.minimum(agreement.tested[rows], agreement.tested.T[rows]) >= MIN_TESTED
+        return np.where(enough, np.minimum(forth, back), np.inf)
+
+    return np.where(shares(0) <= MAX_CONTRADICTED, shares(1), np.inf)
+
+
 def group_views(agreement: Agreement) -> Grouping:
     """Join views to groups, those first that agree most surely.
 
@@ -63,18 +80,24 @@ def group_views(agreement: Agreement) -> Grouping:
     It ends when only groups are left that contradict each other, or about which nothing can be
     said. The order of views has an effect only among equals.
     """
-    members = [[k] for k in range(len(agreement.tested))]
-    while len(members) > 1:
-        beyond = agreement.beyond_light()
-        with np.errstate(invalid="ignore"):
-            open_to = share(agreement.tested, beyond) <= MAX_CONTRADICTED
-        sure = np.where(open_to, share(agreement.tested, beyond + 1), np.inf)
-        sure[np.tril_indices(len(members))] = np.inf
-        first, second = np.unravel_index(np.argmin(sure), sure.shape)
+    count = len(agreement.tested)
+    groups: dict[int, list[int]] = {k: [k] for k in range(count)}
+    now, sure = agreement.copied(), _sure(agreement, slice(None))
+    sure[np.tril_indices(count)] = np.inf
+    while len(groups) > 1:
+        first, second = (int(k) for k in np.unravel_index(np.argmin(sure), sure.shape))
         if not np.isfinite(sure[first, second]):
             break
-        members[first] = sorted(members[first] + members.pop(second))
-        agreement = agreement.joined(int(first), int(second))
+        groups[first] = sorted(groups[first] + groups.pop(second))
+        now.join(first, second)
+        # Only the shares of the joined group have changed.
+        row = _sure(now, slice(first, first + 1))[0]
+        row[[k for k in range(count) if k not in groups or k == first]] = np.inf
+        sure[:first, first], sure[first, first:] = row[:first], row[first:]
+        sure[second], sure[:, second] = np.inf, np.inf
+    members = list(groups.values())
+    left = [*groups]
+    agreement = Agreement(*(each[np.ix_(left, left)] for each in now))
     tested, contradicted = agreement.tested, agreement.beyond_light()
     shares = share(tested, contradicted)
     found = []

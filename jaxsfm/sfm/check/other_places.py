@@ -15,11 +15,12 @@ from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.check.agreement import agreement, thinned
+from jaxsfm.sfm.check.agreement import agreement, thinned_points
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import OtherPlace
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.refine.track_alignment import may_show
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 MIN_INLIERS = 30
@@ -91,7 +92,7 @@ def other_place(
         if count >= MIN_SUPPORT
     ]
     moved = others.with_views([*model.views[:k], there, *model.views[k + 1 :]])
-    tested, contradicted = shown_by(moved, images, refinement, k)
+    tested, contradicted = shown_by(moved, normal, images, refinement, k)
     if tested - contradicted < MIN_AGREED or contradicted > MAX_CONTRADICTED * tested:
         return None
     return OtherPlace(
@@ -117,10 +118,13 @@ def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
     return bool(turned > OTHER_ROTATION_DEG or away > OTHER_DISTANCE * distance)
 
 
-def shown_by(model: Model, images: DeviceImages, refinement: Refinement, k: int) -> tuple[int, int]:
+def shown_by(
+    model: Model, normal: np.ndarray, images: DeviceImages, refinement: Refinement, k: int
+) -> tuple[int, int]:
     """What a view shows of the points that other views have seen.
 
     Args:
+      normal: float64 (points, 3), of the model's points.
       images: those of the views, in the model's pixels.
       k: index of the view.
 
@@ -128,8 +132,11 @@ def shown_by(model: Model, images: DeviceImages, refinement: Refinement, k: int)
       the number of points that it should show and on which something can be said, and the number of
       contradictions among them (`jaxsfm.sfm.check.agreement`): means over the other views.
     """
-    others = thinned(model.select(model.tracks.view != k), per_view=TESTED_PER_VIEW)
-    found = agreement(others, images, refinement, targets=[k])
+    others = model.select(model.tracks.view != k)
+    rows = thinned_points(others, per_view=TESTED_PER_VIEW)
+    rows = rows[may_show(others.tracks.points[rows], [others.views[k]])]
+    some = others.with_tracks(others.tracks.select_points(rows))
+    found = agreement(some, images, refinement, targets=[k], normal=normal[rows])
     counts = found.tested[:, k]
     if not counts.any():
         return 0, 0

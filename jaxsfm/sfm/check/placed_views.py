@@ -59,7 +59,7 @@ def doubts(
     for k, view in enumerate(model.views):
         if view.name in found or not placed.full_size.get(view.name):
             continue
-        tested, contradicted = shown_by(model, images, refinement, k)
+        tested, contradicted = shown_by(model, normal, images, refinement, k)
         if contradicted >= max(MIN_CONTRADICTED, MOST_CONTRADICTED * tested):
             found[view.name] = (
                 f"of {tested} points that it should show there, it shows something else instead of "

@@ -101,13 +101,32 @@ def _beside(graph: Graph, cores: list[np.ndarray], part: int, overlap: int) -> n
     the strongest neighbours first, at most `MOST_ADDED` of the part."""
     core = cores[part]
     matches = np.asarray(graph.weights[core].sum(axis=0)).ravel()
-    matches[core] = 0
     found: list[tuple[float, np.ndarray]] = []
     for k, other in enumerate(cores):
-        near = other[matches[other] > 0]
-        if k != part and len(near):
-            best = near[np.lexsort((near, -matches[near]))][: -(-overlap // 2)]
+        if k != part and (matches[other] > 0).any():
+            best = _strongest(graph, matches, other, -(-overlap // 2))
             found.append((-float(matches[best].sum()), best))
     found.sort(key=lambda each: (each[0], each[1].tolist()))
     room = max(overlap, int(MOST_ADDED * len(core)))
     return np.concatenate([np.zeros(0, np.int64), *(best for _, best in found)])[:room]
+
+
+def _strongest(graph: Graph, matches: np.ndarray, among: np.ndarray, count: int) -> np.ndarray:
+    """The photos with most matches, each counted with those that were taken before it.
+
+    Args:
+      matches: float (n,), the matches of each photo with the part.
+      among: only these photos are taken.
+      count: at most so many.
+    """
+    matches = matches.copy()
+    taken: list[int] = []
+    while len(taken) < count:
+        left = among[~np.isin(among, taken)]
+        if not len(left) or matches[left].max() <= 0:
+            break
+        best = int(left[np.argmax(matches[left])])
+        taken.append(best)
+        row = slice(graph.weights.indptr[best], graph.weights.indptr[best + 1])
+        matches[graph.weights.indices[row]] += graph.weights.data[row]
+    return np.asarray(taken, np.int64)

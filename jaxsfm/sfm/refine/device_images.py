@@ -24,11 +24,12 @@ class DeviceImages:
         one image more takes memory while it replaces another."""
         self._read, self._most, self._px = read, most_bytes, 1
         self._images: OrderedDict[tuple[str, int], PaddedImage] = OrderedDict()
+        self._used = [0]  # one number for all octaves
 
     @property
     def nbytes(self) -> int:
         """Bytes of the images on the device."""
-        return sum(image.map.nbytes for image in self._images.values())
+        return self._used[0]
 
     def octave(self, px: int) -> "DeviceImages":
         """The same images with pixels `px` times as large, in the same memory."""
@@ -42,7 +43,9 @@ class DeviceImages:
         if key not in self._images:
             gray, _ = self._read(name)
             self._images[key] = padded(block_means(gray, self._px))
+            self._used[0] += self._images[key].map.nbytes
         self._images.move_to_end(key)
         while len(self._images) > 1 and self.nbytes > self._most:
-            self._images.popitem(last=False)
+            _, gone = self._images.popitem(last=False)
+            self._used[0] -= gone.map.nbytes
         return self._images[key]

@@ -16,6 +16,9 @@ CHUNK = 256
 """Keypoints aligned by one call of the compiled program on a CPU. A keypoint takes 35 us in chunks
 of 128 to 1024 and 47 us in chunks of 4096, and most views of a large model have a few hundred in a
 block."""
+FEW = 64
+"""Fewer keypoints than these are aligned by a call of their own length. A test of a second place
+has templates from 40 views, with 10 of them from a view."""
 ACCELERATOR_FACTOR = 8
 """An accelerator aligns up to so many times as many keypoints by one call. Its lanes are filled by
 the samples of about 2000 patches. The factor changes no result, and it has not been measured."""
@@ -38,13 +41,14 @@ def largest_chunk() -> int:
 def chunks(rows: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
     """Chunks of indices (n,), filled up with their first one, and how many of each count.
 
-    The last chunk is CHUNK times the power of two that holds it, so that the calls of an
-    accelerator have few lengths, and a short one is not mostly filling.
+    The last chunk has FEW, or CHUNK times the power of two that holds it, so that calls have few
+    lengths, and a short one is not mostly filling.
     """
     largest = largest_chunk()
     for start in range(0, len(rows), largest):
         piece = rows[start : start + largest]
-        filled = np.full(CHUNK << ((len(piece) - 1) // CHUNK).bit_length(), piece[0])
+        length = FEW if len(piece) <= FEW else CHUNK << ((len(piece) - 1) // CHUNK).bit_length()
+        filled = np.full(length, piece[0])
         filled[: len(piece)] = piece
         interrupt.check()
         yield filled, len(piece)

@@ -153,7 +153,7 @@ def under_pixels(
       pixels these are.
     """
     tracks = model.tracks
-    own = np.flatnonzero(tracks.view == view)
+    own = model.rows[view]
     if not len(own) or not len(xy):
         return np.zeros((0, 3)), np.zeros(0, np.int64)
     distance, nearest = map(np.asarray, KDTree(tracks.xy[own]).query(xy))

@@ -2,6 +2,7 @@
 moved onto the point's reference patch. Points are taken in blocks, so that memory stays bounded.
 """
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -198,6 +199,7 @@ def align_blocks(
     limits: AlignmentLimits,
     *,
     targets: Sequence[int] | None = None,
+    normal: np.ndarray | None = None,
 ) -> Iterator[AlignedBlock]:
     """Align the observations of every point of a model, block by block.
 
@@ -207,15 +209,18 @@ def align_blocks(
       limits: what an aligned keypoint must fulfil to count.
       targets: indices of views. Only observations in these views are aligned, and only points that
         they may show are looked at. None: all views.
+      normal: float64 (points, 3), of the model's points; None: from the points.
     """
-    views = model.views
-    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
+    if normal is None:
+        normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     patch = square_patch(refinement.radius)
-    for rows, tracks in _blocks(model.tracks, views, targets):
-        part = model.with_tracks(tracks)
+    for rows, tracks in _blocks(model.tracks, model.views, targets):
+        part, number = _of_near_views(model.with_tracks(tracks))
+        views = part.views
+        among = None if targets is None else np.flatnonzero(np.isin(number, targets)).tolist()
         seen = plane_geometry.visibility(part, normal[rows])
         patches = plane_geometry.reference_patches(part, normal[rows], seen)
-        found = find_candidates(views, patches, seen, refinement, targets=targets)
+        found = find_candidates(views, patches, seen, refinement, targets=among)
         templates = _templates(patches, np.unique(found.point), views, images, patch)
         moved, score, agrees = _align(
             found, templates, views, images, patch, limits, iterations=refinement.iterations
@@ -223,4 +228,21 @@ def align_blocks(
         # Otherwise they would stay on the device beside those of the next block.
         del templates
         tracked, before = (each[found.point, found.view] for each in (seen.tracked, seen.xy))
+        patches = patches._replace(reference=number[patches.reference])
+        found = found._replace(view=number[found.view])
         yield AlignedBlock(rows, patches, found, moved, score, agrees, tracked, before)
+
+
+def _of_near_views(part: Model) -> tuple[Model, np.ndarray]:
+    """A block with only those views that may show one of its points; int (v,), their indices.
+
+    The time of a block then depends on the photos around it, and not on all photos of the model.
+    """
+    seen = np.bincount(part.tracks.view, minlength=len(part.views)) > 0
+    near = np.asarray(
+        [seen[k] or bool(may_show(part.tracks.points, [v]).any()) for k, v in enumerate(part.views)]
+    )
+    number = np.flatnonzero(near)
+    place = np.cumsum(near) - 1
+    tracks = part.tracks._replace(view=place[part.tracks.view])
+    return dataclasses.replace(part, views=[part.views[k] for k in number], tracks=tracks), number
