@@ -1,4 +1,4 @@
-"""Camera poses from a COLMAP model or a folder of Strecha `.camera` files."""
+"""Camera poses from a COLMAP model, or from files of Strecha or 7-Scenes, one for each photo."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -50,6 +50,29 @@ def _read_strecha(path: Path) -> CameraPose:
     return CameraPose(rotation, np.asarray(values[21:24]))
 
 
+def _read_matrix(path: Path) -> CameraPose:
+    """Read a file with a matrix 4 x 4, camera to world, as 7-Scenes has them."""
+    try:
+        values = [float(v) for v in path.read_text(encoding="utf-8").split()]
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not a pose ({error})") from error
+    if len(values) != 16 or not np.isfinite(values).all():
+        raise UserError(f"{path}: not a pose (expected 4 x 4 finite numbers)")
+    matrix = np.asarray(values).reshape(4, 4)
+    # Single precision, and rounded when it was written.
+    rotation = matrix[:3, :3].T
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise UserError(f"{path}: its rotation is not a rotation matrix")
+    return CameraPose(rotation, matrix[:3, 3])
+
+
+def _photo_of(file: Path) -> str:
+    """The name of a pose file's photo without its suffix. 7-Scenes calls the photos
+    NAME.color.png."""
+    stem = file.name.removesuffix(".pose.txt")
+    return f"{stem}.color" if (file.parent / f"{stem}.color.png").is_file() else stem
+
+
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """Read the COLMAP model (binary or text) in a folder. Raises UserError if there is none."""
     suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
@@ -89,13 +112,14 @@ def find_model(path: Path) -> Path:
 
 
 def read_poses(path: Path, *, option: str = "--reference") -> Poses:
-    """Read reference poses: Strecha `.camera` files or a COLMAP model, in the folder or below it.
+    """Read reference poses, in the folder or below it: Strecha's `.camera` files, the `.pose.txt`
+    files of 7-Scenes, or a COLMAP model.
 
     Args:
       option: the option that names it, for messages.
 
     Raises:
-      UserError: there is nothing of either kind, or it is damaged.
+      UserError: there is nothing of these kinds, or it is damaged.
     """
     if not path.is_dir():
         raise UserError(f"{option} {path}: no such folder")
@@ -103,6 +127,8 @@ def read_poses(path: Path, *, option: str = "--reference") -> Poses:
         folder = path / sub
         if cameras := sorted(folder.glob("*.camera")):
             return {file.name.removesuffix(".camera"): _read_strecha(file) for file in cameras}
+        if matrices := sorted(folder.glob("*.pose.txt")):
+            return {_photo_of(file): _read_matrix(file) for file in matrices}
         if _has_model(folder):
             return model_poses(read_model(folder))
-    raise UserError(f"{option} {path}: neither Strecha .camera files nor a COLMAP model in it")
+    raise UserError(f"{option} {path}: no .camera files, .pose.txt files or COLMAP model in it")

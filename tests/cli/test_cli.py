@@ -382,7 +382,7 @@ def test_a_pair_file_with_an_unknown_name_is_refused(scene, tmp_path, capsys):
 
 def test_bad_references_are_explained(scene, plain, tmp_path, capsys):
     evaluate = ["evaluate", plain[0], "--reference"]
-    refuse(capsys, [*evaluate, tmp_path], "neither Strecha")
+    refuse(capsys, [*evaluate, tmp_path], "no .camera files")
     strangers, line = tmp_path / "strangers", tmp_path / "line"
     for folder in (strangers, line):
         folder.mkdir()

@@ -50,6 +50,36 @@ def test_strecha_files_come_back_by_image_name(tmp_path, sub):
     assert_poses(read_poses(tmp_path), truth)
 
 
+def matrix_of(pose: CameraPose) -> np.ndarray:
+    """Camera to world, float64 (4, 4)."""
+    return np.block([[pose.rotation.T, pose.centre[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+@pytest.mark.parametrize("colour", [False, True])
+def test_poses_of_7_scenes_come_back_by_the_photos_stem(tmp_path, colour):
+    truth = {f"frame-{i:06d}": pose for i, pose in enumerate(arc(4))}
+    for name, pose in truth.items():
+        np.savetxt(tmp_path / f"{name}.pose.txt", matrix_of(pose))
+        if colour:
+            (tmp_path / f"{name}.color.png").write_bytes(b"")
+    names = {f"{name}.color": pose for name, pose in truth.items()} if colour else truth
+    assert_poses(read_poses(tmp_path), names)
+
+
+@pytest.mark.parametrize("text", ["", "1 0 0 0\n0 1 0 0\n0 0 1 0\n", "no pose", "nan " * 4])
+def test_a_malformed_pose_is_refused_by_name(tmp_path, text):
+    (tmp_path / "frame-000000.pose.txt").write_text(text)
+    with pytest.raises(UserError, match="frame-000000.pose.txt: not a pose"):
+        read_poses(tmp_path)
+
+
+def test_a_pose_that_mirrors_is_refused(tmp_path):
+    matrix = matrix_of(arc(3)[0]) @ np.diag([-1, 1, 1, 1])
+    np.savetxt(tmp_path / "a.pose.txt", matrix)
+    with pytest.raises(UserError, match="not a rotation matrix"):
+        read_poses(tmp_path)
+
+
 def test_a_point_before_the_camera_projects_in_front(tmp_path):
     """World to camera: what the demo's cameras look at lies on their optical axis."""
     pose = arc(3)[0]
@@ -123,7 +153,7 @@ def test_only_registered_images_have_poses():
 
 def test_a_folder_with_neither_is_refused_naming_the_option(tmp_path):
     (tmp_path / "images").mkdir()
-    with pytest.raises(UserError, match=f"--reference {re.escape(str(tmp_path))}: neither Strecha"):
+    with pytest.raises(UserError, match=f"{re.escape(str(tmp_path))}: no .camera files"):
         read_poses(tmp_path)
     with pytest.raises(UserError, match="--other .*none: no such folder"):
         read_poses(tmp_path / "none", option="--other")

@@ -1,0 +1,293 @@
+"""Frames of a video with reference poses: models of some of them, and the others localized.
+
+`python -m jaxsfm.bench.sequence FOLDER --every 10,2,1` takes each tenth frame of a folder, then
+each second one, then all, and makes models of them with jaxsfm, and with COLMAP's RootSIFT on the
+same pairs and with the same camera. The folder is laid out as a sequence of 7-Scenes: `NAME.jpg`
+(or another format), `NAME.pose.txt` (camera to world) and `K.txt`. The figures are those of a run:
+seconds of each stage, the number of registered frames, the position errors after a similarity over
+all frames, and those of the first and the last tenth of the frames (drift).
+
+With `--localize 5`, each fifth frame is left out of the models, and is localized in them.
+"""
+
+import argparse
+import dataclasses
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jaxsfm.bench.figures import write_json
+from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.database import read_images
+from jaxsfm.colmap.inliers import read_inliers
+from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.mapper import MapOptions, first_models
+from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.resection import find_view
+from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.two_views import VerificationOptions
+from jaxsfm.colmap.view import View
+from jaxsfm.config import preset
+from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
+from jaxsfm.io.pair_selection import natural
+from jaxsfm.io.pairs import Pair, make_pair
+from jaxsfm.io.pixels import Pixels
+from jaxsfm.matching.pipeline import open_images
+from jaxsfm.runs.localize import localize_photos
+from jaxsfm.runs.localize_report import LocalizedPhoto
+from jaxsfm.runs.reconstruct import reconstruct_folder
+from jaxsfm.runs.run_options import LocalizeOptions, RunOptions
+from jaxsfm.sfm.evaluation import (
+    PoseError,
+    common_alignment,
+    evaluate,
+    own_rotation_deg,
+    pose_error,
+)
+
+if TYPE_CHECKING:
+    import pycolmap
+
+PHOTOS = (".jpg", ".jpeg", ".png")
+END = 0.1
+"""The share of the frames at either end whose errors are reported apart."""
+NEAR, NEAR_DEG = 0.05, 5.0
+"""A localized frame counts as right within this distance (units of the poses) and this angle: the
+limits of 7-Scenes (Shotton et al. 2013)."""
+MATCH_ERROR_PX = 12.0
+"""Of a match of RootSIFT with a point: the limit of COLMAP's mapper."""
+
+
+class Frames(NamedTuple):
+    """The frames of a folder that are used."""
+
+    mapped: list[Path]
+    localized: list[Path]
+
+
+def chosen_frames(folder: Path, every: int, localize: int) -> Frames:
+    """Each `every`-th frame by name; of these, each `localize`-th is localized (0: none).
+
+    Raises:
+      UserError: there are fewer than three frames.
+    """
+    found = [p for p in folder.iterdir() if p.suffix.lower() in PHOTOS]
+    frames = sorted(found, key=lambda path: natural(path.name))[::every]
+    if len(frames) < 3:
+        raise UserError(f"{folder}: fewer than three frames")
+    out = frames[localize // 2 :: localize] if localize else []
+    return Frames([path for path in frames if path not in out], out)
+
+
+def _linked(frames: list[Path], folder: Path) -> Path:
+    """A folder with links to some frames."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for frame in frames:
+        if not (folder / frame.name).exists():
+            os.symlink(frame.absolute(), folder / frame.name)
+    return folder
+
+
+def errors(model: Poses, truth: Poses) -> dict[str, Json]:
+    """Position errors of a model after the best similarity, and those of its ends."""
+    found = evaluate(model, truth)
+    names = sorted(found.images, key=natural)
+    count = max(1, round(END * len(names)))
+    ends = [names[:count], names[-count:]]
+    return {
+        "registered": len(names),
+        "position": found.position["mean"],
+        "rotation_deg": found.rotation_deg["mean"],
+        "own_rotation_deg": own_rotation_deg(model, truth),
+        "ends": [float(np.mean([found.images[n].position for n in end])) for end in ends],
+    }
+
+
+def _summary(found: Mapping[str, PoseError], frames: int, seconds: float) -> dict[str, Json]:
+    """What became of localized frames; those without a pose have no error."""
+    each = list(found.values())
+    near = [e for e in each if e.position < NEAR and e.rotation_deg < NEAR_DEG]
+    return {
+        "frames": frames,
+        "placed": len(each),
+        "near": len(near),
+        "median_position": float(np.median([e.position for e in each])) if each else None,
+        "median_rotation_deg": float(np.median([e.rotation_deg for e in each])) if each else None,
+        "seconds": seconds,
+        "each": {name: dataclasses.asdict(error) for name, error in sorted(found.items())},
+    }
+
+
+class Sequence(NamedTuple):
+    """The input of all methods."""
+
+    folder: Path
+    """Of the frames and their poses."""
+    frames: Frames
+    work: Path
+    """Where results are kept."""
+    known: str | None
+    """The value of `--intrinsics`; None: the camera is not known."""
+    truth: Poses
+
+
+def with_jaxsfm(given: Sequence, name: str) -> tuple[dict[str, Json], set[Pair]]:
+    """Models of a preset, and localized frames; the pairs that were tried, for other methods."""
+    out = given.work / name
+    report = reconstruct_folder(
+        _linked(given.frames.mapped, given.work / "frames"),
+        out,
+        config=preset(name),
+        options=RunOptions(intrinsics=given.known, keep_features=True, progress=True),
+    )
+    row: dict[str, Json] = {
+        "verdict": report.verdict,
+        "seconds": dict(report.seconds),
+        **errors(model_poses(read_model(out / "sparse" / "0")), given.truth),
+    }
+    pairs = {each.pair for each in report.pairs.each}
+    if given.frames.localized:
+        start = time.monotonic()
+        options = LocalizeOptions(
+            intrinsics=given.known, reference=given.folder, keep_features=True, progress=True
+        )
+        found = localize_photos(given.frames.localized, out, options=options).photos
+        seconds = time.monotonic() - start
+        placed = {}
+        for each in found:
+            photo = Path(each.photo).name
+            pairs |= {make_pair(photo, other) for other in each.shortlist or ()}
+            if isinstance(each, LocalizedPhoto) and each.error is not None:
+                placed[photo] = each.error
+        row["localized"] = _summary(placed, len(found), seconds)
+        row["trusted"] = sum(each.status == "localized" for each in found)
+    return row, pairs
+
+
+def with_rootsift(given: Sequence, pairs: set[Pair]) -> dict[str, Json]:
+    """The same of COLMAP's features on given pairs: a model of its incremental mapper, and frames
+    localized by the matches with points of the model."""
+    out = given.work / "rootsift"
+    out.mkdir(parents=True, exist_ok=True)
+    every = [*given.frames.mapped, *given.frames.localized]
+    images, _ = open_images(_linked(every, given.work / "all"))
+    known = parse_intrinsics(given.known) if given.known else None
+    database, start = out / "database.db", time.monotonic()
+    write_rootsift_database(
+        database,
+        given.work / "all",
+        images,
+        Cameras(known=known),
+        VerificationOptions(),
+        pairs=sorted(pairs),
+    )
+    matched = time.monotonic()
+    names = [frame.name for frame in given.frames.mapped]
+    options = MapOptions(refine_intrinsics=known is None)
+    models = first_models(database, options, names=names).models
+    mapped = time.monotonic()
+    row: dict[str, Json] = {
+        "seconds": {"matching": matched - start, "mapping": mapped - matched},
+        **errors(model_poses(models[0]), given.truth),
+    }
+    if given.frames.localized:
+        placed = _placed_by_matches(given, database, models[0])
+        row["localized"] = _summary(placed, len(given.frames.localized), time.monotonic() - mapped)
+    return row
+
+
+def _placed_by_matches(
+    given: Sequence, database: Path, model: "pycolmap.Reconstruction"
+) -> dict[str, PoseError]:
+    """The errors of frames whose pose follows from their matches with the model's keypoints."""
+    inliers, cameras = read_inliers(database), read_images(database)
+    point_of = {
+        model.image(k).name: {
+            i: model.point3D(p.point3D_id).xyz
+            for i, p in enumerate(model.image(k).points2D)
+            if p.has_point3D()
+        }
+        for k in model.reg_image_ids()
+    }
+    _, _, to_truth = common_alignment(model_poses(model), given.truth)
+    found = {}
+    for frame in given.frames.localized:
+        xy, points = [], []
+        for (a, b), rows in inliers.matches.items():
+            if frame.name not in (a, b):
+                continue
+            other, side = (b, 0) if a == frame.name else (a, 1)
+            known = point_of.get(other, {})
+            for row in rows:
+                if int(row[1 - side]) in known:
+                    xy.append(inliers.keypoints[frame.name].xy[row[side]])
+                    points.append(known[int(row[1 - side])])
+        number, camera = cameras[frame.name]
+        size = (camera.width, camera.height)
+        view = View.without_pose(frame.name, number, camera, size, Pixels((1.0, 1.0)))
+        at = find_view(
+            view,
+            np.asarray(xy).reshape(-1, 2),
+            np.asarray(points).reshape(-1, 3),
+            max_error_px=MATCH_ERROR_PX,
+            estimate_focal_length=False,
+            seed=0,
+        )
+        if at is not None:
+            pose = to_truth.moved(CameraPose(at.rotation, at.centre))
+            found[frame.name] = pose_error(pose, given.truth[frame.stem])
+    return found
+
+
+def measure(given: Sequence, methods: list[str]) -> list[dict[str, Json]]:
+    """A row for each method; those of presets come first, because they choose the pairs.
+
+    Raises:
+      UserError: a frame, a pose or an option cannot be used.
+    """
+    pairs: set[Pair] = set()
+    rows = []
+    for method in sorted(methods, key=lambda name: name == "rootsift"):
+        if method == "rootsift":
+            row = with_rootsift(given, pairs)
+        else:
+            row, pairs = with_jaxsfm(given, method)
+        frames = len(given.frames.mapped)
+        rows.append({"method": method, "frames": frames, "known": given.known is not None, **row})
+        told = {k: v for k, v in rows[-1].items() if k != "localized"}
+        print("\t".join(f"{name} {value}" for name, value in told.items()), flush=True)
+        if isinstance(local := row.get("localized"), dict):
+            print("localized", {k: v for k, v in local.items() if k != "each"}, flush=True)
+    return rows
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure some numbers of frames, and print a row for each."""
+    parser = argparse.ArgumentParser(prog="jaxsfm.bench.sequence", description=__doc__)
+    parser.add_argument("folder", type=Path, help="with the frames, their poses and K.txt")
+    parser.add_argument("--every", default="10", help="which frames are used, for example 10,2,1")
+    parser.add_argument("--localize", type=int, default=0, help="each so many is localized")
+    parser.add_argument("--methods", default="default,rootsift", help="presets, and rootsift")
+    parser.add_argument("--unknown", action="store_true", help="do not use K.txt")
+    parser.add_argument("--out", type=Path, required=True, help="where results are kept")
+    parser.add_argument("--json", type=Path, help="write all figures to this file")
+    options = parser.parse_args(arguments)
+    truth = read_poses(options.folder)
+    known = None if options.unknown else str(options.folder / "K.txt")
+    rows = []
+    for every in map(int, options.every.split(",")):
+        frames = chosen_frames(options.folder, every, options.localize)
+        work = options.out / f"every-{every}{'-unknown' * options.unknown}"
+        given = Sequence(options.folder, frames, work, known, truth)
+        rows += measure(given, options.methods.split(","))
+        if options.json:
+            write_json(options.json, {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()
