@@ -1,5 +1,7 @@
 """Laws of images and templates that stay on the device, and of calls that are not waited for."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -28,6 +30,30 @@ def assert_same(some: list[AlignedBlock], others: list[AlignedBlock]) -> None:
     for one, other in zip(some, others, strict=True):
         for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
             np.testing.assert_array_equal(x, y)
+
+
+def test_views_that_show_nothing_of_a_block_change_nothing(rendered, in_blocks):
+    """Their photos are not even read: there are none."""
+    alone = blocks_of(rendered, images_of(rendered))
+    model = exact_model(rendered)
+    away = [
+        dataclasses.replace(view, name="away", rotation=np.diag([-1.0, 1, -1]) @ view.rotation)
+        for view in model.views[:2]
+    ]
+    views = [away[0], *model.views[:3], away[1], *model.views[3:]]
+    place = np.asarray([1, 2, 3, 5, 6])
+    tracks = model.tracks._replace(view=place[model.tracks.view])
+    wider = dataclasses.replace(model, views=views, tracks=tracks)
+    found = list(align_blocks(wider, images_of(rendered), REFINEMENT, LIMITS))
+    assert len(found) == len(alone) == 3
+    for one, other in zip(found, alone, strict=True):
+        assert {*one.found.view} == {*place}
+        back = np.argsort(place)
+        number = np.full(len(views), -1)
+        number[place] = back
+        patches = one.patches._replace(reference=number[one.patches.reference])
+        same = one._replace(patches=patches, found=one.found._replace(view=number[one.found.view]))
+        assert_same([same], [other])
 
 
 @pytest.fixture
