@@ -225,13 +225,15 @@ def _not_hidden(view: View, surface: np.ndarray, points: np.ndarray) -> np.ndarr
         the same depth or lie behind it.
     """
     xy, depth = view.project(surface)
-    known = np.isfinite(xy).all(1)
+    reach = REACH * max(view.size)
+    with np.errstate(invalid="ignore"):  # what lies further outside is near no pixel of the image
+        known = ((xy > -1 - reach) & (xy < np.asarray(view.size) + reach)).all(1)
     xy, depth = xy[known], depth[known]
     if len(xy) < AROUND or not len(points):
         return np.zeros(len(points), bool)
     at, own = view.project(points)
     distance, nearest = map(np.asarray, KDTree(xy).query(at, k=AROUND))
-    near = distance < REACH * max(view.size)
+    near = distance < reach
     ratio = depth[nearest] / own[:, None]
     need = np.maximum(MOST * near.sum(1), AROUND / 2)
     same = (near & (np.abs(ratio - 1) < SAME_DEPTH)).sum(1) >= need
