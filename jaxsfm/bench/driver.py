@@ -102,7 +102,7 @@ def measure(photos: int, folder: Path) -> dict[str, float]:
     verdicts = timed("view graph", lambda: trusted_pairs(geometries))
     counts = {p: geometries[p].num_inliers for p, each in verdicts.items() if each.trusted}
     graph = graph_of(counts)
-    parts = timed("parts", lambda: overlapping_parts(graph, most=PART, overlap=OVERLAP))
+    parts = timed("parts", lambda: overlapping_parts(graph, size=PART, overlap=OVERLAP))
     on_disk = sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
     return {
         "photos": photos,

@@ -58,7 +58,7 @@ def map_in_parts(
     Raises:
       UserError: COLMAP failed.
     """
-    parts = overlapping_parts(graph_of(matches), most=PART, overlap=OVERLAP)
+    parts = overlapping_parts(graph_of(matches), size=PART, overlap=OVERLAP)
     logger.info("mapping in %d parts", len(parts))
     found: list[pycolmap.Reconstruction] = []
     attempts: list[Attempt] = []

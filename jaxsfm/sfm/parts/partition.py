@@ -16,8 +16,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from jaxsfm.io.pairs import Pair
 
-MIDDLE = 1 / 3
-"""A part is cut between this share of its photos and the rest, so that both halves shrink."""
+SLACK = 0.25
+"""A cut may lie so many sizes of a part beside the place where all parts would be equal, and a part
+may be larger by twice as much."""
 MOST_ADDED = 0.5
 """A part grows at most by this share by the photos of its neighbours."""
 
@@ -44,11 +45,12 @@ def graph_of(matches: Mapping[Pair, int]) -> Graph:
     return Graph(names, csr_array(weights))
 
 
-def overlapping_parts(graph: Graph, *, most: int, overlap: int) -> list[list[str]]:
+def overlapping_parts(graph: Graph, *, size: int, overlap: int) -> list[list[str]]:
     """Parts that cover all photos. The order of pairs and photos has no effect.
 
     Args:
-      most: the number of photos of a part before its neighbours' photos are added.
+      size: the number of photos of a part before its neighbours' photos are added. Parts may have
+        half as many more.
       overlap: about so many photos are in two parts that were cut apart; half of them come from
         either side.
 
@@ -58,8 +60,8 @@ def overlapping_parts(graph: Graph, *, most: int, overlap: int) -> list[list[str
     Raises:
       ValueError: a number is too small.
     """
-    if most < 2 or overlap < 0:
-        raise ValueError(f"most must be at least 2 and overlap 0; got {most} and {overlap}")
+    if size < 2 or overlap < 0:
+        raise ValueError(f"size must be at least 2 and overlap 0; got {size} and {overlap}")
     cores: list[np.ndarray] = []
     todo = [np.arange(len(graph.names))] if graph.names else []
     while todo:
@@ -68,18 +70,19 @@ def overlapping_parts(graph: Graph, *, most: int, overlap: int) -> list[list[str
         count, label = connected_components(inside, directed=False)
         if count > 1:
             todo += [photos[label == k] for k in range(count)]
-        elif len(photos) <= most:
+        elif len(photos) <= (1 + 2 * SLACK) * size:
             cores.append(photos)
         else:
-            todo += [photos[side] for side in _halves(inside)]
+            todo += [photos[side] for side in _halves(inside, size)]
     whole = [
         np.sort(np.r_[core, _beside(graph, cores, k, overlap)]) for k, core in enumerate(cores)
     ]
     return sorted([graph.names[i] for i in part] for part in whole)
 
 
-def _halves(weights: csr_array) -> tuple[np.ndarray, np.ndarray]:
-    """The two sides of a cut through a connected graph, int, ascending."""
+def _halves(weights: csr_array, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The two sides of a cut through a connected graph, int, ascending. Each has about a whole
+    number of times the size of a part."""
     lengths = csr_array((1 / weights.data, weights.indices, weights.indptr), shape=weights.shape)
     start = int(np.argmax(dijkstra(lengths, directed=False, indices=0)))
     order = np.argsort(dijkstra(lengths, directed=False, indices=start), kind="stable")
@@ -91,8 +94,10 @@ def _halves(weights: csr_array) -> tuple[np.ndarray, np.ndarray]:
     change = np.bincount(first + 1, edges.data, len(order) + 1)
     change -= np.bincount(last + 1, edges.data, len(order) + 1)
     across = np.cumsum(change)
-    low = max(1, int(MIDDLE * len(order)))
-    cut = low + int(np.argmin(across[low : len(order) - low + 1]))
+    parts = -(-len(order) // size)
+    each = len(order) / parts
+    low, high = (max(1, round(each * (parts // 2 + slack))) for slack in (-SLACK, SLACK))
+    cut = low + int(np.argmin(across[low : min(high, len(order) - 1) + 1]))
     return np.sort(order[:cut]), np.sort(order[cut:])
 
 
