@@ -31,6 +31,8 @@ HEIGHT = (-3.0, 1.5)
 """From where to where points lie, metres; y is down."""
 BLOCK = 5.0
 """Points are drawn for stretches of the street of this length, metres."""
+FIRST_BLOCK = 1000
+"""Stretches are counted from this many before the beginning, so that no number is negative."""
 
 
 class SimulatedPhoto(NamedTuple):
@@ -88,6 +90,11 @@ class SimulatedStreet:
         """The keypoints of a photo."""
         return self._photo(k)
 
+    def point(self, number: int) -> np.ndarray:
+        """A point of the street, float64 (3,), metres."""
+        stretch, index = divmod(number, self._count)
+        return self._block(stretch - FIRST_BLOCK)[index]
+
     def matches(self, pair: Pair) -> PairResult:
         """The matches of two photos: the points that both show."""
         one, other = (self._photo(int(name[5:11])) for name in pair)
@@ -106,7 +113,7 @@ class SimulatedStreet:
 
     def _make_block(self, number: int) -> np.ndarray:
         """The points of a stretch of the street, float64 (n, 3)."""
-        rng = np.random.default_rng([self._seed, 1, number + 1000])
+        rng = np.random.default_rng([self._seed, 1, number + FIRST_BLOCK])
         x = BLOCK * (number + rng.random(self._count))
         y = rng.uniform(*HEIGHT, self._count)
         return np.stack([x, y, DEPTH + rng.uniform(-1, 1, self._count)], axis=1)
@@ -117,7 +124,7 @@ class SimulatedStreet:
         blocks = range(at - 2, at + 3)
         points = np.concatenate([self._block(number) for number in blocks])
         ids = np.concatenate(
-            [(number + 1000) * self._count + np.arange(self._count) for number in blocks]
+            [(number + FIRST_BLOCK) * self._count + np.arange(self._count) for number in blocks]
         )
         x, y, depth = camera @ pose.rotation @ (points - pose.centre).T
         rng = np.random.default_rng([self._seed, 2, k])

@@ -137,7 +137,7 @@ class RunStages:
             cameras=self.cameras,
             options=MapOptions(
                 mapper="global" if options.mapper == "global" else "incremental",
-                in_parts=options.mapper == "auto",
+                in_parts=options.mapper == "parts",
                 refine_intrinsics=options.refines,
                 seed=options.seed,
                 threads=options.threads,

@@ -15,7 +15,7 @@ from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 8
+FORMAT = 9
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 

@@ -69,7 +69,7 @@ def runs(monkeypatch, outcomes):
     """`_run` gives these outcomes in turn; the (mapper, initial pair) of every call are kept."""
     calls, left = [], list(outcomes)
 
-    def run(database, options, initial, on_image):
+    def run(database, options, initial, on_image, names=()):
         calls.append((options.mapper, initial))
         return left.pop(0)
 
@@ -106,7 +106,7 @@ def test_connected_images_left_out_are_tried_from_other_pairs_and_the_best_count
 def test_after_a_draft_the_whole_run_is_tried_before_other_pairs(monkeypatch, tmp_path):
     drafts, left = [], [[model("ab")], [model("abc")], [model("abcdef")], [model("ab")]]
 
-    def run(database, options, initial, on_image):
+    def run(database, options, initial, on_image, names=()):
         drafts.append((options.draft, initial))
         return left.pop(0)
 

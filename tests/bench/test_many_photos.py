@@ -1,0 +1,112 @@
+"""Laws of what many photos are measured with: a rendered street, simulated matches, the driver, and
+frames of a sequence."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jaxsfm.bench import driver, sequence
+from jaxsfm.bench.long_street import SIZE, walk, write_street
+from jaxsfm.bench.simulated import NOISE_PX, REACH, SimulatedStreet
+from jaxsfm.bench.synthetic import camera_matrix
+from jaxsfm.colmap.poses import read_poses
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import inspect_image
+from jaxsfm.io.photo_folder import find_images
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory):
+    """Eleven photos of a street."""
+    folder = tmp_path_factory.mktemp("street")
+    write_street(folder, 11)
+    return folder
+
+
+def test_a_street_has_photos_of_one_size_and_their_exact_cameras(street):
+    names = find_images(street / "images")
+    poses = read_poses(street / "reference")
+    assert sorted(poses) == sorted(names) and len(names) == 11
+    for name, pose in zip(sorted(poses), walk(11), strict=True):
+        np.testing.assert_allclose(poses[name].centre, pose.centre, atol=1e-6)
+        assert inspect_image(street / "images" / name).size == SIZE
+
+
+def test_a_longer_street_begins_with_the_shorter_one(street, tmp_path):
+    """So photos of a short street need not be rendered again."""
+    write_street(tmp_path, 12)
+    first = "photo00000.png"
+    assert [p.centre.tolist() for p in walk(12)[:11]] == [p.centre.tolist() for p in walk(11)]
+    same = (tmp_path / "images" / first).read_bytes() == (street / "images" / first).read_bytes()
+    assert same
+
+
+def test_simulated_keypoints_lie_a_pixel_from_where_the_camera_sees_their_points():
+    photos = SimulatedStreet(3)
+    one = photos.photo(1)
+    assert len(one.points) > 200 and len(np.unique(one.cells)) == len(one.cells)
+    pose, away = photos.poses[1], []
+    for point, xy in zip(one.points, one.xy, strict=True):
+        at = camera_matrix(SIZE) @ pose.rotation @ (photos.point(int(point)) - pose.centre)
+        away.append(at[:2] / at[2] - xy)
+    assert np.std(away) == pytest.approx(NOISE_PX, rel=0.15)
+
+
+def test_simulated_matches_join_keypoints_of_one_point_and_depend_on_the_pair_alone():
+    photos, others = SimulatedStreet(30), SimulatedStreet(30)
+    pairs = photos.pairs()
+    assert len(pairs) == sum(min(REACH, 29 - k) for k in range(30))
+    found = photos.matches(pairs[5])
+    again = [others.matches(pair) for pair in reversed(pairs)][-6]
+    assert found.pair == again.pair and found.num_inliers > 50
+    np.testing.assert_array_equal(found.cells, again.cells)
+    np.testing.assert_array_equal(found.keypoints1, again.keypoints1)
+    assert all(len(np.unique(column)) == len(column) for column in found.cells.T)
+
+
+def test_the_driver_is_measured_stage_by_stage(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "NEAREST", 5)
+    row = driver.measure(30, tmp_path)
+    assert row["photos"] == 30 and row["pairs"] == len(SimulatedStreet(30).pairs())
+    assert row["trusted pairs"] > 100 and row["number of parts"] == 1
+    assert all(row[stage] >= 0 for stage in ("keep", "read", "verification", "view graph"))
+    json.dumps(row)
+
+
+def sequence_of(street, folder):
+    """The street as a sequence of 7-Scenes."""
+    folder.mkdir()
+    for name, pose in read_poses(street / "reference").items():
+        stem = name.removesuffix(".png")
+        (folder / name).write_bytes((street / "images" / name).read_bytes())
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = pose.rotation.T, pose.centre
+        np.savetxt(folder / f"{stem}.pose.txt", matrix)
+    (folder / "K.txt").write_text((street / "K.txt").read_text())
+    return folder
+
+
+def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street, tmp_path):
+    folder = sequence_of(street, tmp_path / "frames")
+    every = sequence.chosen_frames(folder, 1, 0)
+    assert len(every.mapped) == 11 and not every.localized
+    second = sequence.chosen_frames(folder, 2, 3)
+    assert [path.stem for path in second.localized] == ["photo00002", "photo00008"]
+    assert len(second.mapped) == 4 and not {*second.mapped} & {*second.localized}
+    with pytest.raises(UserError, match="fewer than three"):
+        sequence.chosen_frames(folder, 5, 0) and sequence.chosen_frames(folder, 10, 0)
+
+
+@pytest.mark.slow
+def test_frames_are_mapped_and_localized_beside_rootsift(street, tmp_path):
+    folder = sequence_of(street, tmp_path / "frames")
+    figures = tmp_path / "figures.json"
+    options = ["--every", "1", "--localize", "5", "--out", str(tmp_path / "out")]
+    sequence.main([str(folder), *options, "--json", str(figures)])
+    ours, theirs = json.loads(figures.read_text())["rows"]
+    assert (ours["method"], theirs["method"]) == ("default", "rootsift")
+    assert ours["registered"] == ours["frames"] == 9
+    assert ours["position"] < 0.02 and ours["localized"]["near"] == 2
+    assert theirs["registered"] >= 3 and theirs["localized"]["frames"] == 2
+    assert ours["seconds"].keys() >= {"extraction", "matching", "mapping", "refinement"}
