@@ -19,6 +19,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.long_street import SIZE
 from jaxsfm.bench.memory import peak_bytes
 from jaxsfm.bench.simulated import SimulatedStreet
@@ -126,15 +127,16 @@ def main(arguments: list[str] | None = None) -> None:
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
             target = Path(scratch) / "row.json"
             code = (
-                "import json, pathlib; from jaxsfm.bench.driver import measure; "
+                "import pathlib; from jaxsfm.bench.driver import measure; "
+                "from jaxsfm.bench.figures import write_json; "
                 f"folder = pathlib.Path({scratch!r}); "
-                f"(folder / 'row.json').write_text(json.dumps(measure({photos}, folder)))"
+                f"write_json(folder / 'row.json', measure({photos}, folder))"
             )
             subprocess.run([sys.executable, "-c", code], check=True)
-            rows.append(json.loads(target.read_text()))
+            rows.append(json.loads(target.read_text(encoding="utf-8")))
         print("\t".join(f"{name} {value:.6g}" for name, value in rows[-1].items()), flush=True)
     if given.json:
-        given.json.write_text(json.dumps(rows, indent=1))
+        write_json(given.json, {"rows": rows})
 
 
 if __name__ == "__main__":
