@@ -44,10 +44,15 @@ def _read_strecha(path: Path) -> CameraPose:
         raise UserError(f"{path}: not a Strecha camera file ({error})") from error
     if len(values) < 24 or not np.isfinite(values).all():
         raise UserError(f"{path}: not a Strecha camera file (expected at least 24 finite numbers)")
-    rotation = np.asarray(values[12:21]).reshape(3, 3).T
+    return _pose(path, np.asarray(values[12:21]).reshape(3, 3), np.asarray(values[21:24]))
+
+
+def _pose(path: Path, camera_to_world: np.ndarray, centre: np.ndarray) -> CameraPose:
+    """The pose of a file; UserError if its matrix (3, 3) is no rotation, up to rounding."""
+    rotation = camera_to_world.T
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise UserError(f"{path}: its rotation is not a rotation matrix")
-    return CameraPose(rotation, np.asarray(values[21:24]))
+    return CameraPose(rotation, centre)
 
 
 def _read_matrix(path: Path) -> CameraPose:
@@ -59,11 +64,7 @@ def _read_matrix(path: Path) -> CameraPose:
     if len(values) != 16 or not np.isfinite(values).all():
         raise UserError(f"{path}: not a pose (expected 4 x 4 finite numbers)")
     matrix = np.asarray(values).reshape(4, 4)
-    # Single precision, and rounded when it was written.
-    rotation = matrix[:3, :3].T
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise UserError(f"{path}: its rotation is not a rotation matrix")
-    return CameraPose(rotation, matrix[:3, 3])
+    return _pose(path, matrix[:3, :3], matrix[:3, 3])
 
 
 def _photo_of(file: Path) -> str:

@@ -16,19 +16,18 @@ from jaxsfm.colmap.mapper import MapOptions, registered
 from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.checker import CheckedModel, Checker
-from jaxsfm.sfm.model_join import ERROR_PX, adjusted, find_join, joined
+from jaxsfm.sfm.model_join import (
+    ERROR_PX,
+    JOIN_ERROR_PX,
+    MIN_SHARED,
+    adjusted,
+    find_join,
+    joined,
+)
 
 if TYPE_CHECKING:
     import pycolmap
 
-MIN_SHARED = 3
-"""The least number of photos that two models must share. Two share a pair, which may be false in
-both models."""
-JOIN_ERROR_PX = 12.0
-"""Points of two models that are one fall together so nearly, working pixels. Before refinement,
-models are bent: of 2548 common points of two right models of *statue* (43 and 17 photos), 17 fall
-together within 2.7 pixels, 1867 within 8 and 2451 within 16. COLMAP allows as much for a photo that
-it adds."""
 MIN_OBSERVATIONS = 30
 """A photo that sees fewer points has no sure place: COLMAP registers none with fewer inliers."""
 

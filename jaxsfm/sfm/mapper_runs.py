@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from jaxsfm.colmap.inliers import keep_inliers, read_inliers
 from jaxsfm.colmap.mapper import (
     Attempt,
@@ -65,18 +67,21 @@ class MapperRuns:
 
         If the models of the parts do not agree with each other, the mapper is given all photos.
         """
+        chosen = None
         if self._share:
             shutil.copyfile(self._database, self._given)
-            keep_inliers(self._given, mapper_matches(read_inliers(self._given)))
-        made = self._in_parts() if self._options.in_parts else None
+            chosen = mapper_matches(read_inliers(self._given))
+            keep_inliers(self._given, chosen)
+        made = self._in_parts(chosen) if self._options.in_parts else None
         if made is None:
             made = first_models(self._given, self._mapping, on_image=self._on_image)
         self.attempts += made.attempts
         return made
 
-    def _in_parts(self) -> Mapped | None:
+    def _in_parts(self, chosen: Mapping[Pair, np.ndarray] | None) -> Mapped | None:
         """The models of runs for parts; None for few photos, and if the models do not agree."""
-        matches = {pair: len(rows) for pair, rows in read_inliers(self._given).matches.items()}
+        given = read_inliers(self._given).matches if chosen is None else chosen
+        matches = {pair: len(rows) for pair, rows in given.items()}
         if len({name for pair in matches for name in pair}) <= MANY:
             return None
         return map_in_parts(self._given, matches, self._mapping, on_image=self._on_image)

@@ -17,11 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.sfm.evaluation import Similarity
-from jaxsfm.sfm.model_join import find_join
+from jaxsfm.sfm.model_join import MIN_SHARED, find_join
 
-MIN_SHARED = 3
-"""The least number of photos that two models must share. Two share a pair, which may be false in
-both models."""
 SAMPLE = 60
 """So many points that two models share say how these lie to each other."""
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))

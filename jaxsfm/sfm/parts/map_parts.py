@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from jaxsfm.colmap.mapper import Attempt, MapOptions, Mapped, first_models, ordered, registered
 from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.io.pairs import Pair
-from jaxsfm.sfm.model_join import ERROR_PX, adjusted
-from jaxsfm.sfm.parts.frames import MIN_SHARED, common_frames, shared_points
+from jaxsfm.sfm.model_join import ERROR_PX, JOIN_ERROR_PX, MIN_SHARED, adjusted
+from jaxsfm.sfm.parts.frames import common_frames, shared_points
 from jaxsfm.sfm.parts.merge import merged
 from jaxsfm.sfm.parts.partition import graph_of, overlapping_parts
 
@@ -25,9 +25,6 @@ MANY = 200
 """More photos than these are mapped in parts."""
 PART, OVERLAP = 80, 20
 """Photos of a part, and photos that two parts share."""
-JOIN_ERROR_PX = 12.0
-"""Points of two models that are one fall together so nearly, working pixels, as in
-`jaxsfm.sfm.joined_models`."""
 COARSE = 16.0
 """The first adjustment of the whole allows so many times the error of a right observation: where
 models lie in a ring, its ends may not meet."""
