@@ -20,10 +20,8 @@ from typing import TypeVar
 import numpy as np
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.long_street import SIZE
 from jaxsfm.bench.memory import peak_bytes
 from jaxsfm.bench.simulated import SimulatedStreet
-from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
@@ -93,8 +91,7 @@ def measure(photos: int, folder: Path) -> dict[str, float]:
     timed("keep", keep)
     timed("read", lambda: sum(store.load_matches(pair) is not None for pair in pairs))
     database = folder / "database.db"
-    k = camera_matrix(SIZE)
-    known = parse_intrinsics(f"PINHOLE:{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}")
+    known = parse_intrinsics(street.intrinsics())
     saved = SavedMatches(Looks(store), pairs)
     timed("database", lambda: write_database(database, images, saved, Cameras(known=known)))
     timed("verification", lambda: verify(database, VerificationOptions()))

@@ -2,8 +2,9 @@
 
 `python -m jaxsfm.bench.long_street FOLDER --photos 1000` writes the photos (`images/`), the exact
 cameras (`reference/`, Strecha's format) and `K.txt`. Each photo sees as much of the street as any
-other one, and no two parts of the street look alike, so only the number of photos differs between a
-short street and a long one. Results on it must be called synthetic.
+other one, so only the number of photos differs between a short street and a long one. The pictures
+on the walls are parts of nine photographs, so a picture may look like another one elsewhere.
+Results on it must be called synthetic.
 """
 
 import argparse

@@ -73,6 +73,11 @@ class SimulatedStreet:
             for k in range(len(self.poses))
         ]
 
+    def intrinsics(self) -> str:
+        """The camera of all photos, as `--intrinsics` takes it."""
+        k = camera_matrix(SIZE)
+        return f"PINHOLE:{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}"
+
     def name(self, k: int) -> str:
         """The name of a photo."""
         return f"photo{k:06d}.png"

@@ -12,9 +12,7 @@ from mapped import verified
 from room_scene import noisy_model
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.bench.long_street import SIZE
 from jaxsfm.bench.simulated import SimulatedStreet
-from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
@@ -279,8 +277,7 @@ def test_a_photo_has_the_pose_of_the_model_in_which_it_sees_most(whole):
 def simulated_database(path, photos: int) -> dict[tuple[str, str], int]:
     """A verified database of a simulated street; returns the numbers of matches of its pairs."""
     street = SimulatedStreet(photos)
-    k = camera_matrix(SIZE)
-    known = f"PINHOLE:{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}"
+    known = street.intrinsics()
     matches = {pair: street.matches(pair) for pair in street.pairs()}
     write_database(path, street.images(), matches, Cameras(known=parse_intrinsics(known)))
     return {p: v.geometry.num_inliers for p, v in verified(path, OPTIONS).items()}

@@ -17,8 +17,8 @@ CHUNK = 256
 of 128 to 1024 and 47 us in chunks of 4096, and most views of a large model have a few hundred in a
 block."""
 FEW = 64
-"""Fewer keypoints than these are aligned by a call of their own length. A test of a second place
-has templates from 40 views, with 10 of them from a view."""
+"""So many keypoints, or fewer, are aligned by a call of this length. In a street of 100 photos, a
+test of a second place made 43 calls for templates, most of which were mostly filling."""
 ACCELERATOR_FACTOR = 8
 """An accelerator aligns up to so many times as many keypoints by one call. Its lanes are filled by
 the samples of about 2000 patches. The factor changes no result, and it has not been measured."""
