@@ -113,9 +113,10 @@ class UsedLooks:
     first_px: Count
     """The longer side of the photos in the first look, pixels."""
     photos: list[str] = field(default_factory=list)
-    """The photos that had no place in the model after it. Pairs with them were matched again."""
+    """The photos that had no sure place in the model after it."""
     again: list[tuple[str, str]] = field(default_factory=list)
-    """The pairs that were matched again, at the size of the config."""
+    """The pairs that were matched again, at the size of the config: those with these photos. None,
+    if the sky is masked and all pairs would have been matched again."""
     whole: bool = False
     """Whether these are all pairs; then nothing of the first look was used."""
     in_vain: bool = False
@@ -131,10 +132,13 @@ class UsedLooks:
         if not self.photos:
             return f"all photos found a place with descriptions at {self.first_px} px"
         lost = "1 photo" if len(self.photos) == 1 else f"{len(self.photos)} photos"
+        start = f"{lost} found no sure place at {self.first_px} px"
+        if not self.again:
+            return f"{start}; no pair was matched again"
         which = "all pairs" if self.whole else f"{len(self.again)} pairs"
         return (
-            f"{lost} found no sure place at {self.first_px} px; {which} were matched again at full "
-            "size" + ", which gave no better model" * self.in_vain
+            f"{start}; {which} were matched again at full size"
+            + ", which gave no better model" * self.in_vain
         )
 
 

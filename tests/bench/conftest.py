@@ -1,7 +1,8 @@
-"""A data set that the tests of several benchmarks share."""
+"""Data sets that the tests of several benchmarks share."""
 
 import shutil
 
+import numpy as np
 import pytest
 
 
@@ -33,3 +34,30 @@ def simple(tmp_path_factory):
         f"PINHOLE:{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}\n"
     )
     return folder.parent
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory):
+    """Eleven photos of a street."""
+    from jaxsfm.bench.long_street import write_street
+
+    folder = tmp_path_factory.mktemp("street")
+    write_street(folder, 11)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def street_sequence(street, tmp_path_factory):
+    """The same street as a sequence of 7-Scenes."""
+    from jaxsfm.colmap.poses import read_poses
+
+    folder = tmp_path_factory.mktemp("sequence") / "frames"
+    folder.mkdir()
+    for name, pose in read_poses(street / "reference").items():
+        stem = name.removesuffix(".png")
+        shutil.copy(street / "images" / name, folder)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = pose.rotation.T, pose.centre
+        np.savetxt(folder / f"{stem}.pose.txt", matrix)
+    shutil.copy(street / "K.txt", folder)
+    return folder

@@ -16,14 +16,6 @@ from jaxsfm.io.images import inspect_image
 from jaxsfm.io.photo_folder import find_images
 
 
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    """Eleven photos of a street."""
-    folder = tmp_path_factory.mktemp("street")
-    write_street(folder, 11)
-    return folder
-
-
 def test_a_street_has_photos_of_one_size_and_their_exact_cameras(street):
     names = find_images(street / "images")
     poses = read_poses(street / "reference")
@@ -74,21 +66,8 @@ def test_the_driver_is_measured_stage_by_stage(tmp_path, monkeypatch):
     json.dumps(row)
 
 
-def sequence_of(street, folder):
-    """The street as a sequence of 7-Scenes."""
-    folder.mkdir()
-    for name, pose in read_poses(street / "reference").items():
-        stem = name.removesuffix(".png")
-        (folder / name).write_bytes((street / "images" / name).read_bytes())
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = pose.rotation.T, pose.centre
-        np.savetxt(folder / f"{stem}.pose.txt", matrix)
-    (folder / "K.txt").write_text((street / "K.txt").read_text())
-    return folder
-
-
-def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street, tmp_path):
-    folder = sequence_of(street, tmp_path / "frames")
+def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street_sequence):
+    folder = street_sequence
     every = sequence.chosen_frames(folder, 1, 0)
     assert len(every.mapped) == 11 and not every.localized
     second = sequence.chosen_frames(folder, 2, 3)
@@ -99,11 +78,10 @@ def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street, tmp_p
 
 
 @pytest.mark.slow
-def test_frames_are_mapped_and_localized_beside_rootsift(street, tmp_path):
-    folder = sequence_of(street, tmp_path / "frames")
+def test_frames_are_mapped_and_localized_beside_rootsift(street_sequence, tmp_path):
     figures = tmp_path / "figures.json"
     options = ["--every", "1", "--localize", "5", "--out", str(tmp_path / "out")]
-    sequence.main([str(folder), *options, "--json", str(figures)])
+    sequence.main([str(street_sequence), *options, "--json", str(figures)])
     ours, theirs = json.loads(figures.read_text())["rows"]
     assert (ours["method"], theirs["method"]) == ("default", "rootsift")
     assert ours["registered"] == ours["frames"] == 9

@@ -14,6 +14,7 @@ from jaxsfm.runs import mapping_looks, sky_masks
 from jaxsfm.runs.mapping_looks import map_in_looks
 from jaxsfm.runs.run_stages import MappedRun
 from jaxsfm.runs.sky_masks import without_sky
+from jaxsfm.sfm.second_look import SecondLook
 
 SIZE = (10, 10)
 
@@ -76,7 +77,7 @@ def test_masks_of_the_user_are_believed(tmp_path, skies):
 class Matched(str):
     """The matches of a look, which described the photos at full size."""
 
-    described = SimpleNamespace(checked=True)
+    described = SimpleNamespace(checked=True, max_size=800)
     counts: dict = {}
 
 
@@ -102,6 +103,9 @@ class Mapped:
     def settled(self) -> bool:
         return True  # own cameras are not tried
 
+    def unsettled(self, counts: dict) -> SecondLook:
+        return SecondLook(["a"], [("a", "b")], whole=not self.few_apart)
+
     better_than, largest = MappedRun.better_than, MappedRun.largest
 
 
@@ -114,6 +118,8 @@ class Stages:
     seconds: dict = dataclasses.field(default_factory=dict)
 
     def map(self, matched: object) -> Mapped:
+        if matched == "again":
+            return self.made["again"]
         assert matched == self.look and all(i.mask for i in self.images) == (self.look == "-sky")
         return self.made[self.look]
 
@@ -164,3 +170,30 @@ def test_the_sky_is_masked_if_this_helps_where_something_speaks_against_the_mode
     assert photos.tried == (["-sky"] if masked is not None else [])
     assert found.mapped is (second if masked else first)
     assert found.matched == ("-sky" if masked else "")
+
+
+@pytest.mark.parametrize(
+    ("masked", "looked_again"),
+    [
+        (Mapped(False, 108), False),
+        (Mapped(False, 108, few_apart=True), True),
+        (Mapped(False, 50), True),  # the sky is not masked, as this gives no better model
+    ],
+)
+def test_with_the_sky_masked_not_all_pairs_are_looked_at_again(
+    monkeypatch, tmp_path, skies, masked, looked_again
+):
+    """Such a model is amber at best, so nothing can be settled; single photos can."""
+    skies({"a": 40, "b": 40})
+    monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
+    monkeypatch.setattr(mapping_looks, "match_again", lambda *_: Matched("again"))
+    images = {name: image(name) for name in "ab"}
+    full_size = SimpleNamespace(config=SimpleNamespace(checked=True))
+    made = {"": Mapped(False, 60), "-sky": masked, "again": Mapped(True, 110)}
+    photos: Any = Photos(images, full_size)
+    stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
+    found = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]
+    assert found.looks is not None and found.looks.photos == ["a"]
+    assert bool(found.looks.again) == looked_again
+    assert found.mapped is (made["again"] if looked_again else masked)
+    assert ("no pair was matched again" in found.looks.in_words()) != looked_again

@@ -1,0 +1,90 @@
+"""Laws of how many true pairs are among the most similar photos."""
+
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+
+from jaxsfm.bench import recall
+from jaxsfm.bench.synthetic import camera_matrix
+from jaxsfm.colmap.poses import CameraPose
+from jaxsfm.errors import UserError
+
+SIZE = (90, 60)
+CAMERA = camera_matrix(SIZE)
+AHEAD = CameraPose(np.eye(3), np.zeros(3))
+
+
+def aside(share, depth):
+    """A camera that sees the rest of what AHEAD sees, moved by a share of its width."""
+    return CameraPose(np.eye(3), np.array([share * SIZE[0] * depth / CAMERA[0, 0], 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("share", "columns"), [(0.0, 9), (0.3, 6), (0.6, 4), (1.2, 0)])
+def test_a_camera_moved_by_a_share_of_the_width_sees_the_rest(share, columns):
+    """Of nine columns of rays that are evenly spread over the photo, some are lost."""
+    depth = 3.0
+    seen = recall.seen_share(AHEAD, aside(share, depth), CAMERA, SIZE, depth)
+    assert seen == pytest.approx(columns / 9)
+
+
+def test_what_lies_behind_a_camera_is_not_seen():
+    turned = CameraPose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
+    assert recall.seen_share(AHEAD, turned, CAMERA, SIZE, 2.0) == 0.0
+
+
+def test_by_poses_both_cameras_of_a_true_pair_see_half_of_the_other():
+    """A camera that stands far behind sees all of the other, but the other little of it."""
+    behind = CameraPose(np.eye(3), np.array([0.0, 0.0, -8.0]))
+    poses = {"a": AHEAD, "b": aside(0.3, 2.0), "c": aside(0.7, 2.0), "d": behind}
+    assert recall.pairs_by_poses(poses, CAMERA, SIZE, 2.0) == {("a", "b"), ("b", "c")}
+    assert recall.seen_share(AHEAD, behind, CAMERA, SIZE, 2.0) == 1.0
+    with_more_of_it_in_sight = recall.pairs_by_poses(poses, CAMERA, SIZE, 200.0)
+    assert ("a", "d") in with_more_of_it_in_sight
+
+
+def test_by_a_model_true_pairs_have_enough_points_in_common(tmp_path):
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=9, height=9, params=[9, 9, 4, 4], camera_id=1)
+    )
+    for k, name in enumerate("abc", 1):
+        photo = pycolmap.Image(name=f"{name}.png", camera_id=1, image_id=k)
+        photo.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.ones(2))] * 8)
+        model.add_image_with_trivial_frame(photo, pycolmap.Rigid3d())
+    for point in range(8):
+        track = pycolmap.Track()
+        for k in (1, 2, 3)[: 3 if point < 5 else 2]:
+            track.add_element(k, point)
+        model.add_point3D(np.array([0.0, 0.0, 3.0]), track)
+    model.write(tmp_path)
+    assert recall.pairs_by_model(tmp_path, 6) == {("a.png", "b.png")}
+    assert len(recall.pairs_by_model(tmp_path, 5)) == 3
+    assert not recall.pairs_by_model(tmp_path)
+
+
+def test_a_photo_is_connected_by_five_true_partners_or_by_all_that_it_has():
+    true = {("a", name) for name in "bcdefgh"}
+    tried = {("a", name) for name in "bcdef"} | {("b", "c"), ("g", "h")}
+    assert recall.found_pairs(tried, true) == recall.Found(7, 5, 6)
+    assert recall.found_pairs(tried - {("a", "f")}, true) == recall.Found(6, 4, 4)
+
+
+@pytest.mark.slow
+def test_strangers_are_counted_apart(street_sequence, tmp_path):
+    """Of the pairs of a street with two photos of itself as strangers, the true ones are found."""
+    strangers = tmp_path / "others"
+    strangers.mkdir()
+    for name in ("photo00000.png", "photo00001.png"):
+        (strangers / name).write_bytes((street_sequence / name).read_bytes() + b" ")
+    figures = tmp_path / "figures.json"
+    options = ["--truth", str(street_sequence), "--depth", "8", "--k", "2,20"]
+    given = [str(street_sequence), str(strangers), *options, "--json", str(figures)]
+    recall.main([*given, "--retrieval", "vlad"])
+    few, every = json.loads(figures.read_text())["rows"]
+    assert every["pairs"] == 13 * 12 // 2 and every["among_own"] == 11 * 10 // 2
+    assert every["true"] == every["of"] > 9 and every["connected"] == every["photos"] == 11
+    assert 0 < few["true"] <= few["among_own"] < few["pairs"] < every["pairs"]
+    with pytest.raises(UserError, match="no COLMAP model"):
+        recall.main([str(street_sequence), "--truth", str(strangers)])
