@@ -15,7 +15,7 @@ from jaxsfm.colmap.pose_priors import write_pose_priors
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.looks import SavedMatches
-from jaxsfm.io.pairs import Pair, PairCounts
+from jaxsfm.io.pairs import Pair, PairCounts, PairResult
 from jaxsfm.io.store import digest
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.runs.matching_looks import MatchedPairs, timed
@@ -158,8 +158,14 @@ class RunStages:
             bar.update(mapped.largest() - bar.n)
         return mapped
 
-    def refine(self, mapped: MappedRun, target: Path) -> tuple[Reconstructed, Georeference | None]:
-        """Refine and move the models, and write the database and the models into `target`."""
+    def refine(
+        self, mapped: MappedRun, target: Path, closer: Mapping[Pair, PairResult]
+    ) -> tuple[Reconstructed, Georeference | None]:
+        """Refine and move the models, and write the database and the models into `target`.
+
+        Args:
+          closer: matches of closer looks at photos that are in no model.
+        """
         passes = self.config.refinement.passes if self.config.refinement else 0
         quiet = not (self.options.progress and passes)
         taken: dict[str, float] = {}
@@ -172,7 +178,9 @@ class RunStages:
                 turns.update(turns.n < passes)
 
             database = target / "database.db"
-            made = refine_mapped(mapped.given, mapped.stage, database, mapped.cache, on_pass)
+            made = refine_mapped(
+                mapped.given, mapped.stage, database, mapped.cache, on_pass, closer
+            )
         if passes:
             self.seconds.update(taken)
         moved = self._move(made, database)

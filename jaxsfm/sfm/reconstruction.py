@@ -6,6 +6,7 @@ Each stage reads the files of the one before. So a stage whose files exist from 
 """
 
 import dataclasses
+import hashlib
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -20,7 +21,7 @@ from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
-from jaxsfm.io.pairs import ChosenMatches, Pair, PairResult
+from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches, Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
@@ -224,6 +225,7 @@ def refine_mapped(
     database: Path,
     kept: StageCache,
     on_pass: Callable[[], None] = lambda: None,
+    closer: Mapping[Pair, PairResult] | None = None,
 ) -> Reconstructed:
     """Refine the models of the mapper, if asked for, and colour their points.
 
@@ -231,16 +233,23 @@ def refine_mapped(
       mapped: made from what is given.
       database: where to write the COLMAP database; a file there is replaced.
       kept: as in `map_matches`.
+      closer: matches of closer looks at photos that are in no model, original pixels. They say
+        where these photos may stand, instead of the matches of the same pairs.
     """
     config, matches = given.config, given.matches
+    false = mapped.figures.misleading()
+    closer = {pair: found for pair, found in (closer or {}).items() if pair not in false}
 
     def refine(folder: Path) -> None:
-        false = mapped.figures.misleading()
         believed = ChosenMatches(matches, [pair for pair in matches if pair not in false])
         made = refine_models(
             mapped.models(),
             Photos(given.images, config),
-            Believed(mapped.database, believed, mapped.verification.verified.keys() - false),
+            Believed(
+                mapped.database,
+                OverlaidMatches(believed, closer),
+                mapped.verification.verified.keys() - false,
+            ),
             config=config,
             options=given.options,
             on_pass=on_pass,
@@ -249,7 +258,11 @@ def refine_mapped(
         stage_files.write_refinement(folder, made.figures, made.order)
 
     settings = config.refinement and dataclasses.asdict(config.refinement)
-    key = digest(mapped.key, settings, config.max_size, config.enlarge)
+    looked = [
+        [*pair, hashlib.sha256(closer[pair].keypoints0.tobytes()).hexdigest()]
+        for pair in sorted(closer)
+    ]
+    key = digest(mapped.key, settings, config.max_size, config.enlarge, looked)
     refined = kept.folder.stage("refined", key, refine)
     shutil.copyfile(mapped.database, database)
     refinement, order = stage_files.read_refinement(refined)

@@ -62,9 +62,17 @@ def second_look(
         return SecondLook(unsettled, sorted(counts), whole=True)
     pairs: set[Pair] = set()
     for name in unsettled:
-        own = [pair for pair in counts if name in pair]
-        own.sort(key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))
-        pairs.update(own[:CLOSEST])
+        pairs.update(closest_pairs(name, counts)[:CLOSEST])
     near = {name for pair in pairs for name in pair}
     pairs |= {pair for pair in trusted if near >= set(pair)}
     return SecondLook(unsettled, sorted(pairs), whole=False)
+
+
+def closest_pairs(name: str, counts: Mapping[Pair, PairCounts]) -> list[Pair]:
+    """The pairs of a photo: those with most inliers first, then those with most tentative matches.
+
+    Args:
+      counts: of pairs that were tried.
+    """
+    own = [pair for pair in counts if name in pair]
+    return sorted(own, key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))

@@ -76,11 +76,14 @@ def match_photos(
     *,
     config: Config,
     seed: int = 0,
+    worth_closer: float = 0.0,
 ) -> TwoPhotos:
     """Match two photos with as many looks as they need (`Config.closer_looks`).
 
     Args:
       features0, features1: the features of both photos, made with the same config.
+      worth_closer: the evidence that the search for the scale must find, or no further look
+        follows. The strongest photos of different places have 33 (docs/decisions/hard-pairs.md).
 
     Raises:
       ImageError: a photo cannot be decoded again.
@@ -89,31 +92,46 @@ def match_photos(
     looks = [look(features0, features1, images, config=config, seed=seed)]
     if config.closer_looks and not is_settled(looks[0]):
         looks += at_other_scales(features0, features1, config=config, seed=seed)
-        if _best(looks).evidence < SURE and config.enlarge < MOST_ENLARGED:
-            config = dataclasses.replace(config, enlarge=MOST_ENLARGED)
-            features0, features1 = (
-                image_features(weights, image, config=config) for image in images
-            )
-            looks.append(look(features0, features1, images, config=config, seed=seed))
-            looks += at_other_scales(features0, features1, config=config, seed=seed)
-        closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
-        if _best(looks).evidence < SURE:
-            tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
-            looks += [each for each in tried if each is not None]
-        if _best(looks).evidence < TURNED_BELOW:
-            looks += turned(weights, features0, images[1], config=config, seed=seed)
-        for _ in range(config.closer_looks):
-            best = _best(looks)
-            if best.evidence < HOPELESS:
-                break
-            found = closer(best.located(*images), size=SIZE)
-            if found is None:
-                break
-            looks.append(found)
-            if found.evidence <= best.evidence:
-                break
+        if _best(looks).evidence >= worth_closer:
+            looks = _look_closer(weights, (features0, features1), looks, config=config, seed=seed)
     best = _best(looks)
     return TwoPhotos(best.result, _aligned(best, images, config), best.evidence, len(looks))
+
+
+def _look_closer(
+    weights: Weights,
+    features: tuple[ImageFeatures, ImageFeatures],
+    looks: list[Look],
+    *,
+    config: Config,
+    seed: int,
+) -> list[Look]:
+    """The looks after the search for the scale, and those that follow: enlarged, as seen from one
+    place, and turned."""
+    images = (features[0].image, features[1].image)
+    if _best(looks).evidence < SURE and config.enlarge < MOST_ENLARGED:
+        config = dataclasses.replace(config, enlarge=MOST_ENLARGED)
+        enlarged0, enlarged1 = (image_features(weights, each, config=config) for each in images)
+        looks = [*looks, look(enlarged0, enlarged1, images, config=config, seed=seed)]
+        looks += at_other_scales(enlarged0, enlarged1, config=config, seed=seed)
+        features = (enlarged0, enlarged1)
+    closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
+    if _best(looks).evidence < SURE:
+        tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
+        looks = [*looks, *(each for each in tried if each is not None)]
+    if _best(looks).evidence < TURNED_BELOW:
+        looks = [*looks, *turned(weights, features[0], images[1], config=config, seed=seed)]
+    for _ in range(config.closer_looks):
+        best = _best(looks)
+        if best.evidence < HOPELESS:
+            break
+        found = closer(best.located(*images), size=SIZE)
+        if found is None:
+            break
+        looks = [*looks, found]
+        if found.evidence <= best.evidence:
+            break
+    return looks
 
 
 def is_settled(first: Look) -> bool:

@@ -1,0 +1,134 @@
+"""Closer looks at photos that found no place by their first matches.
+
+The strongest pairs of such a photo are matched again at other scales, turned, and as seen from one
+place (`jaxsfm.sfm.two_photos`). Their matches say only where the photo may stand. Whether it stands
+there is for alignment to say, as for all photos that the mapper left out. So a pair that is likely
+wrong costs time, but no accuracy.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import logging
+from collections.abc import Collection, Iterable, Mapping
+
+from tqdm import tqdm
+
+from jaxsfm.core.types import Status
+from jaxsfm.io import interrupt
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.images import ImageError, ImageFile, named
+from jaxsfm.io.pairs import Pair, PairCounts, PairResult
+from jaxsfm.io.store import Store
+from jaxsfm.matching.extraction import image_features
+from jaxsfm.report.typed_json import to_json
+from jaxsfm.runs.job import Job
+from jaxsfm.runs.mapping_looks import MappedLooks
+from jaxsfm.runs.matching_looks import job_of_look, timed
+from jaxsfm.sfm.second_look import closest_pairs
+from jaxsfm.sfm.two_photos.matched import HOPELESS, match_photos
+
+logger = logging.getLogger("jaxsfm")
+
+CLOSER = 3
+"""Pairs of a photo that are looked at closer. Each takes 3 to 60 s on two cores."""
+LIKELY = 0.5
+"""Matches of a pair count if their confidence is at least this."""
+KEPT_FEATURES = CLOSER + 1
+"""Photos whose features are in memory: those of one photo and of its partners."""
+
+
+def look_closer(
+    job: Job, images: Mapping[str, ImageFile], pairs: Iterable[Pair], *, store: Store | None = None
+) -> dict[Pair, PairResult]:
+    """Match pairs with as many looks as they need.
+
+    Pairs that show no sign of a common part at any scale get no closer look.
+
+    Args:
+      job: its config says how many closer looks follow; its stores may have features.
+      images: the photos of the pairs, by name.
+      store: where the results are kept, so that an interrupted run need not look again.
+
+    Returns:
+      the matches of the pairs that are likely right, original pixels. Pairs of photos that cannot
+      be decoded are left out.
+    """
+
+    @functools.lru_cache(KEPT_FEATURES)
+    def features(name: str) -> ImageFeatures:
+        found = job.load_features(images[name])
+        return found or image_features(job.weights, images[name], config=job.config)
+
+    likely = {}
+    for pair in pairs:
+        found = store and store.load_matches(pair)
+        if found is None:
+            with contextlib.suppress(ImageError):
+                found = _matched(job, (features(pair[0]), features(pair[1])))
+            if found is not None and store is not None:
+                store.save_matches(found)
+        if found is not None and found.num_inliers:
+            likely[pair] = found
+        interrupt.check()
+    return likely
+
+
+def _matched(job: Job, features: tuple[ImageFeatures, ImageFeatures]) -> PairResult:
+    """The matches of a pair; none if they are likely wrong."""
+    found = match_photos(
+        job.weights, *features, config=job.config, seed=job.seed, worth_closer=HOPELESS
+    )
+    return found.result if found.confidence >= LIKELY else without_matches(found.result)
+
+
+def without_matches(result: PairResult) -> PairResult:
+    """The same pair, not verified."""
+    rows = {name: getattr(result, name)[:0] for name in ("cells", "keypoints0", "keypoints1")}
+    return dataclasses.replace(
+        result,
+        **rows,
+        plane=result.plane[:0],
+        homographies=result.homographies[:0],
+        status=Status.NO_PLANE,
+    )
+
+
+def pairs_to_look_at(
+    lost: Iterable[str], placed: Collection[str], counts: Mapping[Pair, PairCounts]
+) -> list[Pair]:
+    """The strongest pairs of photos without a place with photos that have one, photo by photo.
+
+    Args:
+      counts: of all pairs that were tried.
+    """
+    found = {}
+    for name in sorted(lost):
+        own = [pair for pair in closest_pairs(name, counts) if set(pair) - {name} <= set(placed)]
+        found |= dict.fromkeys(own[:CLOSER])
+    return list(found)
+
+
+def look_at_lost_photos(
+    job: Job, found: MappedLooks, seconds: dict[str, float]
+) -> dict[Pair, PairResult]:
+    """Likely matches of the photos that are in no model of a run.
+
+    Args:
+      job: that of the run.
+      found: the run after all looks at its photos.
+      seconds: the time is added to that of the stages.
+    """
+    images = {image.name: image for image in found.mapped.given.images}
+    placed = set().union(*found.mapped.photos)
+    pairs = pairs_to_look_at(images.keys() - placed, placed, found.matched.counts)
+    if not (job.config.closer_looks and job.config.refinement and pairs):
+        return {}
+    settings = {**job.config.matching(), "closer_looks": job.config.closer_looks}
+    identity = dataclasses.replace(found.identity, config=settings)
+    store = Store(job.store.path, to_json(identity))
+    job = job_of_look(job, found.identity, job.config)
+    logger.info("looking closer at %s", named(sorted(images.keys() - placed)))
+    bar = tqdm(pairs, desc="closer looks", unit="pair", disable=not job.progress)
+    with timed(seconds, "closer looks"):
+        return look_closer(job, images, bar, store=store)

@@ -1,0 +1,131 @@
+"""Laws of closer looks at photos that found no place."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxsfm.config import preset
+from jaxsfm.core.types import Status
+from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches, PairCounts, PairResult
+from jaxsfm.io.store import Store
+from jaxsfm.runs import closer_looks
+from jaxsfm.runs.closer_looks import CLOSER, look_closer, pairs_to_look_at, without_matches
+from jaxsfm.sfm.two_photos.matched import HOPELESS, confidence
+
+
+def counts(inliers: int, tentative: int = 100) -> PairCounts:
+    return PairCounts(inliers, 1, tentative, 0, Status.VERIFIED)
+
+
+def result(pair: tuple[str, str], matches: int = 5) -> PairResult:
+    xy = np.arange(2 * matches, dtype=np.float32).reshape(-1, 2)
+    return PairResult(
+        pair=pair,
+        cells=np.arange(2 * matches, dtype=np.int32).reshape(-1, 2),
+        keypoints0=xy,
+        keypoints1=xy + 1,
+        plane=np.zeros(matches, np.int32),
+        homographies=np.eye(3)[None],
+        num_tentative=60,
+        num_dropped=0,
+        status=Status.VERIFIED,
+    )
+
+
+def test_the_strongest_pairs_with_placed_photos_are_looked_at():
+    tried = {
+        ("a", "lost"): counts(0, 90),
+        ("b", "lost"): counts(40),
+        ("c", "lost"): counts(0, 80),
+        ("d", "lost"): counts(30),
+        ("lost", "other"): counts(900),
+        ("a", "b"): counts(900),
+    }
+    found = pairs_to_look_at(["lost"], ["a", "b", "c", "d"], tried)
+    assert found == [("b", "lost"), ("d", "lost"), ("a", "lost")] and CLOSER == 3
+    both = pairs_to_look_at(["other", "lost"], ["a", "lost", "other"], tried)
+    assert both == [("lost", "other"), ("a", "lost")]  # each pair once
+    assert pairs_to_look_at(["lost"], ["x"], tried) == []
+
+
+@pytest.fixture
+def looked(monkeypatch):
+    """The pairs that were matched; the evidence of a pair is looked up."""
+    done: list[tuple[str, str]] = []
+
+    def of(evidence: dict[tuple[str, str], float], damaged: str = "") -> list:
+        def features(_: object, image: ImageFile, *, config: object) -> SimpleNamespace:
+            if image.name == damaged:
+                raise ImageError(f"{image.name}: damaged")
+            return SimpleNamespace(image=image)
+
+        def match(_: object, a: Any, b: Any, *, config: object, seed: int, worth_closer: float):
+            assert worth_closer == HOPELESS and seed == 7
+            pair = (a.image.name, b.image.name)
+            done.append(pair)
+            return SimpleNamespace(result=result(pair), confidence=confidence(evidence[pair]))
+
+        monkeypatch.setattr(closer_looks, "image_features", features)
+        monkeypatch.setattr(closer_looks, "match_photos", match)
+        return done
+
+    return of
+
+
+def job_and_images() -> tuple[Any, dict[str, ImageFile]]:
+    images = {
+        name: ImageFile(name=name, path=Path(name), size=(8, 8), sha256=name * 64)
+        for name in "abcd"
+    }
+    job = SimpleNamespace(
+        weights=None, config=preset("default"), seed=7, load_features=lambda image: None
+    )
+    return job, images
+
+
+def test_only_likely_matches_count_and_none_of_photos_that_cannot_be_decoded(looked):
+    job, images = job_and_images()
+    evidence = {("a", "b"): 61.0, ("a", "c"): 59.0}
+    done = looked(evidence, damaged="d")
+    found = look_closer(job, images, [*evidence, ("a", "d")])
+    assert [*found] == [("a", "b")] and found["a", "b"].num_inliers == 5
+    assert done == [*evidence]
+
+
+def test_what_was_looked_at_closer_is_kept_and_what_was_unlikely_too(looked, tmp_path):
+    job, images = job_and_images()
+    evidence = {("a", "b"): 400.0, ("a", "c"): 0.0}
+    done = looked(evidence)
+    identity = {"images": {name: image.sha256 for name, image in images.items()}, "config": {}}
+    store = Store(tmp_path, identity)
+    first = look_closer(job, images, evidence, store=store)
+    again = look_closer(job, images, evidence, store=Store(tmp_path, identity))
+    assert done == [*evidence] and [*first] == [*again] == [("a", "b")]
+    np.testing.assert_array_equal(first["a", "b"].keypoints1, again["a", "b"].keypoints1)
+    elsewhere = Store(tmp_path, {**identity, "config": {"closer_looks": 1}})
+    look_closer(job, images, evidence, store=elsewhere)
+    assert len(done) == 4
+
+
+def test_a_pair_without_matches_has_its_counts_of_tentative_matches():
+    bare = without_matches(result(("a", "b")))
+    assert bare.num_inliers == 0 == len(bare.homographies) == len(bare.cells)
+    assert bare.num_tentative == 60 and bare.status == Status.NO_PLANE
+
+
+def test_overlaid_matches_replace_those_of_the_same_pair_and_add_others():
+    ours = {("a", "b"): result(("a", "b"), 3), ("a", "c"): result(("a", "c"), 4)}
+    theirs = {("a", "c"): result(("a", "c"), 6), ("b", "c"): result(("b", "c"), 7)}
+    found = OverlaidMatches(ChosenMatches(ours, ours), theirs)
+    assert {pair: each.num_inliers for pair, each in found.items()} == {
+        ("a", "b"): 3,
+        ("a", "c"): 6,
+        ("b", "c"): 7,
+    }
+    assert len(found) == 3 and ("b", "d") not in found
+    with pytest.raises(KeyError):
+        found["b", "d"]
