@@ -67,6 +67,9 @@ class Refinement:
     max_stretch: float = 6.0
     """Largest ratio between the areas at which a view and the reference view see the surface, for
     new observations."""
+    most_views: int = 12
+    """New observations of a point are tried until it has this many views, its own included. 0: in all
+    views that could see it. In a video hundreds of frames could, and nearly all of them fail."""
     neighbours: int = 16
     """Number of 3-D points from which the surface normal at a point is estimated."""
     weak_octaves: int = 4
@@ -76,6 +79,10 @@ class Refinement:
     weak_min_score: float = 0.6
     """`min_score` in weak views."""
 
+    def in_all_views(self) -> "Refinement":
+        """The same settings, but points are looked for in all views that could see them."""
+        return dataclasses.replace(self, most_views=0)
+
     def __post_init__(self) -> None:
         for name in ("passes", "radius", "iterations", "neighbours"):
             if getattr(self, name) < 1:
@@ -83,6 +90,8 @@ class Refinement:
         for name in ("max_sigma_px", "max_shift_px", "max_error_px", "max_stretch"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"Refinement.{name} must be positive; got {getattr(self, name)}")
+        if self.most_views < 0:
+            raise ValueError(f"Refinement.most_views must be at least 0; got {self.most_views}")
         if not 0 <= self.weak_octaves <= MAX_OCTAVES:
             raise ValueError(
                 f"Refinement.weak_octaves must lie in 0..{MAX_OCTAVES}; got {self.weak_octaves}"

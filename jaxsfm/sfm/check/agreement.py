@@ -182,7 +182,8 @@ def _tested(
         shown[:, targets] = False
     parts = []
     limits = AlignmentLimits.of(refinement)
-    for block in align_blocks(model, images, refinement, limits, targets=targets, normal=normal):
+    every = refinement.in_all_views()
+    for block in align_blocks(model, images, every, limits, targets=targets, normal=normal):
         points[block.rows] = block.patches.points
         own, found = block.confirmed, block.found
         shown[block.rows[own], block.patches.reference[own]] = True

@@ -32,8 +32,9 @@ def find_candidates(
     """The observations of every track, and other views that could see its patch.
 
     Args:
-      refinement: `min_cosine` and `max_stretch` limit the views that could see a patch; `radius`
-        gives the distance that a keypoint must have from the border.
+      refinement: `min_cosine` and `max_stretch` limit the views that could see a patch, and
+        `most_views` their number; `radius` gives the distance that a keypoint must have from the
+        border.
       targets: only these views, by index; None: all.
     """
     margin = refinement.radius + 2
@@ -50,9 +51,39 @@ def find_candidates(
         rows = np.flatnonzero(inside & (patches.reference != k) & (seen.tracked[:, k] | fits))
         parts.append((rows, np.full(len(rows), k), at[rows]))
     point, view, start = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if refinement.most_views:
+        few = within_most_views(point, view, seen.tracked[point, view], refinement.most_views)
+        point, view, start = point[few], view[few], start[few]
     affine = plane_affines(views, patches.select(point), view)
     ok = np.isfinite(affine).all((1, 2))
     return Candidates(point[ok], view[ok], start[ok], affine[ok])
+
+
+def within_most_views(
+    point: np.ndarray, view: np.ndarray, tracked: np.ndarray, most: int
+) -> np.ndarray:
+    """bool (m,): candidates that remain if a point has at most so many views.
+
+    Observations of tracks remain. Of the other views of a point, those are taken that come first in
+    an order that is drawn for each point, so that they lie on all sides of it.
+
+    Args:
+      point, view: int (m,), of each candidate.
+      tracked: bool (m,), whether it is an observation of a track.
+      most: views of a point, that of its patch included.
+    """
+    order = np.lexsort((_drawn(point, view), ~tracked, point))
+    place = np.empty(len(point), int)
+    place[order] = np.arange(len(point)) - np.searchsorted(point[order], point[order])
+    return tracked | (place < most - 1)
+
+
+def _drawn(point: np.ndarray, view: np.ndarray) -> np.ndarray:
+    """uint64 (m,): numbers that look random and follow from a point and a view (splitmix64)."""
+    mixed = point.astype(np.uint64) << np.uint64(32) | view.astype(np.uint64)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return mixed
 
 
 def plane_affines(

@@ -125,7 +125,8 @@ def _aligned_points(
     """
     parts: list[list[AlignedPoints]] = [[] for _ in targets]
     limits = AlignmentLimits(refinement.weak_min_score, MAX_SIGMA_PX, refinement.max_shift_px)
-    for block in align_blocks(model, images, refinement, limits, targets=targets):
+    every = refinement.in_all_views()
+    for block in align_blocks(model, images, every, limits, targets=targets):
         found, points = block.found, block.patches.points
         for k, part in zip(targets, parts, strict=True):
             own = found.view == k
