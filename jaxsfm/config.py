@@ -68,8 +68,8 @@ class Refinement:
     """Largest ratio between the areas at which a view and the reference view see the surface, for
     new observations."""
     most_views: int = 12
-    """New observations of a point are tried until it has this many views, its own included. 0: in all
-    views that could see it. In a video hundreds of frames could, and nearly all of them fail."""
+    """New observations of a point are tried in so few views that it has at most this many, that of
+    its patch included. 0: in all views that could see it, which in a video are hundreds."""
     neighbours: int = 16
     """Number of 3-D points from which the surface normal at a point is estimated."""
     weak_octaves: int = 4
