@@ -12,6 +12,8 @@ from jaxsfm.io.threads import READ_ONCE, limit_threads
 
 CODE = """
 import os, sys, time
+if hasattr(os, "sched_setaffinity"):  # a test worker keeps to its own cores (conftest.py)
+    os.sched_setaffinity(0, range(os.cpu_count()))
 from jaxsfm.cli.main import main
 assert main(sys.argv[1:]) == 2  # there is no such folder, which is found after the libraries' start
 import cv2, jax

@@ -113,15 +113,15 @@ assert len(jax.devices()) == 3
 images, _ = jaxsfm.open_images(Path(sys.argv[1]))
 weights, config = jaxsfm.load_weights(), jaxsfm.preset("default")
 everything = []
-for execution in (Execution(devices=1), Execution(), Execution(devices=2, memory_gb=1e-6)):
+for execution in (Execution(devices=1), Execution(memory_gb=1e-6)):
     features = jaxsfm.extract(weights, images, config=config, execution=execution)
     pairs = jaxsfm.exhaustive_pairs(features)
     matches = jaxsfm.match(features, pairs, config=config, execution=execution)
     arrays = [jax.tree.leaves(features[n].dense) for n in sorted(features)]
     arrays += [[m.cells, m.keypoints1, m.plane, m.homographies] for _, m in sorted(matches.items())]
     everything.append([np.asarray(a).tobytes() for each in arrays for a in each])
-print(json.dumps([len(everything[0]), [all(a == b for a, b in zip(everything[0], other,
-    strict=True)) for other in everything[1:]]]))
+one, three = everything
+print(json.dumps([len(one), all(a == b for a, b in zip(one, three, strict=True))]))
 """
 
 
@@ -137,7 +137,7 @@ def test_any_number_of_devices_gives_what_one_gives_bit_for_bit(folder):
         check=True,
     )
     count, same = json.loads(done.stdout.splitlines()[-1])
-    assert count > 50 and same == [True, True]
+    assert count > 50 and same
 
 
 @pytest.mark.slow

@@ -1,39 +1,19 @@
 """Laws of closer looks at photos that found no place."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from pair_results import counts, job_and_images, result
 
-from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageError, ImageFile
-from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches, PairCounts, PairResult
+from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches
 from jaxsfm.io.store import Store
 from jaxsfm.runs import closer_looks
 from jaxsfm.runs.closer_looks import CLOSER, look_closer, pairs_to_look_at, without_matches
 from jaxsfm.sfm.two_photos.matched import HOPELESS, confidence
-
-
-def counts(inliers: int, tentative: int = 100) -> PairCounts:
-    return PairCounts(inliers, 1, tentative, 0, Status.VERIFIED)
-
-
-def result(pair: tuple[str, str], matches: int = 5) -> PairResult:
-    xy = np.arange(2 * matches, dtype=np.float32).reshape(-1, 2)
-    return PairResult(
-        pair=pair,
-        cells=np.arange(2 * matches, dtype=np.int32).reshape(-1, 2),
-        keypoints0=xy,
-        keypoints1=xy + 1,
-        plane=np.zeros(matches, np.int32),
-        homographies=np.eye(3)[None],
-        num_tentative=60,
-        num_dropped=0,
-        status=Status.VERIFIED,
-    )
 
 
 def test_the_strongest_pairs_with_placed_photos_are_looked_at():
@@ -74,17 +54,6 @@ def looked(monkeypatch):
         return done
 
     return of
-
-
-def job_and_images() -> tuple[Any, dict[str, ImageFile]]:
-    images = {
-        name: ImageFile(name=name, path=Path(name), size=(8, 8), sha256=name * 64)
-        for name in "abcd"
-    }
-    job = SimpleNamespace(
-        weights=None, config=preset("default"), seed=7, load_features=lambda image: None
-    )
-    return job, images
 
 
 def test_only_likely_matches_count_and_none_of_photos_that_cannot_be_decoded(looked):
