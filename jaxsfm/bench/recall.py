@@ -12,7 +12,8 @@ true.
 
 import argparse
 import dataclasses
-import itertools
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,11 +21,13 @@ import numpy as np
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.poses import CameraPose, Poses, find_model, read_model, read_poses
+from jaxsfm.colmap.poses import find_model, read_model, read_poses
+from jaxsfm.colmap.view import View
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
-from jaxsfm.io.pairs import Pair, make_pair
+from jaxsfm.io.pairs import Pair, exhaustive_pairs
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.weights import load_weights
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
@@ -59,69 +62,49 @@ def pairs_by_model(folder: Path, least: int = COMMON_POINTS) -> set[Pair]:
       UserError: there is no model.
     """
     model = read_model(find_model(folder))
-    common: dict[Pair, int] = {}
+    common: Counter[Pair] = Counter()
     for point in model.points3D.values():
         seen = {model.image(each.image_id).name for each in point.track.elements}
-        for pair in itertools.combinations(sorted(seen), 2):
-            common[pair] = common.get(pair, 0) + 1
+        common.update(exhaustive_pairs(seen))
     return {pair for pair, points in common.items() if points >= least}
 
 
-def seen_share(
-    one: CameraPose, other: CameraPose, camera: np.ndarray, size: tuple[int, int], depth: float
-) -> float:
-    """The share of what a camera sees at a distance that another one sees, from 0 to 1.
+def seen_share(one: View, other: View, depth: float) -> float:
+    """The share of what a view sees at a distance that another one sees, from 0 to 1.
 
     Args:
-      camera: float64 (3, 3), of both.
-      size: width and height of both photos, in pixels; the centre of the first pixel is 0.5.
       depth: of all points along the optical axis, in units of the poses.
     """
-    x, y = (np.linspace(0.5, side - 0.5, GRID) for side in size)
-    pixels = np.stack([*(axis.ravel() for axis in np.meshgrid(x, y)), np.ones(GRID * GRID)])
-    points = one.rotation.T @ (depth * np.linalg.solve(camera, pixels)) + one.centre[:, None]
-    at = camera @ other.rotation @ (points - other.centre[:, None])
-    ahead = at[2] > 0
-    x, y = at[:2] / np.where(ahead, at[2], 1.0)
-    return float(np.mean(ahead & (x > 0) & (x < size[0]) & (y > 0) & (y < size[1])))
+    width, height = one.size
+    x, y = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
+    at, _ = other.project(one.centre + depth * one.rays(np.c_[x.ravel(), y.ravel()]))
+    with np.errstate(invalid="ignore"):  # NaN behind the camera
+        return float(((at > -0.5) & (at < np.asarray(other.size) - 0.5)).all(1).mean())
 
 
-def pairs_by_poses(
-    poses: Poses, camera: np.ndarray, size: tuple[int, int], depth: float
-) -> set[Pair]:
-    """Pairs of which each camera sees half of what the other one sees; see `seen_share`."""
-    return {
-        make_pair(a, b)
-        for a, b in itertools.combinations(sorted(poses), 2)
-        if min(
-            seen_share(poses[a], poses[b], camera, size, depth),
-            seen_share(poses[b], poses[a], camera, size, depth),
-        )
-        >= OVERLAP
-    }
+def pairs_by_poses(views: Mapping[str, View], depth: float) -> set[Pair]:
+    """Pairs of which each view sees half of what the other one sees; see `seen_share`."""
+
+    def overlap(a: View, b: View) -> float:
+        return min(seen_share(a, b, depth), seen_share(b, a, depth))
+
+    return {(a, b) for a, b in exhaustive_pairs(views) if overlap(views[a], views[b]) >= OVERLAP}
 
 
 def found_pairs(tried: set[Pair], true: set[Pair]) -> Found:
     """How many of the true pairs are among those that are tried."""
-    partners: dict[str, int] = {}
-    hits: dict[str, int] = {}
-    for pair in true:
-        for name in pair:
-            partners[name] = partners.get(name, 0) + 1
-            hits[name] = hits.get(name, 0) + (pair in tried)
-    connected = sum(hits[name] >= min(PARTNERS, all_) for name, all_ in partners.items())
+    partners = Counter(name for pair in true for name in pair)
+    found = Counter(name for pair in true & tried for name in pair)
+    connected = sum(found[name] >= min(PARTNERS, count) for name, count in partners.items())
     return Found(len(tried), len(tried & true), connected)
 
 
 def _photos(folders: list[Path]) -> list[ImageFile]:
-    """The photos of all folders; those of other folders than the first have its name before
-    theirs."""
-    photos: list[ImageFile] = []
-    for k, folder in enumerate(folders):
-        images, _ = open_images(folder)
-        photos += [
-            dataclasses.replace(i, name=f"{folder.name}/{i.name}") if k else i for i in images
-        ]
+    """The photos of all folders. Those of the second and of later folders have the name of their
+    folder before their own."""
+    (photos, _), *others = map(open_images, folders)
+    for folder, (images, _) in zip(folders[1:], others, strict=True):
+        photos += [dataclasses.replace(i, name=f"{folder.name}/{i.name}") for i in images]
     return photos
 
 
@@ -134,13 +117,20 @@ def _true_pairs(truth: Path, depth: float, photos: list[ImageFile]) -> set[Pair]
     names = {photo.name for photo in photos}
     if not any(truth.glob("*.pose.txt")):
         return {pair for pair in pairs_by_model(truth) if names.issuperset(pair)}
-    given = parse_intrinsics(str(truth / "K.txt"))
+    camera = parse_intrinsics(str(truth / "K.txt"))
     stored = {Path(photo.name).stem: photo for photo in photos}
-    poses = {stored[n].name: pose for n, pose in read_poses(truth).items() if n in stored}
-    if not poses:
+    views = {}
+    for stem, pose in read_poses(truth).items():
+        if (photo := stored.get(stem)) is not None:
+            view = View.without_pose(
+                photo.name, 0, camera.camera(photo.size), photo.size, Pixels((1.0, 1.0))
+            )
+            views[photo.name] = dataclasses.replace(
+                view, rotation=pose.rotation, centre=pose.centre
+            )
+    if not views:
         raise UserError(f"--truth {truth}: none of the photos has a pose")
-    size = next(iter(stored.values())).size
-    return pairs_by_poses(poses, given.camera(size).calibration_matrix(), size, depth)
+    return pairs_by_poses(views, depth)
 
 
 def measure(

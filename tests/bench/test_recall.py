@@ -1,46 +1,56 @@
 """Laws of how many true pairs are among the most similar photos."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pycolmap
 import pytest
+from room_scene import camera
 
 from jaxsfm.bench import recall
 from jaxsfm.bench.synthetic import camera_matrix
-from jaxsfm.colmap.poses import CameraPose
+from jaxsfm.colmap.view import View
 from jaxsfm.errors import UserError
+from jaxsfm.io.pixels import Pixels
 
 SIZE = (90, 60)
-CAMERA = camera_matrix(SIZE)
-AHEAD = CameraPose(np.eye(3), np.zeros(3))
 
 
-def aside(share, depth):
-    """A camera that sees the rest of what AHEAD sees, moved by a share of its width."""
-    return CameraPose(np.eye(3), np.array([share * SIZE[0] * depth / CAMERA[0, 0], 0.0, 0.0]))
+def placed(centre, turn=(1.0, 1.0, 1.0)) -> View:
+    """A view at a place, that looks along the third axis, or against it."""
+    view = View.without_pose("a", 0, camera(SIZE), SIZE, Pixels((1.0, 1.0)))
+    return dataclasses.replace(view, rotation=np.diag(turn), centre=np.array(centre))
+
+
+AHEAD = placed([0.0, 0.0, 0.0])
+
+
+def aside(share, depth) -> View:
+    """A view of the rest of what AHEAD sees, moved by a share of its width."""
+    return placed([share * SIZE[0] * depth / camera_matrix(SIZE)[0, 0], 0.0, 0.0])
 
 
 @pytest.mark.parametrize(("share", "columns"), [(0.0, 9), (0.3, 6), (0.6, 4), (1.2, 0)])
 def test_a_camera_moved_by_a_share_of_the_width_sees_the_rest(share, columns):
     """Of nine columns of rays that are evenly spread over the photo, some are lost."""
     depth = 3.0
-    seen = recall.seen_share(AHEAD, aside(share, depth), CAMERA, SIZE, depth)
+    seen = recall.seen_share(AHEAD, aside(share, depth), depth)
     assert seen == pytest.approx(columns / 9)
 
 
 def test_what_lies_behind_a_camera_is_not_seen():
-    turned = CameraPose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))
-    assert recall.seen_share(AHEAD, turned, CAMERA, SIZE, 2.0) == 0.0
+    turned = placed([0.0, 0.0, 0.0], (-1.0, 1.0, -1.0))
+    assert recall.seen_share(AHEAD, turned, 2.0) == 0.0
 
 
 def test_by_poses_both_cameras_of_a_true_pair_see_half_of_the_other():
     """A camera that stands far behind sees all of the other, but the other little of it."""
-    behind = CameraPose(np.eye(3), np.array([0.0, 0.0, -8.0]))
-    poses = {"a": AHEAD, "b": aside(0.3, 2.0), "c": aside(0.7, 2.0), "d": behind}
-    assert recall.pairs_by_poses(poses, CAMERA, SIZE, 2.0) == {("a", "b"), ("b", "c")}
-    assert recall.seen_share(AHEAD, behind, CAMERA, SIZE, 2.0) == 1.0
-    with_more_of_it_in_sight = recall.pairs_by_poses(poses, CAMERA, SIZE, 200.0)
+    behind = placed([0.0, 0.0, -8.0])
+    views = {"a": AHEAD, "b": aside(0.3, 2.0), "c": aside(0.7, 2.0), "d": behind}
+    assert recall.pairs_by_poses(views, 2.0) == {("a", "b"), ("b", "c")}
+    assert recall.seen_share(AHEAD, behind, 2.0) == 1.0
+    with_more_of_it_in_sight = recall.pairs_by_poses(views, 200.0)
     assert ("a", "d") in with_more_of_it_in_sight
 
 
