@@ -171,12 +171,13 @@ def _localize_query(
         if not found.trusted and found.inliers < MANY_INLIERS and model.config.closer_looks:
             counts = {pair: result.counts for pair, result in matches.items()}
             likely = closer(pairs_to_look_at([query.image.name], query.shortlist, counts))
+            every = matches | likely
             if likely:
-                matches = matches | likely
                 again = locate_photo(
-                    query.image, query.camera, model, query.shortlist, matches, images
+                    query.image, query.camera, model, query.shortlist, every, images
                 )
-                found = again if again.trusted or not found.view else found
+                if again.trusted or not found.view:
+                    found, matches = again, every
     except ImageError as error:
         return UnusablePhoto(photo=query.path, shortlist=query.shortlist, why=str(error))
     error = None

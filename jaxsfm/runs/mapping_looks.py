@@ -80,8 +80,8 @@ class RunPhotos:
 def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) -> MappedLooks:
     """Map the photos; where that leaves photos without a sure place, look again.
 
-    With the sky masked, the verdict is amber at best, so a second look at all pairs could settle
-    nothing, and takes several times as long as the first one.
+    With the sky masked, the verdict is amber at best. If something still speaks against the model,
+    a second look at all pairs could settle nothing, and it takes longer than the first one.
 
     Args:
       matched: the photos after the first look.
@@ -109,7 +109,7 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     again = mapped.unsettled(matched.counts)
     if again is None:
         return found._replace(looks=looks)
-    if again.whole and masked_sky:
+    if again.whole and masked_sky and mapped.doubted():
         logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
         return found._replace(looks=dataclasses.replace(looks, photos=again.photos))
     logger.info("%s", again.in_words())

@@ -8,14 +8,13 @@ from pair_results import result
 
 from jaxsfm.config import preset
 from jaxsfm.runs import localize
-from jaxsfm.runs.localize import MANY_INLIERS
 from jaxsfm.runs.localize_report import LocalizedPhoto
 from jaxsfm.sfm.register.locate_view import Localization
 
 SOME_VIEW: Any = SimpleNamespace(centre=None)
 LOST = Localization(why="lost", on_surface=5)
-DOUBTFUL = Localization(view=SOME_VIEW, why="doubtful", on_surface=40, inliers=40)
-MANY = Localization(view=SOME_VIEW, why="doubtful", on_surface=500, inliers=MANY_INLIERS)
+DOUBTFUL = Localization(view=SOME_VIEW, why="doubtful", on_surface=120, inliers=99)
+MANY = Localization(view=SOME_VIEW, why="doubtful", on_surface=500, inliers=100)
 TRUSTED = Localization(view=SOME_VIEW, trusted=True, why=None, on_surface=90, inliers=60)
 
 
@@ -65,7 +64,8 @@ def test_a_photo_without_a_sure_pose_is_looked_at_closer(localized, first):
 
 def test_a_pose_that_closer_looks_do_not_confirm_replaces_none_but_no_other(localized):
     assert localized(LOST, DOUBTFUL)[0].found is DOUBTFUL
-    assert localized(DOUBTFUL, MANY)[0].found is DOUBTFUL
+    found, _ = localized(DOUBTFUL, MANY)
+    assert found.found is DOUBTFUL and found.matches == 7  # those that gave this pose
     assert localized(DOUBTFUL, LOST)[0].found is DOUBTFUL
 
 

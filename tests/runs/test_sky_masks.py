@@ -89,6 +89,8 @@ class Mapped:
     size: int
     few_apart: bool = False
     """Only photos that follow each other speak against it."""
+    many_lost: bool = False
+    """More than a third of the photos are in no model."""
 
     @property
     def photos(self) -> list[range]:
@@ -104,7 +106,7 @@ class Mapped:
         return True  # own cameras are not tried
 
     def unsettled(self, counts: dict) -> SecondLook:
-        return SecondLook(["a"], [("a", "b")], whole=not self.few_apart)
+        return SecondLook(["a"], [("a", "b")], whole=self.many_lost or not self.few_apart)
 
     better_than, largest = MappedRun.better_than, MappedRun.largest
 
@@ -177,6 +179,7 @@ def test_the_sky_is_masked_if_this_helps_where_something_speaks_against_the_mode
     [
         (Mapped(False, 108), False),
         (Mapped(False, 108, few_apart=True), True),
+        (Mapped(True, 60, many_lost=True), True),
         (Mapped(False, 50), True),  # the sky is not masked, as this gives no better model
     ],
 )
