@@ -115,8 +115,8 @@ class UsedLooks:
     photos: list[str] = field(default_factory=list)
     """The photos that had no sure place in the model after it."""
     again: list[tuple[str, str]] = field(default_factory=list)
-    """The pairs that were matched again, at the size of the config: those with these photos. None,
-    if the sky is masked and all pairs would have been matched again."""
+    """The pairs that were matched again, at the size of the config. Empty if the sky is masked and
+    something still speaks against the model."""
     whole: bool = False
     """Whether these are all pairs; then nothing of the first look was used."""
     in_vain: bool = False

@@ -2,11 +2,9 @@
 
 The strongest pairs of such a photo are matched again at other scales, turned, and as seen from one
 place (`jaxsfm.sfm.two_photos`). Their matches say only where the photo may stand. Whether it stands
-there is for alignment to say, as for all photos that the mapper left out. So a pair that is likely
-wrong costs time, but no accuracy.
+there is for alignment to say, as for all photos that the mapper left out.
 """
 
-import contextlib
 import dataclasses
 import functools
 import logging
@@ -62,15 +60,17 @@ def look_closer(
 
     likely = {}
     for pair in pairs:
-        found = store and store.load_matches(pair)
-        if found is None:
-            with contextlib.suppress(ImageError):
-                found = _matched(job, (features(pair[0]), features(pair[1])))
-            if found is not None and store is not None:
-                store.save_matches(found)
-        if found is not None and found.num_inliers:
-            likely[pair] = found
         interrupt.check()
+        found = store.load_matches(pair) if store else None
+        if found is None:
+            try:
+                found = _matched(job, (features(pair[0]), features(pair[1])))
+            except ImageError:
+                continue
+            if store:
+                store.save_matches(found)
+        if found.num_inliers:
+            likely[pair] = found
     return likely
 
 

@@ -6,7 +6,6 @@ Each stage reads the files of the one before. So a stage whose files exist from 
 """
 
 import dataclasses
-import hashlib
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -259,7 +258,7 @@ def refine_mapped(
 
     settings = config.refinement and dataclasses.asdict(config.refinement)
     looked = [
-        [*pair, hashlib.sha256(closer[pair].keypoints0.tobytes()).hexdigest()]
+        [*pair, closer[pair].keypoints0.tolist(), closer[pair].keypoints1.tolist()]
         for pair in sorted(closer)
     ]
     key = digest(mapped.key, settings, config.max_size, config.enlarge, looked)

@@ -56,15 +56,16 @@ def test_all_views_are_equally_likely():
 
 @pytest.fixture(scope="module")
 def aligned(rendered):
-    """Candidates of a point of the room on average, with a setting; each point has one track."""
+    """With a setting, in how many views each point of the room is looked for. The model has one
+    observation of each point."""
 
-    def of(refinement: Refinement, targets: list[int] | None = None) -> np.ndarray:
+    def of(refinement: Refinement) -> np.ndarray:
         model = exact_model(rendered)
         first = np.unique(model.tracks.point, return_index=True)[1]
         alone = np.isin(np.arange(len(model.tracks.point)), first)
         model = model.with_tracks(model.tracks.select(alone))
         limits = AlignmentLimits.of(refinement)
-        blocks = align_blocks(model, images_of(rendered), refinement, limits, targets=targets)
+        blocks = align_blocks(model, images_of(rendered), refinement, limits)
         return np.concatenate([np.bincount(b.found.point, minlength=len(b.rows)) for b in blocks])
 
     return of

@@ -3,6 +3,8 @@
 import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -259,3 +261,22 @@ def test_a_strong_pair_is_looked_at_once(weights, pictures):
     features = image_features(weights, pictures["part"], config=config)
     found = match_photos(weights, features, features, config=config)
     assert found.looks == 1 and found.confidence > 0.99
+
+
+@pytest.mark.parametrize(("evidence", "closer"), [(14.9, False), (15.1, True)])
+def test_if_a_pair_must_be_worth_it_closer_looks_follow_a_sign_at_some_scale(
+    monkeypatch, evidence, closer
+):
+    """`jaxsfm match` looks closer at any weak pair; runs do not."""
+    features = SimpleNamespace(image=photo((8, 8)))
+    weak, found, asked = (SimpleNamespace(evidence=e, result=None) for e in (2.0, evidence, 99.0))
+    monkeypatch.setattr(matched, "is_settled", lambda first: False)
+    monkeypatch.setattr(matched, "look", lambda *_, **__: weak)
+    monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [found])
+    monkeypatch.setattr(matched, "_look_closer", lambda *given, **__: [*given[2], asked])
+    monkeypatch.setattr(matched, "_aligned", lambda *_: None)
+    given: Any = (None, features, features)
+    config = preset("default")
+    least = match_photos(*given, config=config, worth_closer=matched.HOPELESS)
+    assert (least.looks == 3) == closer
+    assert match_photos(*given, config=config).looks == 3

@@ -106,21 +106,20 @@ def _look_closer(
     config: Config,
     seed: int,
 ) -> list[Look]:
-    """The looks after the search for the scale, and those that follow: enlarged, as seen from one
-    place, and turned."""
-    images = (features[0].image, features[1].image)
+    """The looks that were taken, and further ones: enlarged, as seen from one place, and turned."""
+    looks, images = list(looks), (features[0].image, features[1].image)
     if _best(looks).evidence < SURE and config.enlarge < MOST_ENLARGED:
         config = dataclasses.replace(config, enlarge=MOST_ENLARGED)
         enlarged0, enlarged1 = (image_features(weights, each, config=config) for each in images)
-        looks = [*looks, look(enlarged0, enlarged1, images, config=config, seed=seed)]
+        looks.append(look(enlarged0, enlarged1, images, config=config, seed=seed))
         looks += at_other_scales(enlarged0, enlarged1, config=config, seed=seed)
         features = (enlarged0, enlarged1)
     closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
     if _best(looks).evidence < SURE:
         tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
-        looks = [*looks, *(each for each in tried if each is not None)]
+        looks += [each for each in tried if each is not None]
     if _best(looks).evidence < TURNED_BELOW:
-        looks = [*looks, *turned(weights, features[0], images[1], config=config, seed=seed)]
+        looks += turned(weights, features[0], images[1], config=config, seed=seed)
     for _ in range(config.closer_looks):
         best = _best(looks)
         if best.evidence < HOPELESS:
@@ -128,7 +127,7 @@ def _look_closer(
         found = closer(best.located(*images), size=SIZE)
         if found is None:
             break
-        looks = [*looks, found]
+        looks.append(found)
         if found.evidence <= best.evidence:
             break
     return looks
