@@ -3,8 +3,8 @@
 Tiles d of 6 x 6 inputs, four cells apart, become tiles of 4 x 4 outputs,
 Y = A^T [(G g G^T) * (B^T d B)] A. The elementwise product, summed over the channels, is thirty-six
 matrix products. The result is exact but for rounding. Rounding depends on the points at which the
-polynomials behind the transforms are evaluated: 0, +-3/4, +-3/2 and infinity round three to five
-times less than the usual 0, +-1, +-2 and infinity, and as little as F(2 x 2, 3 x 3).
+polynomials behind the transforms are evaluated: 0, +-3/4, +-3/2 and infinity round half as much as
+the usual 0, +-1, +-2 and infinity.
 
 This is meant for CPUs, where XLA does not use the algorithm and its matrix products are as fast as
 its convolutions. The libraries of accelerators choose among their own algorithms.
