@@ -6,6 +6,7 @@ found no place are described at full size.
 """
 
 import dataclasses
+import functools
 import logging
 import shutil
 from collections.abc import Collection, Mapping
@@ -26,7 +27,7 @@ from jaxsfm.runs.matching_looks import (
     timed,
 )
 from jaxsfm.runs.run_stages import MappedRun, RunStages
-from jaxsfm.runs.sky_masks import without_sky
+from jaxsfm.runs.sky_masks import sky_masks, without_sky
 from jaxsfm.runs.turned_photos import Trials, find_turned
 from jaxsfm.sfm.round import FEWER
 
@@ -64,6 +65,21 @@ class RunPhotos:
         counts, lost = match_pairs(look, self.images, self.pairs, seconds)
         return MatchedPairs(Looks(look.store), look.config, counts), lost
 
+    @functools.cached_property
+    def sky_masks(self) -> dict[str, bytes]:
+        """Masks that leave out the sky (`jaxsfm.runs.sky_masks`)."""
+        return sky_masks(self.images.values())
+
+    def map(self, matched: MatchedPairs, stages: RunStages) -> MappedRun:
+        """Map the photos. If they contradict each other and the sky can be masked, end early.
+
+        Round after round without the pairs that were refuted was of no use on *statue*, where the
+        outlines before the sky look alike from four sides.
+        """
+        if not self.job.config.checked:
+            return stages.map(matched)
+        return stages.map(matched, lambda: not self.sky_masks)
+
     def without(self, lost: Collection[str]) -> "RunPhotos":
         """These photos without some."""
         left = {name: image for name, image in self.images.items() if name not in lost}
@@ -86,13 +102,13 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     Args:
       matched: the photos after the first look.
     """
-    mapped, seconds = stages.map(matched), stages.seconds
+    mapped, seconds = photos.map(matched, stages), stages.seconds
     trials = Trials(photos.job, photos.identity, photos.images, seconds)
     checked = photos.job.config.checked  # the paper looks at nothing twice
     if checked and (turned := find_turned(mapped, trials, matched.counts)):
         photos, stages = _changed(photos, turned, stages, "-turned")
         matched, _ = photos.match(seconds)
-        mapped = stages.map(matched)
+        mapped = photos.map(matched, stages)
     shared = stages
     if checked and not mapped.settled():
         stages, mapped = _with_own_cameras(matched, mapped, stages)
@@ -102,6 +118,8 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
         if masked is not None:
             photos, matched, stages, mapped = masked
             masked_sky = sum(image.mask is not None for image in stages.images)
+        elif mapped.stage.figures.cut_short:
+            mapped = stages.map(matched)
     found = MappedLooks(matched, mapped, None, photos.identity, own, masked_sky)
     if matched.described == photos.job.config:
         return found
@@ -142,9 +160,10 @@ def _with_masked_sky(
     """The same with the sky masked, if this gives better models; otherwise None."""
     folder = stages.folder.path / SKY
     with timed(stages.seconds, "sky"):
-        masked = without_sky(photos.images.values(), folder)
-    if not masked:
+        masks = photos.sky_masks
+    if not masks:
         return None
+    masked = without_sky(photos.images.values(), masks, folder)
     logger.info("something speaks against the model; matching again without the sky")
     photos, stages = _changed(photos, masked, stages, "-sky")
     matched, _ = photos.match(stages.seconds)

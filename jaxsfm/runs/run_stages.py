@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from tqdm import tqdm
@@ -119,8 +119,12 @@ class RunStages:
     look: str = ""
     """The end of the names of the stages' folders, so that several looks lie beside each other."""
 
-    def map(self, matched: MatchedPairs) -> MappedRun:
-        """Map the pairs with inliers."""
+    def map(self, matched: MatchedPairs, go_on: Callable[[], bool] | None = None) -> MappedRun:
+        """Map the pairs with inliers.
+
+        Args:
+          go_on: as in `map_matches`.
+        """
         chosen = matched.with_inliers(self.options.best_pairs)
         ours = SavedMatches(matched.looks, chosen)
         matches = JoinedMatches(ours, self.external, {image.name for image in self.images})
@@ -153,7 +157,7 @@ class RunStages:
             def on_image() -> None:
                 bar.update(bar.n < total)  # several models may share images
 
-            mapped = MappedRun(given, map_matches(given, cache, on_image), cache)
+            mapped = MappedRun(given, map_matches(given, cache, on_image, go_on), cache)
             # The global mapper does not report images before it ends.
             bar.update(mapped.largest() - bar.n)
         return mapped

@@ -5,7 +5,7 @@ sides, the largest model has 55 photos, of which 50 are right. With the sky mask
 which 91 are right (docs/decisions/repeated-structure.md).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -24,21 +24,28 @@ COMMON = 0.5
 """Masks are tried if so large a share of the photos gets one."""
 
 
-def without_sky(images: Iterable[ImageFile], folder: Path) -> dict[str, ImageFile]:
-    """The photos that show the sky, with masks that leave it out, by name.
+def sky_masks(images: Iterable[ImageFile]) -> dict[str, bytes]:
+    """Masks that leave out the sky, as PNG files, by the names of the photos that show it.
 
     There are none if few photos show the sky, or if a photo has a mask of the user's. A photo that
     cannot be decoded gets no mask.
-
-    Args:
-      folder: for the masks; it is made anew.
     """
     images = list(images)
     if any(image.mask for image in images):
         return {}
     masks = {image.name: data for image in images if (data := _mask(image)) is not None}
-    if not masks or len(masks) < COMMON * len(images):
-        return {}
+    return masks if len(masks) >= COMMON * len(images) else {}
+
+
+def without_sky(
+    images: Iterable[ImageFile], masks: Mapping[str, bytes], folder: Path
+) -> dict[str, ImageFile]:
+    """Those of the photos that have masks, with these, by name.
+
+    Args:
+      masks: what `sky_masks` returned.
+      folder: for the masks; it is made anew.
+    """
     with atomic_folder(folder) as fresh:
         for name, data in masks.items():
             path = mask_path(fresh, name)

@@ -7,7 +7,8 @@ in rounds.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,9 @@ MAX_ROUNDS = 4
 """At most so many times the pairs are mapped for a hypothesis. A model without contradictions takes
 one round, the courtyard of castle-P19 at 800 px and a rendered room take two. Each takes as long as
 the first."""
+ROUNDS_BEFORE_ASKING = 2
+"""After so many rounds in which photos contradict each other, it is asked whether to go on
+(`Voted.cut_short`)."""
 WORSE = 2 / 3
 """Rounds end if photos still contradict each other and the places of fewer pairs of photos are
 consistent than this share of those of the best round. On *statue*, the first round has 1519 such
@@ -41,21 +45,37 @@ corners of rendered boxes, wrong geometries turn it by 70 deg or more, and right
 logger = logging.getLogger("jaxsfm")
 
 
-def by_votes(rounds: Rounds, *, view_graph: bool) -> Round:
+class Voted(NamedTuple):
+    """The outcome of `by_votes`."""
+
+    best: Round
+    cut_short: bool
+    """Whether photos contradict each other and there were no more rounds, because the photos can be
+    matched in another way, which promises more."""
+
+
+def by_votes(
+    rounds: Rounds, *, view_graph: bool, go_on: Callable[[], bool] = lambda: True
+) -> Voted:
     """The best round of the hypothesis that the pairs on which most others agree are right.
 
     Pairs that were left out are taken back in one more round, if they agree with models in which no
     photo contradicts another.
+
+    Args:
+      go_on: whether to go on, if photos still contradict each other after the first rounds.
     """
 
     def judge(geometries: Mapping[Pair, PairGeometry], refuted: bool) -> dict[Pair, Verdict]:
         return trusted_pairs(geometries, strict=refuted) if view_graph else {}
 
     vote = Hypothesis("pairs", judge)
-    best = made = rounds.make(vote, NOTHING_REFUTED)
-    for _ in range(MAX_ROUNDS - 1):
+    best, cut_short = (made := rounds.make(vote, NOTHING_REFUTED)), False
+    for number in range(1, MAX_ROUNDS):
         refuted = _outvoted(rounds, made)
         if refuted == made.refuted:
+            break
+        if number == ROUNDS_BEFORE_ASKING and (cut_short := not go_on()):
             break
         logger.info("photos contradict each other; mapping again without the pairs that join them")
         made = rounds.make(vote, refuted)
@@ -69,7 +89,7 @@ def by_votes(rounds: Rounds, *, view_graph: bool) -> Round:
         again = rounds.make(vote, Refuted(left, best.refuted.first))
         if not again.contradicted() and again.checked_photos() >= best.checked_photos():
             best = again
-    return best
+    return Voted(best, cut_short)
 
 
 def _outvoted(rounds: Rounds, made: Round) -> Refuted:

@@ -48,6 +48,8 @@ class MappingFigures:
     """For each model; None where it was not checked."""
     basis: Basis = "pairs"
     """What the models follow."""
+    cut_short: bool = False
+    """Whether more rounds may give better models (`jaxsfm.sfm.hypotheses.Voted`)."""
 
     def misleading(self) -> set[Pair]:
         """Pairs that do not say where photos stand, because the rounds found them to be false."""
@@ -76,6 +78,7 @@ def build_checked_models(
     config: Config,
     options: MapOptions,
     on_image: Callable[[], None] = lambda: None,
+    go_on: Callable[[], bool] = lambda: True,
 ) -> Mapped:
     """Map verified pairs until no photo contradicts the others, with two hypotheses.
 
@@ -88,13 +91,16 @@ def build_checked_models(
       database: where to write the pairs that the models were made from.
       config: its `view_graph` and `checked` switch these parts on.
       on_image: called for every image that the mapper registers.
+      go_on: whether to go on, if photos still contradict each other after the first rounds. If not,
+        the best of these is returned.
     """
     following = neighbours(given.two_views.keys())
     with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
         rounds = Rounds(
             given, database, Path(scratch), config=config, options=options, on_image=on_image
         )
-        best, other = rounds.joined(by_votes(rounds, view_graph=config.view_graph)), None
+        voted = by_votes(rounds, view_graph=config.view_graph, go_on=go_on)
+        best, other = rounds.joined(voted.best), None
         checks, complete = _checks(best, following, rounds.fallen_apart(best)), False
         if green(checks):
             checks, complete = rounds.with_second_places(best, checks), True
@@ -128,7 +134,11 @@ def build_checked_models(
                 checks[0] = dataclasses.replace(checks[0], alternative=told)
                 alternative = rounds.with_all_points(other)
     figures = MappingFigures(
-        verdicts=best.verdicts, attempts=rounds.attempts, checks=checks, basis=best.basis
+        verdicts=best.verdicts,
+        attempts=rounds.attempts,
+        checks=checks,
+        basis=best.basis,
+        cut_short=voted.cut_short,
     )
     return Mapped(best.models, figures, alternative)
 

@@ -170,13 +170,17 @@ def matched_photos(
 
 
 def map_matches(
-    given: MatchedPhotos, kept: StageCache, on_image: Callable[[], None] = lambda: None
+    given: MatchedPhotos,
+    kept: StageCache,
+    on_image: Callable[[], None] = lambda: None,
+    go_on: Callable[[], bool] | None = None,
 ) -> MappedStage:
     """Verify the matches, and map the trusted pairs until no photo contradicts the others.
 
     Args:
       kept: stages of earlier runs, which are used again where they hold. New ones are kept there.
       on_image: called for every image that the mapper registers.
+      go_on: as in `build_checked_models`; None: always go on. The answer follows from the photos.
 
     Raises:
       UserError: COLMAP fails.
@@ -197,6 +201,7 @@ def map_matches(
             config=config,
             options=options,
             on_image=on_image,
+            go_on=go_on or (lambda: True),
         )
         write_models(made.models, folder / SPARSE)
         write_models(made.alternative, folder / ALTERNATIVE)
@@ -212,7 +217,7 @@ def map_matches(
     aligning = config.refinement or Refinement()
     checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
     refines = config.refinement is not None
-    key = digest(key, dataclasses.asdict(options), checking, refines)
+    key = digest(key, dataclasses.asdict(options), checking, refines, go_on is not None)
     verification = stage_files.read_verification(verified)
     mapped = stages.stage("mapped" + kept.suffix, key, build)
     return MappedStage(verification, stage_files.read_mapping(mapped), mapped, key)

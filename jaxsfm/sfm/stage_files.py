@@ -15,7 +15,7 @@ from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 9
+FORMAT = 10
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 
@@ -51,6 +51,7 @@ def write_mapping(folder: Path, figures: MappingFigures) -> None:
         "verdicts": [[pair, dataclasses.asdict(v)] for pair, v in figures.verdicts.items()],
         "attempts": [dataclasses.asdict(attempt) for attempt in figures.attempts],
         "basis": figures.basis,
+        "cut_short": figures.cut_short,
         "checks": [check and dataclasses.asdict(check) for check in figures.checks],
     }
     (folder / FIGURES).write_text(json.dumps(plain), encoding="utf-8")
@@ -68,6 +69,7 @@ def read_mapping(folder: Path) -> MappingFigures:
         attempts=attempts,
         checks=[row and _check(row) for row in plain["checks"]],
         basis=plain["basis"],
+        cut_short=plain["cut_short"],
     )
 
 

@@ -1,6 +1,7 @@
 """Masks of the sky, and when a run tries them."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.masks import MaskFile, read_mask
 from jaxsfm.runs import mapping_looks, sky_masks
-from jaxsfm.runs.mapping_looks import map_in_looks
+from jaxsfm.runs.mapping_looks import RunPhotos, map_in_looks
 from jaxsfm.runs.run_stages import MappedRun
 from jaxsfm.runs.sky_masks import without_sky
 from jaxsfm.sfm.second_look import SecondLook
@@ -39,7 +40,8 @@ def skies(monkeypatch):
 def test_photos_that_show_the_sky_get_masks_of_the_rest(tmp_path, skies):
     skies({"sub/a.jpg": 40, "b.jpg": 6, "c.jpg": 5, "d.jpg": 95})
     folder = tmp_path / "sky"
-    found = without_sky(map(image, ["sub/a.jpg", "b.jpg", "c.jpg", "d.jpg"]), folder)
+    images = [*map(image, ["sub/a.jpg", "b.jpg", "c.jpg", "d.jpg"])]
+    found = without_sky(images, sky_masks.sky_masks(images), folder)
     assert [*found] == ["sub/a.jpg", "b.jpg"]
     mask = found["sub/a.jpg"].mask
     assert mask is not None and mask.path == folder / "sub/a.jpg.png"
@@ -47,11 +49,9 @@ def test_photos_that_show_the_sky_get_masks_of_the_rest(tmp_path, skies):
     assert sorted(p.name for p in tmp_path.rglob("*.png")) == ["a.jpg.png", "b.jpg.png"]
 
 
-def test_masks_are_not_made_if_few_photos_show_the_sky(tmp_path, skies):
+def test_masks_are_not_made_if_few_photos_show_the_sky(skies):
     skies({"a": 40, "b": 0, "c": 0})
-    folder = tmp_path / "sky"
-    assert without_sky(map(image, "abc"), folder) == {} == without_sky([], folder)
-    assert not folder.exists()
+    assert sky_masks.sky_masks(map(image, "abc")) == {} == sky_masks.sky_masks([])
 
 
 def test_a_photo_that_cannot_be_decoded_gets_no_mask_and_old_masks_go(tmp_path, monkeypatch):
@@ -64,14 +64,15 @@ def test_a_photo_that_cannot_be_decoded_gets_no_mask_and_old_masks_go(tmp_path, 
     folder = tmp_path / "sky"
     folder.mkdir()
     (folder / "old.png").touch()
-    assert [*without_sky(map(image, "abc"), folder)] == ["a", "b"]
+    images = [*map(image, "abc")]
+    assert [*without_sky(images, sky_masks.sky_masks(images), folder)] == ["a", "b"]
     assert sorted(path.name for path in folder.iterdir()) == ["a.png", "b.png"]
 
 
-def test_masks_of_the_user_are_believed(tmp_path, skies):
+def test_masks_of_the_user_are_believed(skies):
     skies({"a": 40, "b": 40})
     own = dataclasses.replace(image("a"), mask=MaskFile(Path("m.png"), "m"))
-    assert without_sky([own, image("b")], tmp_path) == {}
+    assert sky_masks.sky_masks([own, image("b")]) == {}
 
 
 class Matched(str):
@@ -91,6 +92,11 @@ class Mapped:
     """Only photos that follow each other speak against it."""
     many_lost: bool = False
     """More than a third of the photos are in no model."""
+    cut_short: bool = False
+
+    @property
+    def stage(self) -> SimpleNamespace:
+        return SimpleNamespace(figures=SimpleNamespace(cut_short=self.cut_short))
 
     @property
     def photos(self) -> list[range]:
@@ -119,9 +125,13 @@ class Stages:
     look: str = ""
     seconds: dict = dataclasses.field(default_factory=dict)
 
-    def map(self, matched: object) -> Mapped:
+    def map(self, matched: object, go_on: Callable[[], bool] | None = None) -> Mapped:
         if matched == "again":
             return self.made["again"]
+        if go_on is not None:
+            assert self.look == "" and not go_on()  # the sky can be masked
+        elif self.look == "":
+            return self.made["all rounds"]
         assert matched == self.look and all(i.mask for i in self.images) == (self.look == "-sky")
         return self.made[self.look]
 
@@ -140,6 +150,12 @@ class Photos:
     def match(self, seconds: dict) -> tuple["Matched", dict]:
         self.tried.append(self.look)
         return Matched(self.look), {}
+
+    @property
+    def sky_masks(self) -> dict[str, bytes]:
+        return sky_masks.sky_masks(self.images.values())
+
+    map = RunPhotos.map
 
 
 @pytest.mark.parametrize(
@@ -172,6 +188,23 @@ def test_the_sky_is_masked_if_this_helps_where_something_speaks_against_the_mode
     assert photos.tried == (["-sky"] if masked is not None else [])
     assert found.mapped is (second if masked else first)
     assert found.matched == ("-sky" if masked else "")
+
+
+@pytest.mark.parametrize(
+    ("masked", "expected"), [(Mapped(False, 60), "-sky"), (Mapped(False, 55), "all rounds")]
+)
+def test_rounds_that_ended_early_are_made_if_masks_of_the_sky_do_not_help(
+    monkeypatch, tmp_path, skies, masked, expected
+):
+    skies({"a": 40, "b": 40})
+    monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
+    images = {name: image(name) for name in "ab"}
+    made = {"": Mapped(False, 55, cut_short=True), "-sky": masked, "all rounds": Mapped(True, 50)}
+    photos: Any = Photos(images, SimpleNamespace(config=Matched.described))
+    stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
+    matched: Any = Matched("")
+    found = map_in_looks(photos, matched, stages)
+    assert found.mapped is made[expected] and bool(found.masked_sky) == (expected == "-sky")
 
 
 @pytest.mark.parametrize(

@@ -114,6 +114,7 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         left_out: Callable[[frozenset[Pair]], bool] = lambda pairs: False,
         joiner: type = FakeJoiner,
         searched_too: dict | None = None,
+        go_on: Callable[[], bool] = lambda: True,
     ) -> Run:
         given: list[set[Pair]] = []
         started: list[frozenset[Pair]] = []
@@ -186,7 +187,9 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
         verified.write_text(json.dumps(sorted(geometries)))
         photos: checker.Photos = FakePhotos()  # pyright: ignore[reportAssignmentType]
         pairs = VerifiedPairs(verified, geometries, {}, photos)
-        made, figures, other = build_checked_models(pairs, database, config=config, options=OPTIONS)
+        made, figures, other = build_checked_models(
+            pairs, database, config=config, options=OPTIONS, go_on=go_on
+        )
         left = {tuple(pair) for pair in json.loads(database.read_text())}
         assert {tuple(pair) for pair in json.loads(verified.read_text())} == geometries.keys()
         return Run(
@@ -308,6 +311,32 @@ def test_it_ends_after_the_last_round_and_says_what_is_left(rounds):
     assert len(found.dropped) == MAX_ROUNDS - 1
     (last,) = found.figures.checks
     assert last is not None and last.verdict == "red"
+
+
+def one_after_the_other(last: int) -> Callable[[frozenset[Pair]], Checked]:
+    """Of the first pairs, each is refuted in its turn, and nothing else."""
+
+    def check(pairs):
+        return outcome(refuted=[pair for pair in PAIRS[:last] if pair in pairs][:1])
+
+    return check
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_it_is_asked_once_whether_to_go_on_after_two_rounds_of_contradictions(rounds, goes_on):
+    asked = []
+    found = rounds(one_after_the_other(3), go_on=lambda: asked.append(0) or goes_on)
+    assert len(found.rounds) == (4 if goes_on else 2) and len(asked) == 1
+    assert found.figures.cut_short == (not goes_on)
+    assert found.models == [frozenset(PAIRS[3:] if goes_on else PAIRS[1:])]
+    verdicts = [each.verdict for each in found.figures.checks if each]
+    assert verdicts == ["green" if goes_on else "red"]
+
+
+@pytest.mark.parametrize("last", [0, 1])
+def test_it_is_not_asked_whether_to_go_on_if_two_rounds_are_enough(rounds, last):
+    found = rounds(one_after_the_other(last), go_on=lambda: pytest.fail("asked"))
+    assert len(found.rounds) == last + 1 and not found.figures.cut_short
 
 
 def test_pairs_that_agree_with_the_last_model_are_taken_back(rounds):
