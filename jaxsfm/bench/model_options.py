@@ -5,9 +5,16 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from jaxsfm.bench.options import NetworkOptions, SeedOptions, SetOptions, check_side, split_names
+from jaxsfm.bench.options import (
+    BenchOptions,
+    NetworkOptions,
+    SeedOptions,
+    SetOptions,
+    check_side,
+    whole_numbers,
+)
 from jaxsfm.errors import UserError
-from jaxsfm.options import check_seed, check_threads
+from jaxsfm.options import MapperChoice, check_seed, check_threads
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -147,11 +154,38 @@ class AmbiguousOptions(_Runs, SeedOptions):
         Raises:
           UserError: there is no number, or one that is too small.
         """
-        texts = split_names(self.sizes)
-        if not texts:
-            raise UserError("--sizes: none given")
-        for text in texts:
-            if not text.isascii() or not text.isdigit():
-                raise UserError(f"--sizes: {text!r} is not a number of pixels")
-            check_side(int(text) * 3 // 4, "--sizes: three quarters of each size")
-        return list(dict.fromkeys(map(int, texts)))
+        sizes = whole_numbers(self.sizes, "--sizes")
+        for size in sizes:
+            check_side(size * 3 // 4, "--sizes: three quarters of each size")
+        return sizes
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SequenceOptions(BenchOptions):
+    """Options of `bench sequence`.
+
+    Attributes:
+      root: Folder laid out as a sequence of 7-Scenes: NAME.jpg (or another format), NAME.pose.txt
+        (camera to world) and K.txt.
+      methods: Methods to compare, separated by commas or blanks: presets, and rootsift, which gets
+        the pairs of the last preset.
+      every: Which frames are used, separated by commas or blanks. 10,1: each tenth frame, then all.
+      localize: Of the frames that are used, each so many is left out of the model and localized in
+        it. 0: none.
+      intrinsics: known: K.txt is the camera of all frames. unknown: it is estimated.
+      mapper: As in reconstruct.
+      out: Folder for databases and models. A later run continues from what is there.
+    """
+
+    root: Path
+    methods: tuple[str, ...] = ("default,rootsift",)
+    every: tuple[str, ...] = ("10",)
+    localize: int = 0
+    intrinsics: Literal["known", "unknown"] = "known"
+    mapper: MapperChoice = "incremental"
+    out: Path
+
+    def __post_init__(self) -> None:
+        whole_numbers(self.every, "--every")
+        if self.localize < 0 or self.localize == 1:
+            raise UserError(f"--localize must be 0 or at least 2; got {self.localize}")

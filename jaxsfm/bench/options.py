@@ -18,6 +18,21 @@ def split_names(values: Sequence[str]) -> list[str]:
     return [name for value in values for name in value.split(",") if name]
 
 
+def whole_numbers(values: Sequence[str], option: str) -> list[int]:
+    """Different numbers of at least 1, separated by commas, blanks or both.
+
+    Raises:
+      UserError: there is no number, or something else.
+    """
+    texts = split_names(values)
+    if not texts:
+        raise UserError(f"{option}: none given")
+    for text in texts:
+        if not (text.isascii() and text.isdigit() and int(text)):
+            raise UserError(f"{option}: {text!r} is not a whole number of at least 1")
+    return list(dict.fromkeys(map(int, texts)))
+
+
 def check_side(size: int, option: str) -> None:
     """Raise UserError for a working size that is too small."""
     if size < MIN_SIDE:
@@ -152,3 +167,34 @@ class HomographyOptions(PairOptions):
     """
 
     root: Path
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecallOptions(BenchOptions):
+    """Options of `bench recall`.
+
+    Attributes:
+      root: Folder of the photos.
+      strangers: Folder of photos of other places. Their pairs are not true.
+      truth: Folder of a COLMAP model of the photos, or of poses of 7-Scenes with K.txt.
+      depth: By poses alone, the distance at which the common part of two photos is measured, in
+        units of the poses.
+      every: Each so many photos is used.
+      methods: How a photo is described, separated by commas or blanks: vlad, gem.
+      nearest: Numbers of similar photos to look at, separated by commas or blanks.
+    """
+
+    root: Path
+    strangers: Path | None = None
+    truth: Path
+    depth: float = 2.0
+    every: int = 1
+    methods: tuple[str, ...] = ("vlad,gem",)
+    nearest: tuple[str, ...] = ("5,10,20,50",)
+
+    def __post_init__(self) -> None:
+        whole_numbers(self.nearest, "--nearest")
+        if self.every < 1:
+            raise UserError(f"--every must be at least 1; got {self.every}")
+        if not self.depth > 0:
+            raise UserError(f"--depth must be more than 0; got {self.depth}")

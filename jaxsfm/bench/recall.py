@@ -1,25 +1,20 @@
 """How many of the pairs that show the same place are among the most similar photos.
 
-`python -m jaxsfm.bench.recall PHOTOS... --truth TRUTH` describes the photos of one or more folders
-as `reconstruct` does, and looks at the K most similar photos of each photo. TRUTH is the folder of
-a COLMAP model, or of poses of 7-Scenes. By a model, a pair is *true* if its photos have 30 points
-in common. By poses alone, a pair is true if each of its cameras sees half of what lies before the
-other one at a distance of `--depth`.
-
-Photos of other folders than that of the truth are strangers: their pairs with other photos are not
-true.
+The photos are described as `reconstruct` does it. By a model, a pair is *true* if its photos have
+30 points in common. By poses alone, a pair is true if each of its cameras sees half of what lies
+before the other one at a given distance. Pairs of photos of other places are not true.
 """
 
-import argparse
 import dataclasses
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxsfm.bench.figures import write_json
+from jaxsfm.bench.options import RecallOptions, whole_numbers
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.poses import find_model, read_model, read_poses
 from jaxsfm.colmap.view import View
@@ -33,6 +28,8 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
 from jaxsfm.options import Retrieval
 
+KINDS: list[Retrieval] = ["vlad", "gem"]
+"""Ways to compare photos that need no other weights than those of the features."""
 COMMON_POINTS = 30
 """Points that both photos of a true pair see in a model: COLMAP's least number of inliers of a
 photo that it adds."""
@@ -99,13 +96,14 @@ def found_pairs(tried: set[Pair], true: set[Pair]) -> Found:
     return Found(len(tried), len(tried & true), connected)
 
 
-def _photos(folders: list[Path]) -> list[ImageFile]:
-    """The photos of all folders. Those of the second and of later folders have the name of their
-    folder before their own."""
-    (photos, _), *others = map(open_images, folders)
-    for folder, (images, _) in zip(folders[1:], others, strict=True):
-        photos += [dataclasses.replace(i, name=f"{folder.name}/{i.name}") for i in images]
-    return photos
+def _photos(root: Path, strangers: Path | None) -> list[ImageFile]:
+    """The photos of both folders. Strangers have the name of their folder before their own."""
+    photos, _ = open_images(root)
+    others = open_images(strangers)[0] if strangers else []
+    return [
+        *photos,
+        *(dataclasses.replace(i, name=f"{strangers.name}/{i.name}") for i in others if strangers),
+    ]
 
 
 def _true_pairs(truth: Path, depth: float, photos: list[ImageFile]) -> set[Pair]:
@@ -134,43 +132,54 @@ def _true_pairs(truth: Path, depth: float, photos: list[ImageFile]) -> set[Pair]
 
 
 def measure(
-    photos: list[ImageFile], true: set[Pair], kinds: list[Retrieval], numbers: list[int]
-) -> list[dict[str, Json]]:
+    photos: list[ImageFile], true: set[Pair], kinds: list[str], numbers: list[int]
+) -> Iterator[dict[str, Json]]:
     """A row for each way to compare photos and each number of similar photos."""
-    weights, rows = load_weights(), []
+    weights = load_weights()
     places = {name for pair in true for name in pair}
-    for kind in kinds:
+    for kind in KINDS:
+        if kind not in kinds:
+            continue
         described = describe_photos(weights, photos, kind=kind)
         for k in numbers:
             tried = set(nearest_pairs(described.vectors, k))
             found = found_pairs(tried, true)
             own = sum(places.issuperset(pair) for pair in tried)
-            row: dict[str, Json] = {"retrieval": kind, "k": k, "pairs": found.pairs}
-            row |= {"true": found.true, "of": len(true), "among_own": own}
-            row |= {"connected": found.connected, "photos": len(places)}
-            rows.append(row)
-            print("\t".join(f"{name} {value}" for name, value in row.items()), flush=True)
-    return rows
+            yield {
+                "retrieval": kind,
+                "nearest": k,
+                "pairs": found.pairs,
+                "true": found.true,
+                "of": len(true),
+                "among_own": own,
+                "connected": found.connected,
+                "photos": len(places),
+            }
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Measure some numbers of similar photos, and print a row for each."""
-    parser = argparse.ArgumentParser(prog="jaxsfm.bench.recall", description=__doc__)
-    parser.add_argument("photos", type=Path, nargs="+", help="folders; strangers come last")
-    parser.add_argument("--truth", type=Path, required=True, help="a model, or 7-Scenes' poses")
-    parser.add_argument("--depth", type=float, default=2.0, help="of what is seen, by poses alone")
-    parser.add_argument("--every", type=int, default=1, help="each so many photos is used")
-    parser.add_argument("--retrieval", default="vlad,gem", help="ways to compare photos")
-    parser.add_argument("--k", default="5,10,20,50", help="numbers of similar photos")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
-    options = parser.parse_args(arguments)
-    photos = _photos(options.photos)[:: options.every]
+def bench_recall(options: RecallOptions) -> dict[str, Json]:
+    """Measure some numbers of similar photos.
+
+    Raises:
+      UserError: a folder or an option cannot be used.
+    """
+    kinds = options.chosen_methods(KINDS)
+    photos = _photos(options.root, options.strangers)[:: options.every]
     true = _true_pairs(options.truth, options.depth, photos)
-    numbers = [int(k) for k in options.k.split(",")]
-    rows = measure(photos, true, options.retrieval.split(","), numbers)
-    if options.json:
-        write_json(options.json, {"rows": rows})
+    rows: list[dict[str, Json]] = []
+    for row in measure(photos, true, kinds, whole_numbers(options.nearest, "--nearest")):
+        rows.append(row)
+        if options.json:
+            write_json(options.json, {"rows": rows})
+    return {"rows": rows}
 
 
-if __name__ == "__main__":
-    main()
+def table_lines(figures: Mapping[str, Json]) -> list[str]:
+    """A line for each way to compare photos and each number of similar photos."""
+    rows: Any = figures["rows"]
+    lines = ["retrieval  nearest   pairs    true of      among own  connected photos"]
+    return lines + [
+        f"{row['retrieval']:<9} {row['nearest']:>8} {row['pairs']:>7} {row['true']:>7} "
+        f"{row['of']:<7} {row['among_own']:>9}  {row['connected']:>9} of {row['photos']}"
+        for row in rows
+    ]

@@ -1,26 +1,23 @@
 """Frames of a video with reference poses: models of some of them, and the others localized.
 
-`python -m jaxsfm.bench.sequence FOLDER --every 10,2,1` takes each tenth frame of a folder, then
-each second one, then all, and makes models of them with jaxsfm, and with COLMAP's RootSIFT on the
-same pairs and with the same camera. The folder is laid out as a sequence of 7-Scenes: `NAME.jpg`
-(or another format), `NAME.pose.txt` (camera to world) and `K.txt`. The figures are those of a run:
-seconds of each stage, the number of registered frames, the position errors after a similarity over
-all frames, and those of the first and the last tenth of the frames (drift).
-
-With `--localize 5`, each fifth frame is left out of the models, and is localized in them.
+Models are made with jaxsfm, and with COLMAP's RootSIFT on the same pairs and with the same camera.
+The figures are those of a run: seconds of each stage, the number of registered frames, the position
+errors after a similarity over all frames, and those of the first and the last tenth of the frames
+(drift).
 """
 
-import argparse
 import dataclasses
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jaxsfm.bench.figures import write_json
+from jaxsfm.bench.model_options import SequenceOptions
+from jaxsfm.bench.options import whole_numbers
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.inliers import read_inliers
@@ -31,13 +28,14 @@ from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.colmap.view import View
-from jaxsfm.config import preset
+from jaxsfm.config import PRESETS, preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.matching.pipeline import open_images
+from jaxsfm.options import MapperChoice
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizedPhoto
 from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -53,6 +51,7 @@ from jaxsfm.sfm.evaluation import (
 if TYPE_CHECKING:
     import pycolmap
 
+ROOTSIFT = "rootsift"
 PHOTOS = (".jpg", ".jpeg", ".png")
 END = 0.1
 """The share of the frames at either end whose errors are reported apart."""
@@ -123,7 +122,7 @@ def _summary(found: Mapping[str, PoseError], frames: int, seconds: float) -> dic
     }
 
 
-class Sequence(NamedTuple):
+class FrameSequence(NamedTuple):
     """The input of all methods."""
 
     folder: Path
@@ -133,17 +132,21 @@ class Sequence(NamedTuple):
     """Where results are kept."""
     known: str | None
     """The value of `--intrinsics`; None: the camera is not known."""
+    mapper: MapperChoice
+    """Of the presets."""
     truth: Poses
 
 
-def with_jaxsfm(given: Sequence, name: str) -> tuple[dict[str, Json], set[Pair]]:
+def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[Pair]]:
     """Models of a preset, and localized frames; the pairs that were tried, for other methods."""
     out = given.work / name
     report = reconstruct_folder(
         _linked(given.frames.mapped, given.work / "frames"),
         out,
         config=preset(name),
-        options=RunOptions(intrinsics=given.known, keep_features=True, progress=True),
+        options=RunOptions(
+            intrinsics=given.known, mapper=given.mapper, keep_features=True, progress=True
+        ),
     )
     row: dict[str, Json] = {
         "verdict": report.verdict,
@@ -169,7 +172,7 @@ def with_jaxsfm(given: Sequence, name: str) -> tuple[dict[str, Json], set[Pair]]
     return row, pairs
 
 
-def with_rootsift(given: Sequence, pairs: set[Pair]) -> dict[str, Json]:
+def with_rootsift(given: FrameSequence, pairs: set[Pair]) -> dict[str, Json]:
     """The same of COLMAP's features on given pairs: a model of its incremental mapper, and frames
     localized by the matches with points of the model."""
     out = given.work / "rootsift"
@@ -202,7 +205,7 @@ def with_rootsift(given: Sequence, pairs: set[Pair]) -> dict[str, Json]:
 
 
 def _placed_by_matches(
-    given: Sequence, database: Path, model: "pycolmap.Reconstruction"
+    given: FrameSequence, database: Path, model: "pycolmap.Reconstruction"
 ) -> dict[str, PoseError]:
     """The errors of frames whose pose follows from their matches with the model's keypoints."""
     inliers, cameras = read_inliers(database), read_images(database)
@@ -244,50 +247,69 @@ def _placed_by_matches(
     return found
 
 
-def measure(given: Sequence, methods: list[str]) -> list[dict[str, Json]]:
-    """A row for each method; those of presets come first, because they choose the pairs.
-
-    Raises:
-      UserError: a frame, a pose or an option cannot be used.
-    """
+def _measured(given: FrameSequence, methods: list[str]) -> Iterator[dict[str, Json]]:
+    """A row for each method; presets come first, because they choose the pairs."""
     pairs: set[Pair] = set()
-    rows = []
-    for method in sorted(methods, key=lambda name: name == "rootsift"):
-        if method == "rootsift":
+    for method in methods:
+        if method == ROOTSIFT:
             row = with_rootsift(given, pairs)
         else:
             row, pairs = with_jaxsfm(given, method)
         frames = len(given.frames.mapped)
-        rows.append({"method": method, "frames": frames, "known": given.known is not None, **row})
-        told = {k: v for k, v in rows[-1].items() if k != "localized"}
-        print("\t".join(f"{name} {value}" for name, value in told.items()), flush=True)
-        if isinstance(local := row.get("localized"), dict):
-            print("localized", {k: v for k, v in local.items() if k != "each"}, flush=True)
-    return rows
+        yield {"method": method, "frames": frames, "known": given.known is not None, **row}
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Measure some numbers of frames, and print a row for each."""
-    parser = argparse.ArgumentParser(prog="jaxsfm.bench.sequence", description=__doc__)
-    parser.add_argument("folder", type=Path, help="with the frames, their poses and K.txt")
-    parser.add_argument("--every", default="10", help="which frames are used, for example 10,2,1")
-    parser.add_argument("--localize", type=int, default=0, help="each so many is localized")
-    parser.add_argument("--methods", default="default,rootsift", help="presets, and rootsift")
-    parser.add_argument("--unknown", action="store_true", help="do not use K.txt")
-    parser.add_argument("--out", type=Path, required=True, help="where results are kept")
-    parser.add_argument("--json", type=Path, help="write all figures to this file")
-    options = parser.parse_args(arguments)
-    truth = read_poses(options.folder)
-    known = None if options.unknown else str(options.folder / "K.txt")
-    rows = []
-    for every in map(int, options.every.split(",")):
-        frames = chosen_frames(options.folder, every, options.localize)
-        work = options.out / f"every-{every}{'-unknown' * options.unknown}"
-        given = Sequence(options.folder, frames, work, known, truth)
-        rows += measure(given, options.methods.split(","))
-        if options.json:
-            write_json(options.json, {"rows": rows})
+def bench_sequence(options: SequenceOptions) -> dict[str, Json]:
+    """Measure some numbers of frames.
+
+    Raises:
+      UserError: a frame, a pose or an option cannot be used.
+    """
+    methods = options.chosen_methods([*PRESETS, ROOTSIFT])
+    if methods == [ROOTSIFT]:
+        raise UserError("--methods: rootsift needs a preset beside it, which chooses the pairs")
+    truth = read_poses(options.root)
+    known = str(options.root / "K.txt") if options.intrinsics == "known" else None
+    rows: list[dict[str, Json]] = []
+    for every in whole_numbers(options.every, "--every"):
+        frames = chosen_frames(options.root, every, options.localize)
+        parts = [f"every-{every}", "" if known else "unknown", *_others(options)]
+        work = options.out / "-".join(filter(None, parts))
+        for row in _measured(
+            FrameSequence(options.root, frames, work, known, options.mapper, truth), methods
+        ):
+            rows.append(row)
+            if options.json:
+                write_json(options.json, {"rows": rows})
+    return {"rows": rows}
 
 
-if __name__ == "__main__":
-    main()
+def _others(options: SequenceOptions) -> list[str]:
+    """What else a folder of results is named after."""
+    mapper = "" if options.mapper == "incremental" else options.mapper
+    return [mapper, f"localize-{options.localize}" if options.localize else ""]
+
+
+def table_lines(figures: Mapping[str, Json]) -> list[str]:
+    """A line for each method and number of frames, and one for localized frames."""
+    rows: Any = figures["rows"]
+    lines = ["frames  camera   method     registered  position  first, last tenth  seconds"]
+    for row in rows:
+        ends = ", ".join(f"{end:.4f}" for end in row["ends"])
+        stages = ", ".join(f"{name} {value:.0f}" for name, value in row["seconds"].items())
+        camera = "known" if row["known"] else "unknown"
+        lines.append(
+            f"{row['frames']:<7} {camera:<8} {row['method']:<10} {row['registered']:>10}  "
+            f"{row['position']:>8.4f}  {ends:<17}  {sum(row['seconds'].values()):.0f} ({stages})"
+        )
+        if found := row.get("localized"):
+            medians = "none has a pose"
+            if found["placed"]:
+                medians = (
+                    f"median {found['median_position']:.4f}, {found['median_rotation_deg']:.2f} deg"
+                )
+            lines.append(
+                f"        localized: {found['near']} of {found['frames']} within {NEAR:g} and "
+                f"{NEAR_DEG:g} deg, {found['placed']} placed, {medians}, {found['seconds']:.0f} s"
+            )
+    return lines

@@ -5,11 +5,17 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from jaxsfm.bench.model_options import AmbiguousOptions, DayNightOptions, StrechaOptions
+from jaxsfm.bench.model_options import (
+    AmbiguousOptions,
+    DayNightOptions,
+    SequenceOptions,
+    StrechaOptions,
+)
 from jaxsfm.bench.options import (
     BenchOptions,
     HomographyOptions,
     PlanesOptions,
+    RecallOptions,
     WarpsOptions,
     WxbsOptions,
 )
@@ -120,3 +126,29 @@ def warps(bench: Unnamed[WarpsOptions]) -> int:
     from jaxsfm.bench.warps import bench_warps, table_lines
 
     return _run(bench_warps, table_lines, bench)
+
+
+def sequence(bench: Unnamed[SequenceOptions]) -> int:
+    """Reconstruct frames of a video with known poses (7-Scenes), next to COLMAP's RootSIFT.
+
+    With --localize, some frames are left out of the model, and localized in it.
+
+    For example
+        $ jaxsfm bench sequence --root FRAMES --every 10,2 --out OUT
+        $ jaxsfm bench sequence --root FRAMES --every 2 --localize 5 --out OUT
+    """
+    from jaxsfm.bench.sequence import bench_sequence, table_lines
+
+    return _run(bench_sequence, table_lines, bench)
+
+
+def recall(bench: Unnamed[RecallOptions]) -> int:
+    """Count the pairs of photos of one place among the most similar photos.
+
+    For example
+        $ jaxsfm bench recall --root PHOTOS --truth MODEL
+        $ jaxsfm bench recall --root FRAMES --truth FRAMES --every 10 --strangers OTHERS
+    """
+    from jaxsfm.bench.recall import bench_recall, table_lines
+
+    return _run(bench_recall, table_lines, bench)

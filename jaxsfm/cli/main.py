@@ -8,7 +8,17 @@ import threading
 
 import tyro
 
-from jaxsfm.cli.bench_commands import ambiguous, daynight, homography, planes, strecha, warps, wxbs
+from jaxsfm.cli.bench_commands import (
+    ambiguous,
+    daynight,
+    homography,
+    planes,
+    recall,
+    sequence,
+    strecha,
+    warps,
+    wxbs,
+)
 from jaxsfm.cli.data_commands import data
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.frames_command import frames
@@ -29,6 +39,8 @@ BENCHMARKS = {
     "strecha": strecha,
     "daynight": daynight,
     "ambiguous": ambiguous,
+    "sequence": sequence,
+    "recall": recall,
     "wxbs": wxbs,
     "homography": homography,
     "planes": planes,

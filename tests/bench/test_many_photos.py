@@ -10,6 +10,7 @@ from jaxsfm.bench import driver, sequence
 from jaxsfm.bench.long_street import SIZE, walk, write_street
 from jaxsfm.bench.simulated import NOISE_PX, REACH, SimulatedStreet
 from jaxsfm.bench.synthetic import camera_matrix
+from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import inspect_image
@@ -77,11 +78,30 @@ def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street_sequen
         sequence.chosen_frames(folder, 5, 0) and sequence.chosen_frames(folder, 10, 0)
 
 
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (["--localize", "1"], "--localize must be 0 or at least 2; got 1"),
+        (["--every", "0"], "--every: '0' is not a whole number of at least 1"),
+        (["--every", ","], "--every: none given"),
+        (["--methods", "rootsift"], "rootsift needs a preset beside it"),
+        (["--methods", "sift"], "no method 'sift'"),
+    ],
+)
+def test_options_of_a_sequence_that_make_no_sense_are_refused(tmp_path, capsys, given, says):
+    both = ["--root", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main(["bench", "sequence", *both, *given]) == 2
+    assert says in capsys.readouterr().err
+
+
 @pytest.mark.slow
-def test_frames_are_mapped_and_localized_beside_rootsift(street_sequence, tmp_path):
+def test_frames_are_mapped_and_localized_beside_rootsift(street_sequence, tmp_path, capsys):
     figures = tmp_path / "figures.json"
     options = ["--every", "1", "--localize", "5", "--out", str(tmp_path / "out")]
-    sequence.main([str(street_sequence), *options, "--json", str(figures)])
+    given = ["--root", str(street_sequence), *options, "--json", str(figures)]
+    assert main(["bench", "sequence", *given]) == 0
+    printed = capsys.readouterr().out
+    assert "2 of 2 within 0.05 and 5 deg" in printed and "rootsift" in printed
     ours, theirs = json.loads(figures.read_text())["rows"]
     assert (ours["method"], theirs["method"]) == ("default", "rootsift")
     assert ours["registered"] == ours["frames"] == 9

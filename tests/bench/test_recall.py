@@ -10,8 +10,8 @@ from room_scene import camera
 
 from jaxsfm.bench import recall
 from jaxsfm.bench.synthetic import camera_matrix
+from jaxsfm.cli.main import main
 from jaxsfm.colmap.view import View
-from jaxsfm.errors import UserError
 from jaxsfm.io.pixels import Pixels
 
 SIZE = (90, 60)
@@ -82,19 +82,27 @@ def test_a_photo_is_connected_by_five_true_partners_or_by_all_that_it_has():
 
 
 @pytest.mark.slow
-def test_strangers_are_counted_apart(street_sequence, tmp_path):
+def test_strangers_are_counted_apart(street_sequence, tmp_path, capsys):
     """Of the pairs of a street with two photos of itself as strangers, the true ones are found."""
     strangers = tmp_path / "others"
     strangers.mkdir()
     for name in ("photo00000.png", "photo00001.png"):
         (strangers / name).write_bytes((street_sequence / name).read_bytes() + b" ")
     figures = tmp_path / "figures.json"
-    options = ["--truth", str(street_sequence), "--depth", "8", "--k", "2,20"]
-    given = [str(street_sequence), str(strangers), *options, "--json", str(figures)]
-    recall.main([*given, "--retrieval", "vlad"])
+    options = ["--truth", str(street_sequence), "--depth", "8", "--nearest", "2,20"]
+    given = ["bench", "recall", "--root", str(street_sequence), "--strangers", str(strangers)]
+    given += [*options, "--json", str(figures), "--methods", "vlad"]
+    assert main(given) == 0
+    assert "11 of 11" in capsys.readouterr().out
     few, every = json.loads(figures.read_text())["rows"]
     assert every["pairs"] == 13 * 12 // 2 and every["among_own"] == 11 * 10 // 2
     assert every["true"] == every["of"] > 9 and every["connected"] == every["photos"] == 11
     assert 0 < few["true"] <= few["among_own"] < few["pairs"] < every["pairs"]
-    with pytest.raises(UserError, match="no COLMAP model"):
-        recall.main([str(street_sequence), "--truth", str(strangers)])
+
+
+def test_a_truth_that_is_none_is_refused(street_sequence, tmp_path, capsys):
+    given = ["bench", "recall", "--root", str(street_sequence)]
+    assert main([*given, "--truth", str(tmp_path)]) == 2
+    assert "no COLMAP model" in capsys.readouterr().err
+    assert main([*given, "--truth", str(tmp_path), "--depth", "0"]) == 2
+    assert "--depth must be more than 0; got 0" in capsys.readouterr().err
