@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxsfm.colmap.cameras import Cameras as Cameras
     from jaxsfm.colmap.intrinsics import parse_intrinsics as parse_intrinsics
-    from jaxsfm.colmap.mapper import MapOptions as MapOptions
+    from jaxsfm.colmap.map_options import MapOptions as MapOptions
     from jaxsfm.colmap.poses import model_poses as model_poses
     from jaxsfm.colmap.poses import read_poses as read_poses
     from jaxsfm.config import Config as Config

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import build_models
 from jaxsfm.colmap.two_views import read_two_views, verify
 
 

@@ -22,7 +22,8 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.inliers import read_inliers
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.mapper import MapOptions, first_models
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import first_models
 from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.rootsift import write_rootsift_database

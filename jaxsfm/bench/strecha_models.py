@@ -22,7 +22,8 @@ from jaxsfm.bench.strecha_sets import StrechaSet
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_keypoint_matches
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import build_models
 from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database

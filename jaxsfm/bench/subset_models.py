@@ -12,7 +12,8 @@ from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import drop_pairs
-from jaxsfm.colmap.mapper import MapOptions, build_models
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import build_models
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views

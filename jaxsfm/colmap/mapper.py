@@ -6,15 +6,17 @@ parts of the scene that nothing connects to it.
 
 import dataclasses
 import tempfile
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import pycolmap
 
 from jaxsfm.colmap.database import read_images
+from jaxsfm.colmap.map_options import MapOptions, global_options, incremental_options
+from jaxsfm.colmap.model_images import ordered, registered
 from jaxsfm.colmap.native import native
-from jaxsfm.colmap.two_views import TwoView, VerificationOptions
+from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.io.pairs import Pair, component_of
 from jaxsfm.options import Mapper
 
@@ -27,39 +29,6 @@ out. In a collection many photos always are, and each further run takes minutes:
 masks the first run registers 109 of 135 photos, and three more 102, 18 and 2."""
 MAX_RETRIES = 2
 """Number of further initial pairs that are tried if the mapper's own choice leaves out images."""
-DRAFT_GROWTH = 1.4
-"""A draft is adjusted as a whole when it has grown by this factor; COLMAP's own is 1.1. On *statue*
-a run takes 138 s instead of 240."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MapOptions:
-    """Settings of the mapper."""
-
-    mapper: Mapper = "incremental"
-    in_parts: bool = False
-    """Many photos are mapped in parts (`jaxsfm.sfm.parts`)."""
-    refine_intrinsics: bool = True
-    seed: int = 0
-    threads: int = -1
-    """Threads of verification and bundle adjustment; -1 takes all cores. With one thread the model
-    is repeatable to the last byte."""
-    scale: float = 1.0
-    """Original pixels per working pixel. COLMAP's pixel thresholds are multiplied by it."""
-    draft: bool = False
-    """The models are refined afterwards, so the first run of the incremental mapper makes a draft.
-    It adjusts the whole model less often, and leaves out images that see too few of its points.
-    COLMAP would register these by single pairs (its structure-less fallback), filter them out after
-    the next adjustment, and try again, which takes more than a quarter of the time on *statue*."""
-
-    def verification(self, *, relative_poses: bool = True) -> VerificationOptions:
-        """The settings of the two-view verification before this mapping."""
-        return VerificationOptions(
-            seed=self.seed,
-            threads=self.threads,
-            scale=self.scale,
-            relative_poses=relative_poses,
-        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,38 +40,6 @@ class Attempt:
     """The pair that mapping started from; None: the mapper's own choice."""
     registered: list[int]
     """Number of images of every model, the largest first."""
-
-
-def incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOptions:
-    """The options as the incremental mapper takes them."""
-    p = pycolmap.IncrementalPipelineOptions()
-    p.ba_refine_focal_length = p.ba_refine_extra_params = options.refine_intrinsics
-    p.ba_refine_principal_point = False
-    p.num_threads = p.mapper.num_threads = options.threads
-    p.random_seed = p.mapper.random_seed = options.seed
-    p.min_model_size = 2
-    if options.draft:
-        p.structure_less_registration_fallback = False
-        p.ba_global_frames_ratio = p.ba_global_points_ratio = DRAFT_GROWTH
-    p.extract_colors = False  # `colour_points` does it, with our own reader
-    p.mapper.init_max_error *= options.scale
-    p.mapper.abs_pose_max_error *= options.scale
-    p.mapper.filter_max_reproj_error *= options.scale
-    p.triangulation.complete_max_reproj_error *= options.scale
-    p.triangulation.merge_max_reproj_error *= options.scale
-    return p
-
-
-def _global_options(options: MapOptions) -> pycolmap.GlobalPipelineOptions:
-    p = pycolmap.GlobalPipelineOptions()
-    p.num_threads = options.threads
-    p.random_seed = options.seed
-    p.mapper.num_threads = options.threads
-    p.mapper.random_seed = options.seed
-    ba = p.mapper.bundle_adjustment
-    ba.refine_focal_length = ba.refine_extra_params = options.refine_intrinsics
-    ba.refine_principal_point = False
-    return p
 
 
 def initial_pairs(two_views: Mapping[Pair, TwoView]) -> list[Pair]:
@@ -120,41 +57,6 @@ def initial_pairs(two_views: Mapping[Pair, TwoView]) -> list[Pair]:
         (p for p, v in two_views.items() if v.geometry.rotation is not None and score(v) > 0),
         key=lambda p: (-score(two_views[p]), p),
     )
-
-
-def ordered(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """The models, the one with most images first, without those of images that a larger one has.
-
-    In photos of repeated structure, COLMAP starts the same model again from other pairs: one run
-    had seven models of the same 19 photos.
-    """
-    by_size = sorted(
-        models, key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids()))
-    )
-    kept: list[pycolmap.Reconstruction] = []
-    for model in by_size:
-        if not any(registered(model) <= registered(other) for other in kept):
-            kept.append(model)
-    return kept
-
-
-def registered(model: pycolmap.Reconstruction) -> set[str]:
-    """Names of the images that have a pose."""
-    return {model.image(i).name for i in model.reg_image_ids()}
-
-
-def take_out(model: pycolmap.Reconstruction, names: Collection[str]) -> None:
-    """Take the poses of images away, and the points that fewer than two images still see."""
-    for k in sorted(model.reg_image_ids()):
-        if model.image(k).name in names:
-            model.deregister_frame(model.image(k).frame_id)
-
-
-def part_of(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap.Reconstruction:
-    """A copy of a model with these images only, and the points that two of them see."""
-    part = pycolmap.Reconstruction(model)
-    take_out(part, registered(model) - set(names))
-    return part
 
 
 def _complete(
@@ -287,7 +189,7 @@ def _run(
         if options.mapper == "global":
             found = native(
                 lambda _: pycolmap.global_mapping(
-                    database, scratch, scratch, _global_options(options)
+                    database, scratch, scratch, global_options(options)
                 ),
                 database,
                 grace_s=1,  # it cannot be cancelled

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.mapper import MapOptions, incremental_options
+from jaxsfm.colmap.map_options import MapOptions, incremental_options
 from jaxsfm.colmap.native import native
 
 

@@ -9,8 +9,9 @@ from tqdm import tqdm
 
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import ExternalMatches, JoinedMatches
-from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.pose_priors import write_pose_priors
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile

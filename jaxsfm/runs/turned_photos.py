@@ -9,7 +9,7 @@ import dataclasses
 import logging
 from collections.abc import Collection, Mapping, Sequence
 
-from jaxsfm.colmap.mapper import registered
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.io import orientation
 from jaxsfm.io.images import ImageFile, named, orientations

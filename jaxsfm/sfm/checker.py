@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.mapper import registered
 from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError

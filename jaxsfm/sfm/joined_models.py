@@ -12,8 +12,9 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model import Model, stored_sizes
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.checker import CheckedModel, Checker
 from jaxsfm.sfm.model_join import (

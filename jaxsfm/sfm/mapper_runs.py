@@ -9,13 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxsfm.colmap.inliers import keep_inliers, read_inliers
-from jaxsfm.colmap.mapper import (
-    Attempt,
-    MapOptions,
-    Mapped,
-    first_models,
-    with_left_out_images,
-)
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import Attempt, Mapped, first_models, with_left_out_images
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.io.pairs import Pair

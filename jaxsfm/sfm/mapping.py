@@ -15,7 +15,9 @@ from collections.abc import Callable, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.mapper import Attempt, MapOptions, take_out
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import Attempt
+from jaxsfm.colmap.model_images import take_out
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.cameras import pixels_were_turned
 from jaxsfm.colmap.database import read_images
-from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import colour_points
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
 from jaxsfm.config import Config, Refinement

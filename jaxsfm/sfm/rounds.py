@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
-from jaxsfm.colmap.mapper import Attempt, MapOptions
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.colmap.two_views import TwoView, read_two_views, verify
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair

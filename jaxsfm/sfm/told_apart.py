@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
-from jaxsfm.colmap.mapper import MapOptions, part_of
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.model_images import part_of
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.checker import CheckedModel, Checker

@@ -15,7 +15,7 @@ from jaxsfm.colmap.database import (
     write_database,
 )
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.mapper import MapOptions
+from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.two_views import read_two_views
@@ -129,7 +129,7 @@ def test_seed_threads_and_scale_reach_all_of_colmaps_options():
     """A scene without outliers comes back the same whatever they are."""
     options = MapOptions(seed=7, threads=1, scale=2.0)
     plain = pycolmap.IncrementalPipelineOptions().mapper
-    for got in (mapping.incremental_options(options), mapping._global_options(options)):
+    for got in (mapping.incremental_options(options), mapping.global_options(options)):
         assert (got.random_seed, got.mapper.random_seed) == (7, 7)
         assert (got.num_threads, got.mapper.num_threads) == (1, 1)
     mapper = mapping.incremental_options(options).mapper

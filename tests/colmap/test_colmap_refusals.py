@@ -9,7 +9,7 @@ import pytest
 from mapped import map_database
 
 from jaxsfm.colmap.database import write_database
-from jaxsfm.colmap.mapper import MapOptions
+from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.native import THREAD
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)

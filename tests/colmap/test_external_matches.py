@@ -17,7 +17,7 @@ from jaxsfm.colmap.external_matches import NO_EXTERNAL_MATCHES, JoinedMatches, r
 from jaxsfm.colmap.formats.database import read_database
 from jaxsfm.colmap.formats.hloc import FEATURES, MATCHES, write_hloc
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.mapper import MapOptions
+from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import UserError

@@ -11,13 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxsfm.colmap import mapper
 from jaxsfm.colmap.database import drop_pairs, write_database
-from jaxsfm.colmap.mapper import (
-    MapOptions,
-    build_models,
-    initial_pairs,
-    registered,
-    take_out,
-)
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import build_models, initial_pairs
+from jaxsfm.colmap.model_images import registered, take_out
 from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import PairResult, exhaustive_pairs

@@ -8,7 +8,7 @@ import pytest
 from mapped import map_database
 
 from jaxsfm.colmap.database import write_database
-from jaxsfm.colmap.mapper import MapOptions
+from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import colour_points, write_models
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.io.images import WorkingImage

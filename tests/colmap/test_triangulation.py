@@ -9,7 +9,9 @@ from mapped import verified
 
 from jaxsfm.colmap.database import read_images, read_matches, write_database
 from jaxsfm.colmap.inliers import keep_inliers, read_inliers
-from jaxsfm.colmap.mapper import MapOptions, build_models, registered, take_out
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import build_models
+from jaxsfm.colmap.model_images import registered, take_out
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.errors import UserError

@@ -6,7 +6,8 @@ import pytest
 from room_scene import errors, noisy_model
 from verdicts import outcome
 
-from jaxsfm.colmap.mapper import MapOptions, part_of, registered
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.model_images import part_of, registered
 from jaxsfm.sfm import joined_models as module
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.joined_models import Joiner

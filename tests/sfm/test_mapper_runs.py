@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxsfm.colmap.mapper import Attempt, MapOptions, Mapped
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import Attempt, Mapped
 from jaxsfm.sfm import mapper_runs as module
 from jaxsfm.sfm.mapper_runs import MapperRuns
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench.synthetic import look_at
-from jaxsfm.colmap.mapper import Attempt, MapOptions, Mapped
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import Attempt, Mapped
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.two_views import PairGeometry, TwoView
 from jaxsfm.config import Config

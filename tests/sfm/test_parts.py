@@ -16,8 +16,10 @@ from jaxsfm.bench.simulated import SimulatedStreet
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.intrinsics import parse_intrinsics
-from jaxsfm.colmap.mapper import MapOptions, Mapped, registered
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import Mapped
 from jaxsfm.colmap.model import Model, stored_sizes
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.sfm import mapper_runs
 from jaxsfm.sfm.evaluation import Similarity, umeyama

@@ -20,8 +20,8 @@ from room_scene import (
 )
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, room
-from jaxsfm.colmap.mapper import part_of, registered
 from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model_images import part_of, registered
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement

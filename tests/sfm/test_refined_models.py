@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from room_scene import SIZE, noisy_model, read_of
 
-from jaxsfm.colmap.mapper import MapOptions, part_of, registered
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.model_images import part_of, registered
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module

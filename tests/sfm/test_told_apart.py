@@ -7,7 +7,8 @@ from room_scene import arrays, errors, noisy_model
 from verdicts import outcome
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
-from jaxsfm.colmap.mapper import MapOptions, registered
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.sfm import told_apart as module
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.told_apart import told_apart

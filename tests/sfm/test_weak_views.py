@@ -23,8 +23,8 @@ from room_scene import (
 from scipy.spatial.transform import Rotation
 from wall_scene import matched
 
-from jaxsfm.colmap.mapper import registered
 from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement

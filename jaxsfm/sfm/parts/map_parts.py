@@ -10,8 +10,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxsfm.colmap.mapper import Attempt, MapOptions, Mapped, first_models, ordered, registered
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import Attempt, Mapped, first_models
 from jaxsfm.colmap.model import Model, stored_sizes
+from jaxsfm.colmap.model_images import ordered, registered
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.model_join import ERROR_PX, JOIN_ERROR_PX, MIN_SHARED, adjusted
 from jaxsfm.sfm.parts.frames import common_frames, shared_points

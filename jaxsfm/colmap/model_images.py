@@ -1,0 +1,40 @@
+"""The images of COLMAP's models: which ones they have, and models with fewer of them."""
+
+from collections.abc import Collection, Sequence
+
+import pycolmap
+
+
+def ordered(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """The models, the one with most images first, without those of images that a larger one has.
+
+    In photos of repeated structure, COLMAP starts the same model again from other pairs: one run
+    had seven models of the same 19 photos.
+    """
+    by_size = sorted(
+        models, key=lambda m: (-m.num_reg_images(), -m.num_points3D(), min(m.reg_image_ids()))
+    )
+    kept: list[pycolmap.Reconstruction] = []
+    for model in by_size:
+        if not any(registered(model) <= registered(other) for other in kept):
+            kept.append(model)
+    return kept
+
+
+def registered(model: pycolmap.Reconstruction) -> set[str]:
+    """Names of the images that have a pose."""
+    return {model.image(i).name for i in model.reg_image_ids()}
+
+
+def take_out(model: pycolmap.Reconstruction, names: Collection[str]) -> None:
+    """Take the poses of images away, and the points that fewer than two images still see."""
+    for k in sorted(model.reg_image_ids()):
+        if model.image(k).name in names:
+            model.deregister_frame(model.image(k).frame_id)
+
+
+def part_of(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap.Reconstruction:
+    """A copy of a model with these images only, and the points that two of them see."""
+    part = pycolmap.Reconstruction(model)
+    take_out(part, registered(model) - set(names))
+    return part
