@@ -76,6 +76,7 @@ def reconstruct(
     """
     chosen = config.config(network.relocalizer)
     limit_threads(run.threads)
+    from jaxsfm.io.store import FAILED
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
     from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -91,7 +92,7 @@ def reconstruct(
     report = work(images, out, config=chosen, options=options)
     print("\n".join(summary_lines(report)))
     if not report.models:
-        where = out / "failed" if (out / "sparse").exists() else out
+        where = out / FAILED if (out / "sparse").exists() else out
         print(
             "jaxsfm: no model could be built: see the lost images above and "
             f"{where / 'report.json'}",

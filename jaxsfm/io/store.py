@@ -32,6 +32,8 @@ _OCTAVES = ("coarse", "fine")
 _RESULT = ("cells", "keypoints0", "keypoints1", "plane", "homographies")
 """The fields of PairResult that are arrays."""
 _FOLDERS = ("features", "matches", "descriptors")
+FAILED = "failed"
+"""The folder for the report of a run without a model, beside an earlier model."""
 
 
 def digest(*parts: Json) -> str:
@@ -65,8 +67,9 @@ class Store:
         for kind in _FOLDERS:
             for partial in (self.path / kind).glob(f"*/*{PARTIAL}"):
                 partial.unlink(missing_ok=True)
-        for partial in self.path.glob(f"*.json.*{PARTIAL}"):
-            partial.unlink(missing_ok=True)
+        for folder in (self.path, self.path / FAILED):
+            for partial in folder.glob(f"*.*.*{PARTIAL}"):  # NAME.SUFFIX.PROCESS.partial
+                partial.unlink(missing_ok=True)
 
     # -- features: they are needed until all pairs have matches ----------------------------------
 

@@ -15,7 +15,7 @@ from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import PARTIAL, Json, atomic_folder, read_json, write_atomic
 from jaxsfm.io.hashes import rows_sha256, sha256_of
 from jaxsfm.io.locks import only_process
-from jaxsfm.io.store import Identity, Store, digest
+from jaxsfm.io.store import FAILED, Identity, Store, digest
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class WorkFolder(Store):
         if failed:
             logger.warning(
                 "this run made no model, so the earlier model stays; its report is in %s",
-                self.path / "failed",
+                self.path / FAILED,
             )
         moves = {"failed": failed, "names": [n for n in RESULTS if (fresh / n).exists()]}
         write_atomic(fresh / _MOVES, json.dumps(moves).encode())
@@ -101,7 +101,7 @@ class WorkFolder(Store):
         if not isinstance(moves, dict) or not isinstance(names, list):
             _remove(made)
             return
-        target = self.path / "failed" if moves.get("failed") else self.path
+        target = self.path / FAILED if moves.get("failed") else self.path
         target.mkdir(exist_ok=True)
         # The report is removed first and moved last, so that it never describes other files.
         for name in RESULTS:
@@ -111,7 +111,7 @@ class WorkFolder(Store):
             if (made / name).exists():
                 (made / name).rename(target / name)
         if target == self.path:
-            _remove(self.path / "failed")  # left by an earlier attempt
+            _remove(self.path / FAILED)  # left by an earlier attempt
         (made / _MOVES).unlink()
         _remove(made)
 

@@ -18,6 +18,7 @@ from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.masked_images import masks_of, with_masks
 from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
+from jaxsfm.io.store import FAILED
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import open_folder
 from jaxsfm.matching.engines import chosen_engine
@@ -165,7 +166,7 @@ def reconstruct_folder(
             folder.drop_features()
         # The page is written before the lock is released: another run there would replace the files
         # that it shows.
-        page_after_run(out if made.models or not (out / "sparse").exists() else out / "failed")
+        page_after_run(out if made.models or not (out / "sparse").exists() else out / FAILED)
         return report
 
 

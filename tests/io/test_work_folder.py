@@ -236,5 +236,12 @@ def test_sweeping_removes_what_was_half_written_alone(tmp_path):
     store.save_matches(result())
     file = only_file(tmp_path)
     file.with_name(file.name + ".partial").write_bytes(b"half")
+    (tmp_path / "failed").mkdir()
+    for name in (
+        "report.json.17.partial",
+        "report.html.17.partial",
+        "failed/report.html.9.partial",
+    ):
+        (tmp_path / name).write_bytes(b"half")
     store.sweep()
     assert only_file(tmp_path) == file
