@@ -46,8 +46,9 @@ LONG = (
     "weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
-        for name in ("strecha", "daynight", "ambiguous", "wxbs", "homography", "planes", "warps")
+        for name in ("strecha", "daynight", "ambiguous", "sequence", "recall", "wxbs")
     ),
+    *(f"jaxsfm.bench.{name}.bench_{name}" for name in ("homography", "planes", "warps")),
 )
 FENCED = re.compile(r"^```(?:bash|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 IN_FENCE = re.compile(r"^(?: {4}\$ |\$ |)(jaxsfm [a-z-].*)$", re.MULTILINE)
