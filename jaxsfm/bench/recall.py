@@ -99,11 +99,10 @@ def found_pairs(tried: set[Pair], true: set[Pair]) -> Found:
 def _photos(root: Path, strangers: Path | None) -> list[ImageFile]:
     """The photos of both folders. Strangers have the name of their folder before their own."""
     photos, _ = open_images(root)
-    others = open_images(strangers)[0] if strangers else []
-    return [
-        *photos,
-        *(dataclasses.replace(i, name=f"{strangers.name}/{i.name}") for i in others if strangers),
-    ]
+    if strangers:
+        others, _ = open_images(strangers)
+        photos += [dataclasses.replace(i, name=f"{strangers.name}/{i.name}") for i in others]
+    return photos
 
 
 def _true_pairs(truth: Path, depth: float, photos: list[ImageFile]) -> set[Pair]:
@@ -132,14 +131,12 @@ def _true_pairs(truth: Path, depth: float, photos: list[ImageFile]) -> set[Pair]
 
 
 def measure(
-    photos: list[ImageFile], true: set[Pair], kinds: list[str], numbers: list[int]
+    photos: list[ImageFile], true: set[Pair], kinds: list[Retrieval], numbers: list[int]
 ) -> Iterator[dict[str, Json]]:
     """A row for each way to compare photos and each number of similar photos."""
     weights = load_weights()
     places = {name for pair in true for name in pair}
-    for kind in KINDS:
-        if kind not in kinds:
-            continue
+    for kind in kinds:
         described = describe_photos(weights, photos, kind=kind)
         for k in numbers:
             tried = set(nearest_pairs(described.vectors, k))
@@ -163,7 +160,8 @@ def bench_recall(options: RecallOptions) -> dict[str, Json]:
     Raises:
       UserError: a folder or an option cannot be used.
     """
-    kinds = options.chosen_methods(KINDS)
+    chosen = options.chosen_methods(KINDS)
+    kinds: list[Retrieval] = [kind for kind in KINDS if kind in chosen]
     photos = _photos(options.root, options.strangers)[:: options.every]
     true = _true_pairs(options.truth, options.depth, photos)
     rows: list[dict[str, Json]] = []

@@ -119,6 +119,8 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
             photos, matched, stages, mapped = masked
             masked_sky = sum(image.mask is not None for image in stages.images)
         elif mapped.stage.figures.cut_short:
+            # Under another name, so that the same command finds both mappings again.
+            stages = dataclasses.replace(stages, look=stages.look + "-all-rounds")
             mapped = stages.map(matched)
     found = MappedLooks(matched, mapped, None, photos.identity, own, masked_sky)
     if matched.described == photos.job.config:

@@ -128,10 +128,11 @@ class Stages:
     def map(self, matched: object, go_on: Callable[[], bool] | None = None) -> Mapped:
         if matched == "again":
             return self.made["again"]
+        if self.look == "-all-rounds":
+            assert go_on is None and not any(image.mask for image in self.images)
+            return self.made[self.look]
         if go_on is not None:
             assert self.look == "" and not go_on()  # the sky can be masked
-        elif self.look == "":
-            return self.made["all rounds"]
         assert matched == self.look and all(i.mask for i in self.images) == (self.look == "-sky")
         return self.made[self.look]
 
@@ -191,7 +192,7 @@ def test_the_sky_is_masked_if_this_helps_where_something_speaks_against_the_mode
 
 
 @pytest.mark.parametrize(
-    ("masked", "expected"), [(Mapped(False, 60), "-sky"), (Mapped(False, 55), "all rounds")]
+    ("masked", "expected"), [(Mapped(False, 60), "-sky"), (Mapped(False, 55), "-all-rounds")]
 )
 def test_rounds_that_ended_early_are_made_if_masks_of_the_sky_do_not_help(
     monkeypatch, tmp_path, skies, masked, expected
@@ -199,7 +200,7 @@ def test_rounds_that_ended_early_are_made_if_masks_of_the_sky_do_not_help(
     skies({"a": 40, "b": 40})
     monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
     images = {name: image(name) for name in "ab"}
-    made = {"": Mapped(False, 55, cut_short=True), "-sky": masked, "all rounds": Mapped(True, 50)}
+    made = {"": Mapped(False, 55, cut_short=True), "-sky": masked, "-all-rounds": Mapped(True, 50)}
     photos: Any = Photos(images, SimpleNamespace(config=Matched.described))
     stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
     matched: Any = Matched("")
