@@ -50,8 +50,8 @@ class Refinement:
     """How many times alignment, bundle adjustment and filtering are repeated."""
     radius: int = 7
     """Patches are (2 radius + 1)^2 pixels of the working image."""
-    iterations: int = 10
-    """Number of Gauss-Newton steps of an alignment."""
+    iterations: int = 8
+    """Number of steps of an alignment."""
     min_score: float = 0.8
     """Least normalised cross-correlation of an observation with its reference patch."""
     max_sigma_px: float = 0.25

@@ -125,9 +125,13 @@ def plain(scene, tmp_path_factory) -> Iterator[tuple[Path, dict]]:
         yield folder / "out", json.loads((folder / "out" / "report.json").read_text())
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
-    """A headless Chromium without a network beyond this machine."""
+    """A headless Chromium without a network beyond this machine.
+
+    It ends with its module: a viewer that stays open draws on, and took a third of a core from all
+    tests that came after it.
+    """
     from chromium import started
 
     with started() as driver:

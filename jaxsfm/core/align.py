@@ -1,17 +1,24 @@
 """Sub-pixel alignment of keypoints.
 
-A patch of the reference view is warped by the local plane and moved over another view by
-Gauss-Newton steps until the two agree up to gain and offset.
+A patch of the reference view is warped by the local plane and moved over another view until the two
+agree up to gain and offset.
 
 Maps are (h, w, c), with c = 1 for intensities and more channels for dense features. They may be
 padded at the bottom and on the right beyond `size`. A patch is a list of offsets around a keypoint
 with a weight each. All functions are batched by vmap, can be compiled, and are differentiable with
 respect to keypoints and maps: the number of iterations is static, and failures are masked.
 
-The gradient of the template is used, so an iteration is one sampling of the map and the solution of
-a 2 x 2 system.
+The gradient of the template is used, so a step is one sampling of the map and the solution of a
+2 x 2 system. The first step is that of Gauss-Newton. Where the two patches are alike only in part,
+Gauss-Newton goes too far or not far enough, by the same share each time. So every later step
+corrects the system by what the step before has really changed (Broyden).
 
-Source: Baker and Matthews, IJCV 2004, section 3.2 (inverse compositional alignment).
+The first steps only bring the patch near, and interpolate bilinearly, from a quarter of the pixels.
+The last ones interpolate by cubic convolution, whose places count.
+
+Source: Baker and Matthews, IJCV 2004, section 3.2 (inverse compositional alignment); Broyden,
+Mathematics of Computation 1965, "A class of methods for solving nonlinear simultaneous equations"
+(his first method, which updates the Jacobian by a matrix of rank one).
 """
 
 import functools
@@ -22,7 +29,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsfm.core.interpolate import noise_kept, noise_summed, sample
+from jaxsfm.core.interpolate import (
+    noise_kept,
+    noise_summed,
+    pixels,
+    sample,
+    sample_linear,
+    slopes,
+)
 from jaxsfm.core.numerics import HIGHEST
 
 
@@ -30,11 +44,9 @@ class Patch(NamedTuple):
     """Where a patch is sampled around its keypoint."""
 
     offsets: Float[Array, "q 2"]
-    """(x, y), pixels of the reference view."""
+    """(x, y), whole pixels of the reference view."""
     weights: Float[Array, " q"]
     """Sum 1."""
-    area: Float[Array, ""]
-    """Area that a sample stands for, square pixels of the reference view."""
 
 
 class Templates(NamedTuple):
@@ -74,22 +86,27 @@ class Aligned(NamedTuple):
 FLAT = 1e-5
 """A patch is flat if its deviation over its root mean square is below this."""
 MAX_STEP = 1.0
-"""Longest step of one iteration, reference pixels."""
+"""Longest step, reference pixels."""
 TOLERANCE = 0.02
 """An alignment has converged if its last step is shorter, reference pixels."""
+CUBIC_STEPS = 4
+"""The last steps, which interpolate by cubic convolution."""
+LEAST_DETERMINANT = 0.1
+"""A system is not corrected if its determinant would be smaller than this share of the hessian's:
+the next step would be long, and lead anywhere."""
 LEAST_HESSIAN = 1e-9
 """Added to the diagonal of a hessian, so that the deviation of a flat patch is large but finite."""
 
 
-def square_patch(radius: int, *, spacing: float = 1.0, sigma: float | None = None) -> Patch:
-    """A (2 radius + 1)^2 grid with Gaussian weights (sigma in grid steps, default 0.5 radius)."""
+def square_patch(radius: int) -> Patch:
+    """A grid of (2 radius + 1)^2 pixels, with Gaussian weights of half the radius as deviation."""
     if radius < 1:
         raise ValueError(f"radius must be at least 1; got {radius}")
     steps = jnp.arange(-radius, radius + 1, dtype=jnp.float32)
     y, x = jnp.meshgrid(steps, steps, indexing="ij")
     offsets = jnp.stack([x.ravel(), y.ravel()], axis=-1)
-    weights = jnp.exp(-0.5 * jnp.sum(offsets**2, -1) / (sigma or 0.5 * radius) ** 2)
-    return Patch(offsets * spacing, weights / weights.sum(), jnp.float32(spacing**2))
+    weights = jnp.exp(-0.5 * jnp.sum(offsets**2, -1) / (0.5 * radius) ** 2)
+    return Patch(offsets, weights / weights.sum())
 
 
 def _normalise(
@@ -122,16 +139,16 @@ def make_templates(
     way. Between pixels, the noise of an interpolated value is correlated with that of its gradient.
     With noise of an eighth of the contrast this moved keypoints by as much as the noise itself.
     """
-    dx, dy = 0.5 * jnp.eye(2, dtype=xy.dtype)
+    last = size[::-1] - 1
 
     def one(centre):
         nearest = jnp.round(centre)
-        at = nearest + patch.offsets
-        values, inside = sample(image, size, at)
-        gx = sample(image, size, at + dx)[0] - sample(image, size, at - dx)[0]
-        gy = sample(image, size, at + dy)[0] - sample(image, size, at - dy)[0]
+        at = nearest.astype(jnp.int32) + patch.offsets.astype(jnp.int32)
+        inside = ((at >= 0) & (at <= last)).all()
+        values = pixels(image, size, at, centre.dtype)
+        g = slopes(image, size, at, centre.dtype)
         values, contrast, scale = _normalise(values, patch.weights)
-        g = jnp.stack([gx, gy], -1) * scale
+        g = g * scale
         # Gain and offset are projected out of the gradient. A shift that looks like a change of
         # contrast must not count as information.
         g = g - jnp.einsum("q,qck->ck", patch.weights, g, precision=HIGHEST)
@@ -141,13 +158,17 @@ def make_templates(
         noisy = jnp.einsum("q,qck,qcl->kl", patch.weights**2, g, g, precision=HIGHEST)
         covariance = _shift_covariance(hessian, noisy, jnp.sum(patch.weights**2))
         rest = centre - nearest
-        return Templates(values, g, hessian, covariance, rest, contrast, inside.all())
+        return Templates(values, g, hessian, covariance, rest, contrast, inside)
 
     return jax.vmap(one)(xy)
 
 
+def _determinant(a: Float[Array, "2 2"]) -> Float[Array, ""]:
+    return a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+
+
 def _solve2(a: Float[Array, "2 2"], b: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    det = _determinant(a)
     ok = det > 1e-12
     inv = jnp.where(ok, 1.0 / jnp.where(ok, det, 1.0), 0.0)
     return inv * jnp.stack([a[1, 1] * b[0] - a[0, 1] * b[1], a[0, 0] * b[1] - a[1, 0] * b[0]])
@@ -167,7 +188,7 @@ def _shift_covariance(
     h, noisy = hessian + least, noisy + squares * least
     # The determinant of a straight edge is smaller than its rounding.
     smallest = LEAST_HESSIAN * (h[0, 0] + h[1, 1])
-    det = jnp.maximum(h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0], smallest)
+    det = jnp.maximum(_determinant(h), smallest)
     inverse = jnp.stack([h[1, 1], -h[0, 1], -h[1, 0], h[0, 0]]).reshape(2, 2) / det
     return jnp.einsum("ij,jk,kl->il", inverse, noisy, inverse, precision=HIGHEST)
 
@@ -176,6 +197,35 @@ def _largest_eigenvalue(s: Float[Array, "2 2"]) -> Float[Array, ""]:
     """Of a symmetric matrix."""
     mean, diff = 0.5 * (s[0, 0] + s[1, 1]), 0.5 * (s[0, 0] - s[1, 1])
     return mean + jnp.sqrt(diff**2 + s[0, 1] ** 2 + 1e-30)
+
+
+class _Search(NamedTuple):
+    """Where a search is after some steps."""
+
+    at: Float[Array, " 2"]
+    """Pixels of the other view."""
+    system: Float[Array, "2 2"]
+    """How the misfit changes with a shift."""
+    misfit: Float[Array, " 2"]
+    """Before the last step: what the derivatives of the template explain of the difference."""
+    shift: Float[Array, " 2"]
+    """The last step, reference pixels. Zero: there was none, or its misfit was another one."""
+
+
+def _corrected(
+    last: _Search, misfit: Float[Array, " 2"], hessian: Float[Array, "2 2"]
+) -> Float[Array, "2 2"]:
+    """The system that explains the last change of the misfit, and else is the one before.
+
+    It stays as it is if it would become nearly singular.
+    """
+    unexplained = misfit - last.misfit - jnp.matmul(last.system, last.shift, precision=HIGHEST)
+    moved = jnp.maximum(jnp.sum(last.shift**2), 1e-10)
+    made = last.system + jnp.outer(unexplained, last.shift) / moved
+    positive = (made[0, 0] + made[1, 1] > 0) & (
+        _determinant(made) > LEAST_DETERMINANT * _determinant(hessian)
+    )
+    return jnp.where(positive, made, last.system)
 
 
 @functools.partial(jax.jit, static_argnames=("iterations",))
@@ -187,7 +237,7 @@ def align(
     affine: Float[Array, "n 2 2"],
     patch: Patch,
     *,
-    iterations: int = 10,
+    iterations: int = 8,
 ) -> Aligned:
     """Move keypoints of a view onto their templates.
 
@@ -198,40 +248,49 @@ def align(
       xy: where to start, pixels of the view.
       affine: maps reference offsets to offsets in the view (from the local plane).
       patch: the patch that the templates were made with.
-      iterations: number of Gauss-Newton steps.
+      iterations: number of steps. The last `CUBIC_STEPS` of them interpolate by cubic convolution.
     """
 
     def one(t: Templates, start, a):
         offsets = jnp.einsum("qk,lk->ql", patch.offsets, a, precision=HIGHEST)
 
-        def residual(at):
-            values, inside = sample(image, size, at + offsets)
-            values, contrast, _ = _normalise(values, patch.weights)
-            return values - t.values, inside.all(), contrast, values
-
-        def step(at, _):
-            r, _, _, _ = residual(at)
-            b = jnp.einsum("q,qc,qck->k", patch.weights, r, t.descent, precision=HIGHEST)
-            d = -_solve2(t.hessian, b)
+        def step(last: _Search, values) -> tuple[_Search, Float[Array, ""]]:
+            r = _normalise(values, patch.weights)[0] - t.values
+            misfit = jnp.einsum("q,qc,qck->k", patch.weights, r, t.descent, precision=HIGHEST)
+            system = _corrected(last, misfit, t.hessian)
+            d = -_solve2(system, misfit)
             length = jnp.sqrt(jnp.sum(d * d) + 1e-20)
             d = d * jnp.minimum(1.0, MAX_STEP / length)
-            return at + jnp.matmul(a, d, precision=HIGHEST), length
+            return _Search(last.at + jnp.matmul(a, d, precision=HIGHEST), system, misfit, d), length
+
+        def near(last: _Search, _):
+            return step(last, sample_linear(image, size, last.at + offsets))
+
+        def exact(last: _Search, _):
+            return step(last, sample(image, size, last.at + offsets)[0])
 
         rest = jnp.matmul(a, t.rest, precision=HIGHEST)
-        at, lengths = lax.scan(step, start - rest, None, length=iterations)
-        _, inside, contrast, values = residual(at)
+        none = jnp.zeros_like(start)
+        linear = max(iterations - CUBIC_STEPS, 0)
+        first = _Search(start - rest, t.hessian, none, none)
+        brought, _ = lax.scan(near, first, None, length=linear)
+        # Other values between pixels are another misfit, so the last step explains no change of it.
+        brought = brought._replace(shift=none)
+        (at, *_), lengths = lax.scan(exact, brought, None, length=iterations - linear)
+        values, inside = sample(image, size, at + offsets)
+        values, contrast, _ = _normalise(values, patch.weights)
         score = jnp.einsum("q,qc,qc->", patch.weights, values, t.values, precision=HIGHEST)
         # The mean square difference of two patches of variance 1 is 2 (1 - score). Interpolation
         # has reduced the noise in it, and divided by the share that is kept it is the noise of a
         # pixel. A keypoint is moved by the part of the noise that is as smooth as the derivatives.
         # Interpolation does not reduce this part, and samples that share pixels have it in common.
-        kept = noise_kept(patch.offsets, patch.weights), noise_kept(at + offsets, patch.weights)
-        areas = patch.area, patch.area * jnp.abs(a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0])
-        pixel = 2 * jnp.maximum(1 - score, 1e-6) / (values.shape[-1] * (kept[0] + kept[1]))
-        summed = noise_summed(areas[0], kept[0]) + noise_summed(areas[1], kept[1])
+        # The template was sampled at whole pixels, each of which keeps its noise.
+        kept, area = noise_kept(at + offsets, patch.weights), jnp.abs(_determinant(a))
+        pixel = 2 * jnp.maximum(1 - score, 1e-6) / (values.shape[-1] * (1 + kept))
+        summed = 1 + noise_summed(area, kept)
         covariance = jnp.einsum("ij,jk,lk->il", a, t.covariance, a, precision=HIGHEST)
         sigma = jnp.sqrt(pixel * summed * _largest_eigenvalue(covariance))
-        ok = inside & t.inside & (lengths[-1] < TOLERANCE) & (contrast > 0) & (t.contrast > 0)
-        return Aligned(at + rest, score, sigma, ok)
+        converged = (lengths[-1] < TOLERANCE) & (contrast > 0) & (t.contrast > 0)
+        return Aligned(at + rest, score, sigma, converged & inside.all() & t.inside)
 
     return jax.vmap(one)(templates, xy, affine)

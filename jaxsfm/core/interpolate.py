@@ -1,10 +1,11 @@
-"""Values between the pixels of a map, by cubic convolution, and how much noise they keep.
+"""Values between the pixels of a map, by cubic convolution or bilinearly, and how much noise they
+keep.
 
 Source: Keys, IEEE ASSP 1981, equation 15 with a = -1/2.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, DTypeLike, Float, Int
 
 
 def cubic(f: Float[Array, "*n"]) -> list[Float[Array, "*n"]]:
@@ -50,6 +51,59 @@ def sample(
         )
         total = total + line * v[..., None]
     return total, inside
+
+
+def sample_linear(
+    image: Float[Array, "h w c"], size: Int[Array, " 2"], xy: Float[Array, "*n 2"]
+) -> Float[Array, "*n c"]:
+    """Values at (x, y) between four pixels instead of the sixteen of `sample`.
+
+    It has the types and edges of `sample`.
+    """
+    h, w, c = image.shape
+    last = size[::-1] - 1
+    at = jnp.clip(xy, 0, last.astype(xy.dtype))
+    low = jnp.floor(at)
+    f = (at - low)[..., None, :]
+    first = low.astype(jnp.int32)
+    second = jnp.minimum(first + 1, last)
+    flat = image.reshape(h * w, c)
+    upper, lower = (
+        flat[y * w + first[..., 0]].astype(xy.dtype) * (1 - f[..., 0])
+        + flat[y * w + second[..., 0]].astype(xy.dtype) * f[..., 0]
+        for y in (first[..., 1], second[..., 1])
+    )
+    return upper * (1 - f[..., 1]) + lower * f[..., 1]
+
+
+def pixels(
+    image: Float[Array, "h w c"], size: Int[Array, " 2"], at: Int[Array, "*n 2"], dtype: DTypeLike
+) -> Float[Array, "*n c"]:
+    """The pixels (x, y) themselves; outside the image, those of the nearest edge.
+
+    Args:
+      dtype: of the values.
+    """
+    h, w, c = image.shape
+    x, y = (jnp.clip(at[..., k], 0, size[1 - k] - 1) for k in (0, 1))
+    return image.reshape(h * w, c)[y * w + x].astype(dtype)
+
+
+def slopes(
+    image: Float[Array, "h w c"], size: Int[Array, " 2"], at: Int[Array, "*n 2"], dtype: DTypeLike
+) -> Float[Array, "*n c 2"]:
+    """Derivatives by x and y at pixels: the differences of the values of `sample` half a pixel
+    after and before them, which are weighted sums of four pixels.
+
+    Args:
+      dtype: of the derivatives.
+    """
+
+    def along(axis: int) -> Float[Array, "*n c"]:
+        near = {k: pixels(image, size, at.at[..., axis].add(k), dtype) for k in (-2, -1, 1, 2)}
+        return (10 * (near[1] - near[-1]) - (near[2] - near[-2])) / 16
+
+    return jnp.stack([along(0), along(1)], axis=-1)
 
 
 def noise_kept(xy: Float[Array, "q 2"], weights: Float[Array, " q"]) -> Float[Array, ""]:

@@ -10,7 +10,7 @@ from strategies import rng_of, seeds
 from tolerances import ALIGNED_PX
 
 from jaxsfm.core.align import Templates, align, make_templates, square_patch
-from jaxsfm.core.interpolate import sample
+from jaxsfm.core.interpolate import pixels, sample, sample_linear, slopes
 
 SIZE = (64, 80)
 PATCH = square_patch(7)
@@ -248,6 +248,67 @@ def test_sampling_is_exact_on_pixels_and_parabolas_and_clamped_outside():
     np.testing.assert_allclose(got, want, rtol=1e-5)
 
 
+def test_bilinear_sampling_is_exact_on_pixels_and_planes_and_clamped_outside():
+    rng = rng_of(0)
+    image = jnp.asarray(rng.normal(size=(5, 6, 2)), jnp.float32)
+    size = jnp.asarray([4, 5], jnp.int32)  # the last row and column are padding
+    at = jnp.asarray([[0.0, 0.0], [4.0, 3.0], [-3.0, 2.0], [7.0, 9.0], [3.5, 0.25]], jnp.float32)
+    got = sample_linear(image, size, at)
+    want = jnp.stack([image[0, 0], image[3, 4], image[2, 0], image[3, 4]])
+    np.testing.assert_allclose(got[:4], want, rtol=1e-6)
+    between = 0.375 * image[0, 3:5].sum(0) + 0.125 * image[1, 3:5].sum(0)
+    np.testing.assert_allclose(got[4], between, rtol=1e-5)
+
+
+@given(seeds)
+@settings(max_examples=10, deadline=None)
+def test_pixels_and_slopes_are_what_cubic_sampling_gives(seed):
+    """Inside; a slope at the edge would look outside."""
+    rng = rng_of(seed)
+    image = jnp.asarray(rng.normal(size=(9, 11, 2)), jnp.float32)
+    size = jnp.asarray([9, 11], jnp.int32)
+    at = jnp.asarray(rng.integers([2, 2], [9, 7], (6, 2)), jnp.int32)
+    place = at.astype(jnp.float32)
+    np.testing.assert_array_equal(
+        pixels(image, size, at, jnp.float32), sample(image, size, place)[0]
+    )
+    slope = slopes(image, size, at, jnp.float32)
+    for axis, half in enumerate(0.5 * jnp.eye(2, dtype=jnp.float32)):
+        want = sample(image, size, place + half)[0] - sample(image, size, place - half)[0]
+        np.testing.assert_allclose(slope[..., axis], want, atol=1e-5)
+    outside = pixels(image, size, jnp.asarray([[-4, 3], [20, 30]], jnp.int32), jnp.float32)
+    np.testing.assert_array_equal(outside, jnp.stack([image[3, 0], image[8, 10]]))
+
+
+def alike_in_part(rng, share: float, count: int):
+    """Maps of `count` patches one below the other; the second map shows the texture of the first
+    one, shifted, and `share` of another texture. And the places of the patches."""
+    one, two = [], []
+    for _ in range(count):
+        f, other, shift = texture(rng), texture(rng), rng.uniform(-1, 1, 2)
+        one.append(f(grid()))
+        two.append(f(grid() - shift) + share * (other(grid()) - 120))
+    places = np.asarray([[40.0, 32.0 + SIZE[0] * k] for k in range(count)])
+    return np.concatenate(one), np.concatenate(two), places
+
+
+@pytest.mark.parametrize(("share", "least"), [(0.75, 0.94), (1.2, 0.85)])
+def test_patches_that_are_alike_only_in_part_converge_as_soon(share, least):
+    """Their scores are 0.84 and 0.73. Without corrections of the system, 85 and 63 of 100 come
+    within a hundredth of a pixel of where many steps end, instead of 97 and 91."""
+    one, two, places = alike_in_part(rng_of(1), share, 96)
+    size = jnp.asarray(one.shape[:2], jnp.int32)
+    one, two, at = (jnp.asarray(v, jnp.float32) for v in (one, two, places))
+    same = jnp.broadcast_to(jnp.eye(2, dtype=jnp.float32), (len(places), 2, 2))
+    templates = make_templates(one, size, at, PATCH)
+    found, end = (
+        align(two, size, templates, at + 1.5, same, PATCH, **steps)
+        for steps in ({}, {"iterations": 80})
+    )
+    away = np.linalg.norm(np.asarray(found.xy) - np.asarray(end.xy), axis=1)
+    assert (away < 0.01).mean() > least
+
+
 @pytest.mark.slow
 def test_where_a_keypoint_ends_follows_the_map_and_its_gradient_is_finite():
     """Moving the whole map by t moves the aligned keypoint by t: d xy / d t = identity."""
@@ -302,15 +363,15 @@ def test_templates_are_normalised_and_a_patch_weighs_one():
         square_patch(0)
 
 
-@pytest.mark.parametrize(("radius", "sigma"), [(2, None), (3, 2.0)])
-def test_weights_of_a_patch_fall_like_a_gaussian_around_its_centre(radius, sigma):
-    patch = square_patch(radius, spacing=0.5, sigma=sigma)
+@pytest.mark.parametrize("radius", [2, 3])
+def test_weights_of_a_patch_fall_like_a_gaussian_around_its_centre(radius):
+    patch = square_patch(radius)
     side = 2 * radius + 1
     weights = np.asarray(patch.weights, np.float64).reshape(side, side)
     steps = np.arange(side) - radius
-    square = steps[:, None] ** 2 + steps**2  # in steps of the grid, whatever the spacing
-    expected = np.exp(-square / (2 * (sigma or radius / 2) ** 2))
+    square = steps[:, None] ** 2 + steps**2
+    expected = np.exp(-square / (2 * (radius / 2) ** 2))
     np.testing.assert_allclose(weights, expected / expected.sum(), rtol=1e-5)
     offsets = np.asarray(patch.offsets).reshape(side, side, 2)
-    np.testing.assert_array_equal(offsets[..., 0], np.broadcast_to(0.5 * steps, (side, side)))
+    np.testing.assert_array_equal(offsets[..., 0], np.broadcast_to(steps, (side, side)))
     np.testing.assert_array_equal(offsets[..., 1], offsets[..., 0].T)

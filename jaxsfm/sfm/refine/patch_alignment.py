@@ -74,7 +74,7 @@ def align_patches(
     Args:
       start: (n, 2), where each patch starts, pixels of the image.
       affine: (n, 2, 2), from offsets in the reference image to offsets in this image.
-      iterations: Gauss-Newton steps.
+      iterations: number of steps.
     """
     start, affine = jax.device_put((np.float32(start), np.float32(affine)))
     return align_core.align(*image, templates, start, affine, patch, iterations=iterations)
