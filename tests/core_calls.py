@@ -348,6 +348,13 @@ def calls() -> dict[str, Call]:
     table = {
         "align.square_patch": Call(lambda: align.square_patch(2), (), (0,)),
         "interpolate.sample": Call(interpolate.sample, (image, image_size, at)),
+        "interpolate.sample_linear": Call(interpolate.sample_linear, (image, image_size, at)),
+        "interpolate.pixels": Call(
+            _bind(interpolate.pixels, dtype=np.float32), (image, image_size, np.int32(at))
+        ),
+        "interpolate.slopes": Call(
+            _bind(interpolate.slopes, dtype=np.float32), (image, image_size, np.int32(at))
+        ),
         "align.make_templates": Call(align.make_templates, (image, image_size, at, patch)),
         "align.align": Call(
             align.align, (image, image_size, _templates(), at, affine, patch), (0, 2), (0,)
@@ -537,7 +544,7 @@ def calls() -> dict[str, Call]:
             (KEY, f0, f1, THRESHOLDS),
             (2,),
             (1, 2),
-            slow=True,
+            traced=True,
         ),
         "pair.match_pair[paper]": Call(
             _bind(pair.match_pair, shape=_pair_shape("paper")),

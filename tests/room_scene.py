@@ -15,6 +15,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import refine_model
 
 SIZE = (480, 360)
@@ -151,9 +152,7 @@ def refine(model, scene, change=lambda image: image, **config):
     return refine_model(
         model,
         read_of(scene, change),
-        refinement=Refinement(**config),
-        refine_intrinsics=False,
-        threads=1,
+        PassSettings(Refinement(**config), False, 1),
     )
 
 

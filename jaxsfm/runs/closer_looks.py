@@ -95,16 +95,26 @@ def without_matches(result: PairResult) -> PairResult:
 
 
 def pairs_to_look_at(
-    lost: Iterable[str], placed: Collection[str], counts: Mapping[Pair, PairCounts]
+    lost: Iterable[str],
+    placed: Collection[str],
+    counts: Mapping[Pair, PairCounts],
+    *,
+    least: int,
 ) -> list[Pair]:
     """The strongest pairs of photos without a place with photos that have one, photo by photo.
 
     Args:
       counts: of all pairs that were tried.
+      least: pairs with fewer tentative matches are left out. Two photos of anything have hundreds,
+        and a blank photo has none at any scale.
     """
     found = {}
     for name in sorted(lost):
-        own = [pair for pair in closest_pairs(name, counts) if set(pair) - {name} <= set(placed)]
+        own = [
+            pair
+            for pair in closest_pairs(name, counts)
+            if set(pair) - {name} <= set(placed) and counts[pair].num_tentative >= least
+        ]
         found |= dict.fromkeys(own[:CLOSER])
     return list(found)
 
@@ -121,14 +131,15 @@ def look_at_lost_photos(
     """
     images = {image.name: image for image in found.mapped.given.images}
     placed = set().union(*found.mapped.photos)
-    pairs = pairs_to_look_at(images.keys() - placed, placed, found.matched.counts)
+    lost, least = images.keys() - placed, job.config.min_inliers
+    pairs = pairs_to_look_at(lost, placed, found.matched.counts, least=least)
     if not (job.config.closer_looks and job.config.refinement and pairs):
         return {}
     settings = {**job.config.matching(), "closer_looks": job.config.closer_looks}
     identity = dataclasses.replace(found.identity, config=settings)
     store = Store(job.store.path, to_json(identity))
     job = job_of_look(job, found.identity, job.config)
-    logger.info("looking closer at %s", named(sorted(images.keys() - placed)))
+    logger.info("looking closer at %s", named(sorted(lost)))
     bar = tqdm(pairs, desc="closer looks", unit="pair", disable=not job.progress)
     with timed(seconds, "closer looks"):
         return look_closer(job, images, bar, store=store)

@@ -170,7 +170,9 @@ def _localize_query(
         found = locate_photo(query.image, query.camera, model, query.shortlist, matches, images)
         if not found.trusted and found.inliers < MANY_INLIERS and model.config.closer_looks:
             counts = {pair: result.counts for pair, result in matches.items()}
-            likely = closer(pairs_to_look_at([query.image.name], query.shortlist, counts))
+            least = model.config.min_inliers
+            pairs = pairs_to_look_at([query.image.name], query.shortlist, counts, least=least)
+            likely = closer(pairs)
             every = matches | likely
             if likely:
                 again = locate_photo(

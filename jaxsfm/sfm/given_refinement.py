@@ -14,6 +14,7 @@ from jaxsfm.colmap.updated_model import has_rigs, updated
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.model_photos import ModelPhotos
 from jaxsfm.sfm.old_frame import move_back
+from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 
 if TYPE_CHECKING:
@@ -53,10 +54,8 @@ def refine_given(
     refined, figures = refine_model(
         given,
         photos.gray,
-        refinement=refinement,
-        refine_intrinsics=refine_intrinsics,
+        PassSettings(refinement, refine_intrinsics, threads),
         described_px=_described_px(given, photos),
-        threads=threads,
         on_pass=on_pass,
     )
     if not any(done.accepted for done in figures.passes):

@@ -23,6 +23,7 @@ from jaxsfm.sfm.check.placed_views import Placed, doubts
 from jaxsfm.sfm.checker import opened
 from jaxsfm.sfm.photo_order import neighbours
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
+from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 
 if TYPE_CHECKING:
@@ -90,12 +91,10 @@ def refine_models(
                 new, done = refine_model(
                     model,
                     photos.gray,
-                    refinement=config.refinement,
-                    refine_intrinsics=options.refine_intrinsics,
+                    PassSettings(config.refinement, options.refine_intrinsics, options.threads),
                     evidence=evidence,
                     with_all_points=whole,
                     described_px=described_px(options.scale / photos.median_scale()),
-                    threads=options.threads,
                     on_pass=on_pass,
                 )
                 if config.checked:

@@ -485,7 +485,7 @@ def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeyp
     images = [scene / "images" / n for n in ("view0.png", "view2.png")]
     refuse(capsys, ["match", *images, "--out", tmp_path / "m.npz"], "view0.png", "--max-size")
     args = ["match", *map(str, images), "--out", str(tmp_path / "m.npz"), "--max-size", "64"]
-    assert main(args) == 0
+    assert main([*args, "--preset", "paper"]) == 0
     args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]
     assert main(args) == 2
     error = capsys.readouterr().err

@@ -34,6 +34,8 @@ from jaxsfm.matching.pair_matching import match_features
 
 FIELDS = ("cells", "keypoints0", "keypoints1", "plane", "homographies", "num_tentative")
 MESH = device_mesh(jax.local_devices()[:1])
+CONFIG = dataclasses.replace(preset("default"), octaves=2)
+"""Four octaves would be twice as many programs to compile."""
 
 
 @pytest.fixture(scope="module")
@@ -54,13 +56,13 @@ def images(folder):
 
 @pytest.fixture(scope="module")
 def features(weights, images):
-    return jaxsfm.extract(weights, images, config=preset("default"))
+    return jaxsfm.extract(weights, images, config=CONFIG)
 
 
 @pytest.fixture(scope="module")
 def matches(features):
     pairs = jaxsfm.exhaustive_pairs(features)
-    return jaxsfm.match(features, pairs, config=preset("default"))
+    return jaxsfm.match(features, pairs, config=CONFIG)
 
 
 def assert_same_matches(ours, expected):
@@ -74,18 +76,18 @@ def assert_same_matches(ours, expected):
 def test_memory_for_two_images_gives_the_same_matches(features, matches):
     tight = Execution(memory_gb=1e-6)
     pairs = list(matches)[::-1]
-    ours = jaxsfm.match(features, pairs, config=preset("default"), execution=tight)
+    ours = jaxsfm.match(features, pairs, config=CONFIG, execution=tight)
     assert_same_matches(ours, matches)
     (a, b), want = max(matches.items(), key=lambda item: item[1].num_inliers)
     assert want.num_inliers > 100
-    alone = match_features(features[a], features[b], config=preset("default"))
+    alone = match_features(features[a], features[b], config=CONFIG)
     assert_same_matches({(a, b): alone}, {(a, b): want})
 
 
 @pytest.mark.slow
 def test_pairs_side_by_side_give_the_same_matches_up_to_rounding(features, matches):
     together = Execution(pairs_at_once=3)
-    ours = jaxsfm.match(features, list(matches), config=preset("default"), execution=together)
+    ours = jaxsfm.match(features, list(matches), config=CONFIG, execution=together)
     for pair, want in matches.items():
         cells = {tuple(c) for c in want.cells.tolist()}
         same = cells & {tuple(c) for c in ours[pair].cells.tolist()}
@@ -95,7 +97,7 @@ def test_pairs_side_by_side_give_the_same_matches_up_to_rounding(features, match
 @pytest.mark.slow
 def test_images_side_by_side_give_the_same_features_up_to_rounding(weights, images, features):
     together = Execution(images_at_once=3)
-    ours = jaxsfm.extract(weights, images, config=preset("default"), execution=together)
+    ours = jaxsfm.extract(weights, images, config=CONFIG, execution=together)
     for name, want in features.items():
         for one, other in zip(ours[name].dense.coarse, want.dense.coarse, strict=True):
             np.testing.assert_allclose(one, other, atol=2e-3)  # two steps of float16 at 1
@@ -105,13 +107,14 @@ def test_images_side_by_side_give_the_same_features_up_to_rounding(weights, imag
 
 
 SCRIPT = """
-import json, sys
+import dataclasses, json, sys
 from pathlib import Path
 import jax, numpy as np, jaxsfm
 from jaxsfm.matching.execution import Execution
 assert len(jax.devices()) == 3
 images, _ = jaxsfm.open_images(Path(sys.argv[1]))
-weights, config = jaxsfm.load_weights(), jaxsfm.preset("default")
+weights = jaxsfm.load_weights()
+config = dataclasses.replace(jaxsfm.preset("default"), octaves=2)
 everything = []
 for execution in (Execution(devices=1), Execution(memory_gb=1e-6)):
     features = jaxsfm.extract(weights, images, config=config, execution=execution)
@@ -142,7 +145,7 @@ def test_any_number_of_devices_gives_what_one_gives_bit_for_bit(folder):
 
 @pytest.mark.slow
 def test_features_are_the_programs_rounded_once(weights, images):
-    image, config = images[0], preset("default")
+    image, config = images[0], CONFIG
     found = image_features(weights, image, config=config)
     expected = compute_features(weights, read_image(image, max_size=config.max_size), config=config)
     for one, other in zip(
@@ -242,7 +245,7 @@ def test_a_hosts_memory_does_not_grow_with_the_number_of_small_images():
 
 @pytest.mark.parametrize("products", ["float32", "float16"])
 def test_memory_is_what_the_formula_says(features, products):
-    config = dataclasses.replace(preset("default"), products=products)
+    config = dataclasses.replace(CONFIG, products=products)
     (one, *_) = features.values()
     joined = jax.jit(functools.partial(join_octaves, products=products))(one.dense)
     size = sum(x.nbytes for x in jax.tree.leaves(joined))

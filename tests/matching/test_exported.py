@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsfm.config import preset
+from jaxsfm.config import Config, preset
 from jaxsfm.core.features import extract
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pair
@@ -37,11 +37,17 @@ np.savez(folder / "found.npz", **found, keypoints=features[0]["keypoints"])
 """
 
 
+def settings_of(name: str) -> Config:
+    """A preset for small photos. More than two octaves would only be more programs to compile."""
+    config = preset(name)
+    return dataclasses.replace(config, max_size=max(SIZE), octaves=min(config.octaves, 2))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "default"])
 def test_programs_run_without_jaxsfm_and_give_what_it_gives(weights, photos, tmp_path, name):
     pytest.importorskip("flatbuffers")
-    config = dataclasses.replace(preset(name), max_size=max(SIZE))
+    config = settings_of(name)
     programs = export_programs(weights, SIZE, config=config)
     for part, data in programs._asdict().items():
         (tmp_path / part).write_bytes(data)
@@ -75,7 +81,7 @@ def test_programs_run_without_jaxsfm_and_give_what_it_gives(weights, photos, tmp
 def test_a_program_for_any_number_of_photos_gives_what_one_photo_gives(weights, photos, name):
     """Bit for bit on a CPU, where the photos of a batch are computed in turn."""
     pytest.importorskip("flatbuffers")
-    config = dataclasses.replace(preset(name), max_size=max(SIZE))
+    config = settings_of(name)
     one, many = (
         jax.export.deserialize(
             bytearray(export_programs(weights, SIZE, config=config, batch=batch).extract)

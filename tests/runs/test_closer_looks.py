@@ -1,5 +1,6 @@
 """Laws of closer looks at photos that found no place."""
 
+import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,11 +26,14 @@ def test_the_strongest_pairs_with_placed_photos_are_looked_at():
         ("lost", "other"): counts(900),
         ("a", "b"): counts(900),
     }
-    found = pairs_to_look_at(["lost"], ["a", "b", "c", "d"], tried)
+    tried |= {("blank", "lost"): counts(0, 25), ("bare", "lost"): counts(0, 26)}
+    find = functools.partial(pairs_to_look_at, counts=tried, least=26)
+    found = find(["lost"], ["a", "b", "c", "d"])
     assert found == [("b", "lost"), ("d", "lost"), ("a", "lost")] and CLOSER == 3
-    both = pairs_to_look_at(["other", "lost"], ["a", "lost", "other"], tried)
+    both = find(["other", "lost"], ["a", "lost", "other"])
     assert both == [("lost", "other"), ("a", "lost")]  # each pair once
-    assert pairs_to_look_at(["lost"], ["x"], tried) == []
+    assert find(["lost"], ["x"]) == []
+    assert find(["lost"], ["blank", "bare"]) == [("bare", "lost")]  # a blank photo shows nothing
 
 
 @pytest.fixture

@@ -29,6 +29,7 @@ from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import plane_affines
+from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.track_alignment import neighbourhoods
 
@@ -173,10 +174,8 @@ def test_all_points_return_before_the_last_pass(rendered):
     after, figures = refine_model(
         few,
         read_of(rendered),
-        refinement=Refinement(),
-        refine_intrinsics=False,
+        PassSettings(Refinement(), False, 1),
         with_all_points=with_all_points,
-        threads=1,
     )
     (between,) = asked
     assert between.num_points3D() < 0.3 * whole.num_points3D() < 0.35 * after.num_points3D()
@@ -201,10 +200,8 @@ def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(
     refine_model(
         noisy_model(rendered, 0.7),
         read_of(rendered),
-        refinement=Refinement(passes=3, max_shift_px=4.0),
-        refine_intrinsics=False,
+        PassSettings(Refinement(passes=3, max_shift_px=4.0), False, 1),
         with_all_points=(lambda model: model) if returned else None,
-        threads=1,
     )
     assert seen == [4.0, 2.0, 4.0 if returned else 2.0]
 
@@ -230,11 +227,9 @@ def test_passes_begin_at_the_size_of_the_descriptions(rendered, monkeypatch, des
     refine_model(
         noisy_model(rendered, 0.7),
         read_of(rendered),
-        refinement=Refinement(),
-        refine_intrinsics=False,
+        PassSettings(Refinement(), False, 1),
         with_all_points=with_all_points,
         described_px=described_px,
-        threads=1,
     )
     assert [px for px, _ in seen] == sizes and returned == [1]
     assert [shift for _, shift in seen] == [4.0, 4.0, *[2.0] * (len(sizes) - 2)]
@@ -243,9 +238,9 @@ def test_passes_begin_at_the_size_of_the_descriptions(rendered, monkeypatch, des
 def test_keypoints_that_are_too_far_off_for_full_size_are_aligned_from_half_of_it(rendered):
     """With a noise of 6 px, most are further off than the 4 px within which full size looks."""
     before = noisy_model(rendered, 6.0)
-    known = {"refinement": Refinement(), "refine_intrinsics": False, "threads": 1}
-    once, _ = refine_model(before, read_of(rendered), **known)
-    twice, _ = refine_model(before, read_of(rendered), described_px=2, **known)
+    given = before, read_of(rendered), PassSettings(Refinement(), False, 1)
+    once, _ = refine_model(*given)
+    twice, _ = refine_model(*given, described_px=2)
     assert max(errors(twice, rendered)) < 0.02
     seen = [arrays(model, rendered).tracks for model in (once, twice)]
     assert len(seen[1].view) > 1.1 * len(seen[0].view)
@@ -257,10 +252,8 @@ def test_all_points_return_if_the_passes_end_early(rendered):
     after, figures = refine_model(
         few,
         read_of(rendered._replace(images=images)),
-        refinement=Refinement(),
-        refine_intrinsics=False,
+        PassSettings(Refinement(), False, 1),
         with_all_points=lambda model: part_of(model, ["0.png", "1.png", "2.png"]),
-        threads=1,
     )
     assert len(figures.passes) == 1 and len(registered(after)) == 3 < len(registered(few))
 

@@ -58,7 +58,7 @@ def refined(rendered, monkeypatch):
     def run(placed: Placement, against: dict, *, checked: bool = True, gone: bool = False):
         offered, asked = [], []
 
-        def refine_model(model, read, *, evidence, with_all_points, **_):
+        def refine_model(model, read, settings, *, evidence, with_all_points, **_):
             assert with_all_points("a model") == "whole"
             offered.append([image.name for image in evidence.unmapped])
             if gone:

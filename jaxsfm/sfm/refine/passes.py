@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.model import Model, Sizes
-from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -75,13 +74,11 @@ def _working_sizes(
 def refine_model(
     reconstruction: "pycolmap.Reconstruction",
     read: Reader,
+    settings: PassSettings,
     *,
-    refinement: Refinement,
-    refine_intrinsics: bool,
     evidence: Evidence = NO_EVIDENCE,
     with_all_points: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction] | None" = None,
     described_px: int = 1,
-    threads: int = -1,
     on_pass: Callable[[], None] = lambda: None,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
     """Refine a model.
@@ -96,7 +93,7 @@ def refine_model(
     Args:
       reconstruction: from the mapper; not changed.
       read: intensities by image name; may be called several times per image.
-      refine_intrinsics: whether bundle adjustment moves focal lengths and distortion.
+      settings: of the passes. With one thread the model is repeatable to the last byte.
       evidence: images that the mapper left out, and matches to place them and weak views by.
       with_all_points: gives a model the points of all matches, before the last of the `passes`.
         None: it has them already.
@@ -104,13 +101,12 @@ def refine_model(
         pixels. The `passes` are done with images of this size, and one more follows at each size
         above it, up to the working size: keypoints of a small image are too far off for a larger
         one.
-      threads: of bundle adjustment. With one thread the model is repeatable to the last byte.
 
     Raises:
       ImageError: an image of the model cannot be read any more.
     """
     sizes, evidence = _working_sizes(reconstruction, read, evidence)
-    images, settings = DeviceImages(read), PassSettings(refinement, refine_intrinsics, threads)
+    images, refinement = DeviceImages(read), settings.refinement
     now = _as_arrays(reconstruction, sizes)
     figures: list[PassFigures] = []
     limits = AlignmentLimits.of(refinement)
