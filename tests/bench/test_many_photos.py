@@ -107,4 +107,5 @@ def test_frames_are_mapped_and_localized_beside_rootsift(street_sequence, tmp_pa
     assert ours["registered"] == ours["frames"] == 9
     assert ours["position"] < 0.02 and ours["localized"]["near"] == 2
     assert theirs["registered"] >= 3 and theirs["localized"]["frames"] == 2
+    assert theirs["localized"]["near"] == theirs["localized"]["placed"]
     assert ours["seconds"].keys() >= {"extraction", "matching", "mapping", "refinement"}

@@ -48,6 +48,26 @@ def test_inliers_are_those_of_the_database(database):
         assert inliers.keypoints[name].size == (camera.width, camera.height)
 
 
+@pytest.mark.parametrize("columns", [2, 4, 6])
+def test_keypoints_of_any_number_of_columns_lie_where_the_first_two_say(tmp_path, columns):
+    """Those of COLMAP's SIFT have six. Read as pairs of numbers, they would be three times as many,
+    and the frames that RootSIFT localizes were kilometres off."""
+    import pycolmap
+
+    path, rows = tmp_path / "d.db", np.float32(np.arange(5 * columns).reshape(5, columns))
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[60, 32, 24])
+    with pycolmap.Database.open(path) as db:
+        camera_id = db.write_camera(camera)
+        number, bare = (
+            db.write_image(pycolmap.Image(name=n, camera_id=camera_id)) for n in ("a", "bare")
+        )
+        db.write_keypoints(number, rows)
+        db.write_keypoints(bare, rows[:0])
+    found = read_inliers(path).keypoints
+    np.testing.assert_array_equal(found["a"].xy, rows[:, :2] - 0.5)
+    assert found["bare"].xy.shape == (0, 2)
+
+
 def test_a_pair_of_images_that_were_written_in_another_order_is_turned_round(tmp_path):
     import pycolmap
 
