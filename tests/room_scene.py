@@ -148,12 +148,13 @@ def errors(model, scene: Room) -> tuple[float, float]:
     return e.position["mean"], e.rotation_deg["mean"]
 
 
+def settings_of(**config) -> PassSettings:
+    """Settings of a refinement with exact cameras on one thread."""
+    return PassSettings(Refinement(**config), refine_intrinsics=False, threads=1)
+
+
 def refine(model, scene, change=lambda image: image, **config):
-    return refine_model(
-        model,
-        read_of(scene, change),
-        PassSettings(Refinement(**config), False, 1),
-    )
+    return refine_model(model, read_of(scene, change), settings_of(**config))
 
 
 def sizes(scene: Room):

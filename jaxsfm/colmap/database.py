@@ -184,8 +184,16 @@ def read_matches(
         else:
             matches = []
         rows = np.asarray(matches).reshape(-1, 2).astype(np.int64)
-        xy = [np.asarray(db.read_keypoints(i), np.float64)[:, :2] - PIXEL_OFFSET for i in (a, b)]
+        xy = [colmap_xy(db, i).astype(np.float64) - PIXEL_OFFSET for i in (a, b)]
     return xy[0][rows[:, 0]], xy[1][rows[:, 1]]
+
+
+def colmap_xy(db: pycolmap.Database, image_id: int) -> np.ndarray:
+    """Where the keypoints of an image lie, float32 (n, 2), in COLMAP's pixels (`PIXEL_OFFSET`).
+
+    COLMAP's own keypoints have a shape behind their place: four or six numbers in all.
+    """
+    return np.asarray(db.read_keypoints(image_id), np.float32)[:, :2].reshape(-1, 2)
 
 
 def read_images(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET, image_ids
+from jaxsfm.colmap.database import PIXEL_OFFSET, colmap_xy, image_ids
 from jaxsfm.io.pairs import Pair
 
 
@@ -36,11 +36,10 @@ def read_inliers(path: Path) -> Inliers:
         images = {image.image_id: image for image in db.read_all_images()}
         keypoints = {}
         for image_id, image in images.items():
-            # COLMAP's own keypoints have a shape behind their place: four or six numbers.
-            rows = np.asarray(db.read_keypoints(image_id))
-            xy = rows[:, :2] if len(rows) else np.zeros((0, 2), np.float32)
             camera = cameras[image.camera_id]
-            keypoints[image.name] = ImageKeypoints(xy - PIXEL_OFFSET, (camera.width, camera.height))
+            keypoints[image.name] = ImageKeypoints(
+                colmap_xy(db, image_id) - PIXEL_OFFSET, (camera.width, camera.height)
+            )
         matches = {}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             rows = np.asarray(geometry.inlier_matches).reshape(-1, 2).astype(np.int64)

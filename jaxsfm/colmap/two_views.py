@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET
+from jaxsfm.colmap.database import PIXEL_OFFSET, colmap_xy
 from jaxsfm.colmap.native import native
 from jaxsfm.io.pairs import Pair
 
@@ -103,7 +103,7 @@ def read_two_views(path: Path) -> dict[Pair, TwoView]:
         images = {image.image_id: image for image in db.read_all_images()}
         cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
         camera_of = {i: cameras[image.camera_id] for i, image in images.items()}
-        xy = {i: np.asarray(db.read_keypoints(i))[:, :2] - PIXEL_OFFSET for i in images}
+        xy = {i: colmap_xy(db, i) - PIXEL_OFFSET for i in images}
         found = {}
         for pair_id, geometry in zip(*db.read_two_view_geometries(), strict=True):
             if not len(geometry.inlier_matches):

@@ -440,6 +440,7 @@ def test_lost_images_are_explained(scene, tmp_path, capsys):
     report = run(scene, tmp_path / "out", images=folder)
     lost = {row["image"]: row["stage"] for row in report["lost"]}
     assert lost == {"blank.png": "too few matches"} or lost == {"blank.png": "no plane"}
+    assert "closer looks" not in report["seconds"]  # a blank photo shows nothing at any scale
     (row,) = report["lost"]
     assert row["best_pair"]["tentative"] >= 0 and "--preset robust" in row["help"][0]["option"]
     groups = report["view_graph"]["components"]

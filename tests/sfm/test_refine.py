@@ -16,6 +16,7 @@ from room_scene import (
     other_scene,
     read_of,
     refine,
+    settings_of,
     view_of,
 )
 
@@ -29,7 +30,6 @@ from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import plane_affines
-from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.track_alignment import neighbourhoods
 
@@ -174,7 +174,7 @@ def test_all_points_return_before_the_last_pass(rendered):
     after, figures = refine_model(
         few,
         read_of(rendered),
-        PassSettings(Refinement(), False, 1),
+        settings_of(),
         with_all_points=with_all_points,
     )
     (between,) = asked
@@ -200,7 +200,7 @@ def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(
     refine_model(
         noisy_model(rendered, 0.7),
         read_of(rendered),
-        PassSettings(Refinement(passes=3, max_shift_px=4.0), False, 1),
+        settings_of(passes=3, max_shift_px=4.0),
         with_all_points=(lambda model: model) if returned else None,
     )
     assert seen == [4.0, 2.0, 4.0 if returned else 2.0]
@@ -227,7 +227,7 @@ def test_passes_begin_at_the_size_of_the_descriptions(rendered, monkeypatch, des
     refine_model(
         noisy_model(rendered, 0.7),
         read_of(rendered),
-        PassSettings(Refinement(), False, 1),
+        settings_of(),
         with_all_points=with_all_points,
         described_px=described_px,
     )
@@ -238,7 +238,7 @@ def test_passes_begin_at_the_size_of_the_descriptions(rendered, monkeypatch, des
 def test_keypoints_that_are_too_far_off_for_full_size_are_aligned_from_half_of_it(rendered):
     """With a noise of 6 px, most are further off than the 4 px within which full size looks."""
     before = noisy_model(rendered, 6.0)
-    given = before, read_of(rendered), PassSettings(Refinement(), False, 1)
+    given = before, read_of(rendered), settings_of()
     once, _ = refine_model(*given)
     twice, _ = refine_model(*given, described_px=2)
     assert max(errors(twice, rendered)) < 0.02
@@ -252,7 +252,7 @@ def test_all_points_return_if_the_passes_end_early(rendered):
     after, figures = refine_model(
         few,
         read_of(rendered._replace(images=images)),
-        PassSettings(Refinement(), False, 1),
+        settings_of(),
         with_all_points=lambda model: part_of(model, ["0.png", "1.png", "2.png"]),
     )
     assert len(figures.passes) == 1 and len(registered(after)) == 3 < len(registered(few))

@@ -18,6 +18,7 @@ from room_scene import (
     other_scene,
     read_of,
     refine,
+    settings_of,
     sizes,
 )
 from scipy.spatial.transform import Rotation
@@ -33,7 +34,6 @@ from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import one_pass, passes, plane_geometry, weak_views
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, matched_points
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
-from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
@@ -274,9 +274,7 @@ def test_a_photo_that_went_away_is_not_missed(rendered):
     model = noisy_model(rendered, 0.5, use=without(rendered.visible, NIGHT))
     model.deregister_frame(model.image(NIGHT + 1).frame_id)
     evidence = night_matches(rendered, right=20, wrong=0)
-    after, figures = refine_model(
-        model, read, PassSettings(Refinement(), False, 1), evidence=evidence
-    )
+    after, figures = refine_model(model, read, settings_of(), evidence=evidence)
     assert after.num_reg_images() == 4 and figures.placed == []
     assert [p.accepted for p in figures.passes] == [True, True]
 
@@ -409,11 +407,7 @@ def test_a_doubtful_view_is_placed_again_and_one_pass_more_follows(rendered, mon
 
     monkeypatch.setattr(passes, "run_pass", doubting)
     before = lost_view(rendered, turn_deg=2.0)
-    after, figures = refine_model(
-        before,
-        read_of(rendered),
-        PassSettings(Refinement(), False, 1),
-    )
+    after, figures = refine_model(before, read_of(rendered), settings_of())
     turned = [error > 1.9 for _, error in calls]
     assert turned == [True, True, False] and [px for px, _ in calls] == [1, 1, 1]
     assert max(night_error(after, rendered)) < 0.03
