@@ -52,7 +52,7 @@ PAPER_PAIR = {
 REFINEMENT = {
     "passes": 2,
     "radius": 7,
-    "iterations": 10,
+    "iterations": 8,
     "min_score": 0.8,
     "max_sigma_px": 0.25,
     "max_shift_px": 4.0,
