@@ -13,9 +13,11 @@ from jaxsfm.bench.model_options import (
 )
 from jaxsfm.bench.options import (
     BenchOptions,
+    ConfidenceOptions,
     HomographyOptions,
     PlanesOptions,
     RecallOptions,
+    TurnsOptions,
     WarpsOptions,
     WxbsOptions,
 )
@@ -152,3 +154,26 @@ def recall(bench: Unnamed[RecallOptions]) -> int:
     from jaxsfm.bench.recall import bench_recall, table_lines
 
     return _run(bench_recall, table_lines, bench)
+
+
+def turns(bench: Unnamed[TurnsOptions]) -> int:
+    """Match photos with copies of themselves that are turned and resized (synthetic).
+
+    For example
+        $ jaxsfm bench turns --root PHOTOS --every 10 --max-size 800
+    """
+    from jaxsfm.bench.turns import bench_turns, table_lines
+
+    return _run(bench_turns, table_lines, bench)
+
+
+def confidence(bench: Unnamed[ConfidenceOptions]) -> int:
+    """Count how many pairs of each confidence are right: photos with known poses, altered.
+
+    For example
+        $ jaxsfm bench confidence --root SETS --max-size 800 --diagram diagram.png
+    """
+    from jaxsfm.bench.confidence import bench_confidence, table_lines
+
+    check_writable(bench.diagram, "--diagram", (".png",))
+    return _run(bench_confidence, table_lines, bench)

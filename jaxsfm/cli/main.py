@@ -10,12 +10,14 @@ import tyro
 
 from jaxsfm.cli.bench_commands import (
     ambiguous,
+    confidence,
     daynight,
     homography,
     planes,
     recall,
     sequence,
     strecha,
+    turns,
     warps,
     wxbs,
 )
@@ -45,6 +47,8 @@ BENCHMARKS = {
     "homography": homography,
     "planes": planes,
     "warps": warps,
+    "turns": turns,
+    "confidence": confidence,
 }
 _Benchmark = one_of(BENCHMARKS)
 
