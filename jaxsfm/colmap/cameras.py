@@ -5,7 +5,7 @@ accurate than a camera for each photo, if the photos were in fact taken with one
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 
 import pycolmap
@@ -22,6 +22,7 @@ from jaxsfm.colmap.intrinsics import (
 )
 from jaxsfm.colmap.stand_in import readable_by_colmap
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile, shown_name
 from jaxsfm.io.orientation import QUARTERS
 from jaxsfm.options import CameraSharing
@@ -51,6 +52,13 @@ class Cameras:
         elif self.sharing == "single":
             sizes = {image.name: image.size for image in images}
             check_one_size(sizes, "--cameras single: there is")
+
+    def plain(self) -> Json:
+        """The same as JSON, which tells different cameras apart."""
+        known = self.known
+        if isinstance(known, Mapping):
+            return {name: dataclasses.asdict(each) for name, each in known.items()}
+        return dataclasses.asdict(known) if known else [self.sharing, self.model]
 
     def each_its_own(self, images: Sequence[ImageFile]) -> "Cameras | None":
         """The same with a camera for each photo; None unless `auto` makes most photos share one.

@@ -81,6 +81,71 @@ class Mapped(NamedTuple):
     """All runs of the mapper."""
 
 
+class Start(NamedTuple):
+    """How a run of the mapper begins."""
+
+    pair: Pair | None = None
+    """The pair that it starts from; None: its own choice."""
+    names: Sequence[str] = ()
+    """Of the images that it may use; none: all. For the incremental mapper."""
+
+
+USUAL_START = Start()
+
+
+def run_mapper(
+    database: Path,
+    options: MapOptions,
+    start: Start = USUAL_START,
+    on_image: Callable[[], None] = lambda: None,
+) -> list[pycolmap.Reconstruction]:
+    """The models of one run of COLMAP's mapper, the one with most images first.
+
+    Args:
+      on_image: called for every image that the incremental mapper registers.
+
+    Raises:
+      UserError: COLMAP failed.
+    """
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        if options.mapper == "global":
+            found = native(
+                lambda _: pycolmap.global_mapping(
+                    database, scratch, scratch, global_options(options)
+                ),
+                database,
+                grace_s=1,  # it cannot be cancelled
+            )
+            return ordered(list(found.values()))
+        p = incremental_options(options)
+        p.image_names = list(start.names)
+        if start.pair is not None:
+            images = read_images(database)
+            p.init_image_id1, p.init_image_id2 = (images[name][0] for name in start.pair)
+            p.multiple_models = (
+                False  # otherwise COLMAP starts every model from this pair, 50 times
+            )
+            p.mapper.init_min_num_inliers = 30
+            p.mapper.init_min_tri_angle = 4.0
+        found = native(
+            lambda token: pycolmap.incremental_mapping(
+                database,
+                scratch,
+                scratch,
+                p,
+                initial_image_pair_callback=lambda: (on_image(), on_image()) and None,
+                next_image_callback=on_image,
+                cancellation_token=token,
+            ),
+            database,
+        )
+        return ordered(list(found.values()))
+
+
+MapperRun = Callable[[Path, MapOptions, Start, Callable[[], None]], "list[pycolmap.Reconstruction]"]
+"""What `run_mapper` does, for a database that does not change while models are made from it."""
+
+
 def build_models(
     database: Path,
     two_views: Mapping[Pair, TwoView],
@@ -106,13 +171,15 @@ def first_models(
     *,
     names: Sequence[str] = (),
     on_image: Callable[[], None] = lambda: None,
+    run: MapperRun = run_mapper,
 ) -> Mapped:
     """Run the mapper once; see `build_models`.
 
     Args:
       names: of the images that the incremental mapper may use; by default all.
+      run: runs the mapper, or gives what an earlier run gave.
     """
-    models = _run(database, options, None, on_image, names)
+    models = run(database, options, Start(names=names), on_image)
     return Mapped(models, [_attempt(options.mapper, None, models)])
 
 
@@ -123,6 +190,7 @@ def with_left_out_images(
     options: MapOptions,
     *,
     on_image: Callable[[], None] = lambda: None,
+    run: MapperRun = run_mapper,
 ) -> Mapped:
     """Start the mapper again if its first run found no model or left out connected images.
 
@@ -132,6 +200,9 @@ def with_left_out_images(
     Then it is started from other initial pairs (`initial_pairs`, each image once, with lower
     demands). If there is still no model, the global mapper is tried. An attempt that registers more
     images replaces the former ones, except for models of other images.
+
+    Args:
+      run: runs the mapper, or gives what an earlier run gave.
 
     Returns:
       `first` itself if nothing was tried.
@@ -149,13 +220,14 @@ def with_left_out_images(
         for pair in starts:
             if _complete(models, pairs, MISSING if pair else 0):
                 continue
-            other = _run(database, options, pair, on_image)
+            other = run(database, options, Start(pair), on_image)
             attempts.append(_attempt("incremental", pair, other))
             if other and (not models or other[0].num_reg_images() > models[0].num_reg_images()):
                 apart = [m for m in models if not registered(m) <= registered(other[0])]
                 models = ordered([other[0], *apart])
         if not models and pairs:
-            other = _run(database, dataclasses.replace(options, mapper="global"), None, on_image)
+            options = dataclasses.replace(options, mapper="global")
+            other = run(database, options, USUAL_START, on_image)
             attempts.append(_attempt("global", None, other))
             models = other
     return Mapped(models, attempts) if len(attempts) > len(first.attempts) else first
@@ -176,45 +248,3 @@ def _attempt(mapper: Mapper, pair: Pair | None, models: list[pycolmap.Reconstruc
     return Attempt(
         mapper=mapper, initial_pair=pair, registered=[m.num_reg_images() for m in models]
     )
-
-
-def _run(
-    database: Path,
-    options: MapOptions,
-    initial: Pair | None,
-    on_image: Callable[[], None],
-    names: Sequence[str] = (),
-) -> list[pycolmap.Reconstruction]:
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        if options.mapper == "global":
-            found = native(
-                lambda _: pycolmap.global_mapping(
-                    database, scratch, scratch, global_options(options)
-                ),
-                database,
-                grace_s=1,  # it cannot be cancelled
-            )
-            return ordered(list(found.values()))
-        p = incremental_options(options)
-        p.image_names = list(names)
-        if initial is not None:
-            images = read_images(database)
-            p.init_image_id1, p.init_image_id2 = (images[name][0] for name in initial)
-            p.multiple_models = (
-                False  # otherwise COLMAP starts every model from this pair, 50 times
-            )
-            p.mapper.init_min_num_inliers = 30
-            p.mapper.init_min_tri_angle = 4.0
-        found = native(
-            lambda token: pycolmap.incremental_mapping(
-                database,
-                scratch,
-                scratch,
-                p,
-                initial_image_pair_callback=lambda: (on_image(), on_image()) and None,
-                next_image_callback=on_image,
-                cancellation_token=token,
-            ),
-            database,
-        )
-        return ordered(list(found.values()))

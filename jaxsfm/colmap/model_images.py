@@ -1,7 +1,9 @@
 """The images of COLMAP's models: which ones they have, and models with fewer of them."""
 
+import hashlib
 from collections.abc import Collection, Sequence
 
+import numpy as np
 import pycolmap
 
 
@@ -24,6 +26,19 @@ def ordered(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstr
 def registered(model: pycolmap.Reconstruction) -> set[str]:
     """Names of the images that have a pose."""
     return {model.image(i).name for i in model.reg_image_ids()}
+
+
+def fingerprint(model: pycolmap.Reconstruction) -> str:
+    """A hash of the images that have a pose, of their poses and cameras, and of the points."""
+    found = hashlib.sha256()
+    for k in sorted(model.reg_image_ids()):
+        image = model.image(k)
+        found.update(f"{k} {image.name} {image.camera_id}\n".encode())
+        found.update(image.cam_from_world().matrix().tobytes())
+        found.update(np.asarray(model.camera(image.camera_id).params).tobytes())
+    for k in sorted(model.point3D_ids()):
+        found.update(model.point3D(k).xyz.tobytes())
+    return found.hexdigest()
 
 
 def take_out(model: pycolmap.Reconstruction, names: Collection[str]) -> None:

@@ -7,15 +7,14 @@ import contextlib
 import json
 import logging
 import shutil
-import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from jaxsfm.errors import UserError, writing
-from jaxsfm.io.atomic import PARTIAL, Json, atomic_folder, read_json, write_atomic
-from jaxsfm.io.hashes import rows_sha256, sha256_of
+from jaxsfm.io.atomic import PARTIAL, Json, read_json, write_atomic
+from jaxsfm.io.kept_folders import Steps, forget, is_kept, keep
 from jaxsfm.io.locks import only_process
-from jaxsfm.io.store import FAILED, Identity, Store, digest
+from jaxsfm.io.store import FAILED, Identity, Store
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +29,7 @@ SKY = "sky"
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")
-_MOVES, _KEY, _LOCK = "moves.json", "key", ".lock"
+_MOVES, _LOCK = "moves.json", ".lock"
 
 
 class WorkFolder(Store):
@@ -46,28 +45,27 @@ class WorkFolder(Store):
           compute: runs the stage and writes its files into the given folder.
         """
         folder = self._stage_folder(name)
-        if self._has_stage(folder, key):
+        if is_kept(folder, key):
             logger.info("%s: as before, nothing it depends on has changed", name)
-            return folder
-        with atomic_folder(folder) as fresh:
-            compute(fresh)
-            (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
+        else:
+            keep(folder, key, compute)
+        _remove(self.steps(name, key).folder)
         return folder
+
+    def steps(self, name: str, key: str) -> Steps:
+        """The kept parts of a stage that is not finished; when it is, they are removed.
+
+        Args:
+          key: as in `stage`.
+        """
+        return Steps(self.path / "stages" / f"{name}-steps", key)
 
     def forget_stage(self, name: str) -> None:
         """Make the next run compute a stage again."""
-        (self._stage_folder(name) / _KEY).unlink(missing_ok=True)
+        forget(self._stage_folder(name))
 
     def _stage_folder(self, name: str) -> Path:
         return self.path / "stages" / name
-
-    def _has_stage(self, folder: Path, key: str) -> bool:
-        """Whether the files of a stage are whole and were made with this key."""
-        try:
-            found = (folder / _KEY).read_text(encoding="ascii")
-            return found == f"{key} {_content(folder)}"
-        except (OSError, ValueError):
-            return False
 
     # -- results ---------------------------------------------------------------------------------
 
@@ -114,21 +112,6 @@ class WorkFolder(Store):
             _remove(self.path / FAILED)  # left by an earlier attempt
         (made / _MOVES).unlink()
         _remove(made)
-
-
-def _content(folder: Path) -> str:
-    """A digest of a stage's files; it shows files that a power failure tore."""
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / _KEY)
-    return digest([[p.relative_to(folder).as_posix(), _hash(p)] for p in files])
-
-
-def _hash(file: Path) -> str:
-    if file.suffix != ".db":
-        return sha256_of(file)
-    try:
-        return rows_sha256(file)
-    except sqlite3.DatabaseError as error:
-        return f"damaged: {error}"
 
 
 def _remove(path: Path) -> None:

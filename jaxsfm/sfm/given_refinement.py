@@ -15,7 +15,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.sfm.model_photos import ModelPhotos
 from jaxsfm.sfm.old_frame import move_back
 from jaxsfm.sfm.refine.one_pass import PassSettings
-from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
+from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model, with_progress
 
 if TYPE_CHECKING:
     import pycolmap
@@ -56,7 +56,7 @@ def refine_given(
         photos.gray,
         PassSettings(refinement, refine_intrinsics, threads),
         described_px=_described_px(given, photos),
-        on_pass=on_pass,
+        run=with_progress(on_pass),
     )
     if not any(done.accepted for done in figures.passes):
         return None

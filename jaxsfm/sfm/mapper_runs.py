@@ -1,4 +1,7 @@
-"""Runs of the mapper on a share of the matches, and the points of all matches afterwards."""
+"""Runs of the mapper on a share of the matches, and the points of all matches afterwards.
+
+Each run is kept as soon as it ends, because it may take hours.
+"""
 
 import dataclasses
 import shutil
@@ -10,15 +13,28 @@ import numpy as np
 
 from jaxsfm.colmap.inliers import keep_inliers, read_inliers
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import Attempt, Mapped, first_models, with_left_out_images
+from jaxsfm.colmap.mapper import (
+    Attempt,
+    Mapped,
+    Start,
+    first_models,
+    run_mapper,
+    with_left_out_images,
+)
+from jaxsfm.colmap.model_folders import read_models, write_models
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.two_views import TwoView
+from jaxsfm.io.hashes import rows_sha256
+from jaxsfm.io.kept_folders import Steps
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.mapper_matches import mapper_matches
 from jaxsfm.sfm.parts.map_parts import MANY, map_in_parts
 
 if TYPE_CHECKING:
     import pycolmap
+
+MODELS = "models"
+"""The folder of the models of a kept run."""
 
 
 class MapperRuns:
@@ -36,6 +52,7 @@ class MapperRuns:
         *,
         share: bool,
         on_image: Callable[[], None] = lambda: None,
+        steps: Steps | None = None,
     ) -> None:
         """
         Args:
@@ -44,7 +61,9 @@ class MapperRuns:
           share: give the mapper a share of the matches, of which it makes a draft; otherwise all of
             them.
           on_image: called for every image that the mapper registers.
+          steps: where the models of each run are kept; None: nowhere.
         """
+        self._steps = steps
         self._database, self._options, self._on_image = database, options, on_image
         self._share, self._mapping = share, dataclasses.replace(options, draft=share)
         self._given = scratch / "mapper.db" if share else database
@@ -69,7 +88,9 @@ class MapperRuns:
             keep_inliers(self._given, chosen)
         made = self._in_parts(chosen) if self._options.in_parts else None
         if made is None:
-            made = first_models(self._given, self._mapping, on_image=self._on_image)
+            made = first_models(
+                self._given, self._mapping, on_image=self._on_image, run=self._kept_run
+            )
         self.attempts += made.attempts
         return made
 
@@ -79,7 +100,29 @@ class MapperRuns:
         matches = {pair: len(rows) for pair, rows in given.items()}
         if len({name for pair in matches for name in pair}) <= MANY:
             return None
-        return map_in_parts(self._given, matches, self._mapping, on_image=self._on_image)
+        return map_in_parts(
+            self._given, matches, self._mapping, on_image=self._on_image, run=self._kept_run
+        )
+
+    def _kept_run(
+        self, database: Path, options: MapOptions, start: Start, on_image: Callable[[], None]
+    ) -> "list[pycolmap.Reconstruction]":
+        """The models of a run of the mapper that may have been made before."""
+        if self._steps is None:
+            return run_mapper(database, options, start, on_image)
+        about = [rows_sha256(database), dataclasses.asdict(options), start.pair, list(start.names)]
+        ran = []
+
+        def make(folder: Path) -> None:
+            ran.append(True)
+            write_models(run_mapper(database, options, start, on_image), folder / MODELS)
+
+        folder = self._steps.kept("mapper", about, make)
+        models = read_models(folder / MODELS, database)
+        if not ran:
+            for _ in range(sum(model.num_reg_images() for model in models)):
+                on_image()
+        return models
 
     def with_left_out_images(self, made: Mapped, two_views: Mapping[Pair, TwoView]) -> Mapped:
         """The models of further runs, if the first run since the database changed left out images.
@@ -89,7 +132,12 @@ class MapperRuns:
           two_views: the pairs in the database.
         """
         more = with_left_out_images(
-            made, self._given, two_views, self._mapping, on_image=self._on_image
+            made,
+            self._given,
+            two_views,
+            self._mapping,
+            on_image=self._on_image,
+            run=self._kept_run,
         )
         self.attempts += more.attempts[len(made.attempts) :]
         return more

@@ -20,6 +20,7 @@ from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.colmap.model_images import take_out
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import Config
+from jaxsfm.io.kept_folders import Steps
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
@@ -81,6 +82,7 @@ def build_checked_models(
     options: MapOptions,
     on_image: Callable[[], None] = lambda: None,
     go_on: Callable[[], bool] = lambda: True,
+    steps: Steps | None = None,
 ) -> Mapped:
     """Map verified pairs until no photo contradicts the others, with two hypotheses.
 
@@ -95,11 +97,18 @@ def build_checked_models(
       on_image: called for every image that the mapper registers.
       go_on: whether to go on, if photos still contradict each other after the first rounds. If not,
         the best of these is returned.
+      steps: where models and checks are kept until all rounds are made; None: nowhere.
     """
     following = neighbours(given.two_views.keys())
     with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
         rounds = Rounds(
-            given, database, Path(scratch), config=config, options=options, on_image=on_image
+            given,
+            database,
+            Path(scratch),
+            config=config,
+            options=options,
+            on_image=on_image,
+            steps=steps,
         )
         voted = by_votes(rounds, view_graph=config.view_graph, go_on=go_on)
         best, other = rounds.joined(voted.best), None

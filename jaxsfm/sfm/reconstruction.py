@@ -18,7 +18,6 @@ from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
-from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches, Pair, PairResult
 from jaxsfm.io.photos import Photos
@@ -202,13 +201,14 @@ def map_matches(
             options=options,
             on_image=on_image,
             go_on=go_on or (lambda: True),
+            steps=stages.steps(name, key),
         )
         write_models(made.models, folder / SPARSE)
         write_models(made.alternative, folder / ALTERNATIVE)
         stage_files.write_mapping(folder, made.figures)
 
     by_image = [[image.name, image.content, image.size] for image in given.images]
-    camera = _plain(given.cameras)
+    camera = given.cameras.plain()
     verifying = [options.seed, options.threads, options.scale, config.view_graph]
     key = digest(
         kept.matches_key, stage_files.FORMAT, by_image, camera, verifying, package_versions()
@@ -218,8 +218,9 @@ def map_matches(
     checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
     refines = config.refinement is not None
     key = digest(key, dataclasses.asdict(options), checking, refines, go_on is not None)
+    name = "mapped" + kept.suffix
     verification = stage_files.read_verification(verified)
-    mapped = stages.stage("mapped" + kept.suffix, key, build)
+    mapped = stages.stage(name, key, build)
     return MappedStage(verification, stage_files.read_mapping(mapped), mapped, key)
 
 
@@ -257,6 +258,7 @@ def refine_mapped(
             config=config,
             options=given.options,
             on_pass=on_pass,
+            steps=kept.folder.steps("refined", key),
         )
         write_models(made.models, folder / SPARSE)
         stage_files.write_refinement(folder, made.figures, made.order)
@@ -281,14 +283,6 @@ def refine_mapped(
         alternative=mapped.models(ALTERNATIVE),
         refinement=refinement,
     )
-
-
-def _plain(cameras: Cameras) -> Json:
-    """What is known and assumed of cameras, as part of a key."""
-    known = cameras.known
-    if isinstance(known, Mapping):
-        return {name: dataclasses.asdict(each) for name, each in known.items()}
-    return dataclasses.asdict(known) if known else [cameras.sharing, cameras.model]
 
 
 def _verified(database: Path, options: MapOptions, view_graph: bool) -> VerificationFigures:

@@ -1,6 +1,7 @@
 """The refinement of all models of a run, and of the places that it gives to further photos."""
 
 import dataclasses
+import functools
 import logging
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -17,14 +18,16 @@ from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError
+from jaxsfm.io.kept_folders import Steps
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.placed_views import Placed, doubts
 from jaxsfm.sfm.checker import opened
+from jaxsfm.sfm.kept_refinement import KeptRefinement, RefinedModel
 from jaxsfm.sfm.photo_order import neighbours
 from jaxsfm.sfm.refine.evidence import Evidence, UnmappedImage
-from jaxsfm.sfm.refine.one_pass import PassSettings
-from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
+from jaxsfm.sfm.refine.one_pass import PassSettings, run_pass
+from jaxsfm.sfm.refine.passes import PassRun, RefinementFigures, refine_model, with_progress
 
 if TYPE_CHECKING:
     import pycolmap
@@ -62,6 +65,7 @@ def refine_models(
     config: Config,
     options: MapOptions,
     on_pass: Callable[[], None] = lambda: None,
+    steps: Steps | None = None,
 ) -> RefinedModels:
     """Refine the models, if asked for, and colour their points.
 
@@ -73,39 +77,23 @@ def refine_models(
       photos: at the size that the refinement works at.
       config: its `refinement` and `checked` switch these parts on.
       options: of the mapper; its `scale` is that of the photos in which keypoints were found.
+      steps: where passes and models are kept until all are refined; None: nowhere.
     """
     cameras = read_images(believed.database)
     mapped = {name for model in models for name in registered(model)}
     unmapped = [UnmappedImage(name, *cameras[name]) for name in sorted({*cameras} - mapped)]
     evidence = Evidence(believed.matches, unmapped, options.seed)
-    following = neighbours(believed.verified)
-
-    def whole(model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
-        return with_all_points(model, believed.database, options)
-
+    refining = _Refining(photos, believed, config, options, neighbours(believed.verified), on_pass)
     refined, figures = [], []
-    for model in models:
-        new, done = model, None
-        try:
-            if config.refinement is not None:
-                new, done = refine_model(
-                    model,
-                    photos.gray,
-                    PassSettings(config.refinement, options.refine_intrinsics, options.threads),
-                    evidence=evidence,
-                    with_all_points=whole,
-                    described_px=described_px(options.scale / photos.median_scale()),
-                    on_pass=on_pass,
-                )
-                if config.checked:
-                    new, done = _without_doubtful(
-                        new, done, photos, believed.matches, following, config.refinement
-                    )
-        except ImageError as error:  # a photo was deleted since; the mapper's model remains
-            logger.warning("no refinement: %s", error)
-            new = whole(model)
-        if done is not None and options.refine_intrinsics:
-            new = _with_one_camera(new, photos, options.threads)
+    for number, model in enumerate(models):
+        if config.refinement is None:
+            new, done = model, None
+        elif steps is None:
+            new, done = refining.refined(model, evidence)
+        else:
+            kept = KeptRefinement(steps, f"model-{number}", believed.database)
+            refine = functools.partial(refining.refined, model, evidence, kept.run_pass)
+            new, done = kept.finished(model, refine, [each.name for each in evidence.unmapped])
         left = [image for image in evidence.unmapped if image.name not in registered(new)]
         evidence = evidence._replace(unmapped=left)
         refined.append(new)
@@ -115,6 +103,52 @@ def refine_models(
     for model in refined:
         colour_points(model, photos.rgb)
     return RefinedModels([refined[k] for k in order], [figures[k] for k in order], order)
+
+
+class _Refining(NamedTuple):
+    """What all models of a run are refined with."""
+
+    photos: Photos
+    believed: Believed
+    config: Config
+    options: MapOptions
+    following: Collection[Pair]
+    """Verified pairs of photos that follow each other."""
+    on_pass: Callable[[], None]
+
+    def refined(
+        self,
+        model: "pycolmap.Reconstruction",
+        evidence: Evidence,
+        run: PassRun = run_pass,
+    ) -> RefinedModel:
+        """A model after the refinement; if a photo cannot be read, it is not refined."""
+        refinement, options = self.config.refinement, self.options
+        assert refinement is not None
+        try:
+            new, done = refine_model(
+                model,
+                self.photos.gray,
+                PassSettings(refinement, options.refine_intrinsics, options.threads),
+                evidence=evidence,
+                with_all_points=self._whole,
+                described_px=described_px(options.scale / self.photos.median_scale()),
+                run=with_progress(self.on_pass, run),
+            )
+            if self.config.checked:
+                matches = self.believed.matches
+                new, done = _without_doubtful(
+                    new, done, self.photos, matches, self.following, refinement
+                )
+        except ImageError as error:  # a photo was deleted since; the mapper's model remains
+            logger.warning("no refinement: %s", error)
+            return self._whole(model), None
+        if options.refine_intrinsics:
+            new = _with_one_camera(new, self.photos, options.threads)
+        return new, done
+
+    def _whole(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+        return with_all_points(model, self.believed.database, self.options)
 
 
 def _with_one_camera(

@@ -9,9 +9,14 @@ from typing import TYPE_CHECKING
 from jaxsfm.colmap.database import copy_geometries, drop_pairs, keep_outliers
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import Attempt
+from jaxsfm.colmap.model_images import fingerprint
 from jaxsfm.colmap.two_views import TwoView, read_two_views, verify
 from jaxsfm.config import Config
+from jaxsfm.io.hashes import rows_sha256
+from jaxsfm.io.kept_folders import Steps
 from jaxsfm.io.pairs import Pair
+from jaxsfm.sfm.check.check_files import read_outcomes, write_outcomes
+from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Contradiction, ModelCheck
 from jaxsfm.sfm.checker import Checker, VerifiedPairs
 from jaxsfm.sfm.joined_models import Joiner
@@ -22,6 +27,9 @@ from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
     import pycolmap
+
+OUTCOMES = "outcomes.json"
+"""The file with the outcomes of kept checks."""
 
 
 class Rounds:
@@ -40,7 +48,13 @@ class Rounds:
         config: Config,
         options: MapOptions,
         on_image: Callable[[], None] = lambda: None,
+        steps: Steps | None = None,
     ) -> None:
+        """
+        Args:
+          steps: where models and checks of rounds are kept until all rounds are made; None:
+            nowhere.
+        """
         self.given, self._database = given, database
         self._second_database = scratch / "second.db"
         self._options = options
@@ -50,7 +64,9 @@ class Rounds:
             options,
             share=config.refinement is not None,
             on_image=on_image,
+            steps=steps,
         )
+        self._steps = steps
         self._checker = Checker(given, config, options.seed, self._mapper.with_all_points)
         self._asked: set[Pair] = set()
         """Pairs whose second geometry was looked for."""
@@ -78,14 +94,32 @@ class Rounds:
         dropped = self._write_pairs(verdicts, refuted)
         trusted = {pair: view for pair, view in views.items() if pair not in dropped}
         made = self._mapper.first()
-        checks = self._checker.check(made.models, refuted.pairs)
+        checks = self._checked(made.models, refuted.pairs)
         if not any(each and each.check.contradictions for each in checks):
             more = self._mapper.with_left_out_images(made, trusted)
             if more is not made:
-                made, checks = more, self._checker.check(more.models, refuted.pairs)
+                made, checks = more, self._checked(more.models, refuted.pairs)
         self._last = Round(hypothesis.basis, made.models, verdicts, checks, refuted)
         self.doubt(each and each.check for each in checks)
         return self._last
+
+    def _checked(
+        self, models: "Sequence[pycolmap.Reconstruction]", refuted: Collection[Pair]
+    ) -> list[Checked | None]:
+        """The checks of models, which may have been made before."""
+        if self._steps is None:
+            return self._checker.check(models, refuted)
+        about = [
+            [fingerprint(model) for model in models],
+            rows_sha256(self._database),
+            [list(pair) for pair in sorted(refuted)],
+        ]
+        folder = self._steps.kept(
+            "check",
+            about,
+            lambda fresh: write_outcomes(fresh / OUTCOMES, self._checker.check(models, refuted)),
+        )
+        return read_outcomes(folder / OUTCOMES)
 
     def doubt(self, checks: Iterable[ModelCheck | None]) -> None:
         """Remember the models that something speaks against (`fallen_apart`)."""

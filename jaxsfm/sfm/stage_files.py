@@ -7,11 +7,9 @@ from pathlib import Path
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.io.pairs import Pair
-from jaxsfm.sfm.check.model_check import Alternative, Contradiction, ModelCheck, OtherPlace
+from jaxsfm.sfm.check.check_files import check_from_json
 from jaxsfm.sfm.mapping import MappingFigures
-from jaxsfm.sfm.refine.one_pass import PassFigures
-from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refine.passes import RefinementFigures, figures_from_json
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
@@ -67,21 +65,9 @@ def read_mapping(folder: Path) -> MappingFigures:
     return MappingFigures(
         verdicts={(a, b): Verdict(**row) for (a, b), row in plain["verdicts"]},
         attempts=attempts,
-        checks=[row and _check(row) for row in plain["checks"]],
+        checks=[row and check_from_json(row) for row in plain["checks"]],
         basis=plain["basis"],
         cut_short=plain["cut_short"],
-    )
-
-
-def _check(row: dict) -> ModelCheck:
-    return ModelCheck(
-        groups=row["groups"],
-        contradictions=[Contradiction(**each) for each in row["contradictions"]],
-        other_places=[OtherPlace(**each) for each in row["other_places"]],
-        alternative=row["alternative"] and Alternative(**row["alternative"]),
-        apart=row["apart"],
-        taken_out=row["taken_out"],
-        told_apart=row["told_apart"],
     )
 
 
@@ -102,12 +88,4 @@ def write_refinement(
 def read_refinement(folder: Path) -> tuple[list[RefinementFigures | None], list[int]]:
     """Read what `write_refinement` wrote."""
     plain = json.loads((folder / FIGURES).read_text(encoding="utf-8"))
-    figures = [
-        row
-        and RefinementFigures(
-            passes=[PassFigures(**each) for each in row["passes"]],
-            placed=[Placement(**each) for each in row["placed"]],
-        )
-        for row in plain["models"]
-    ]
-    return figures, plain["order"]
+    return [row and figures_from_json(row) for row in plain["models"]], plain["order"]

@@ -248,7 +248,7 @@ def test_a_given_initial_pair_gives_the_same_scene(tmp_path, scene, initial):
         assert map_database(tmp_path / "d.db", ONE)[0].num_reg_images() == 5
         return
     pair = initial_pairs(verified(tmp_path / "d.db", ONE))[initial]
-    assert mapper._run(tmp_path / "d.db", ONE, pair, lambda: None)[0].num_reg_images() == 5
+    assert mapper.run_mapper(tmp_path / "d.db", ONE, mapper.Start(pair))[0].num_reg_images() == 5
 
 
 def test_a_given_pair_gives_one_model_not_one_per_try(tmp_path, scene):
@@ -264,7 +264,7 @@ def test_a_given_pair_gives_one_model_not_one_per_try(tmp_path, scene):
     write_database(path, small + scene.images, scene.results | other, scene.cameras)
     two_views = verified(path, ONE)
     pair = next(p for p in initial_pairs(two_views) if p[0] in scene.names)
-    assert [m.num_reg_images() for m in mapper._run(path, ONE, pair, lambda: None)] == [5]
+    assert [m.num_reg_images() for m in mapper.run_mapper(path, ONE, mapper.Start(pair))] == [5]
     assert [m.num_reg_images() for m in build_models(path, two_views, ONE)[0]] == [5, 3]
 
 

@@ -28,12 +28,12 @@ def runs(tmp_path, monkeypatch):
     database, log, whole = tmp_path / "d.db", [], []
     database.write_text("all")
 
-    def first(path: Path, options, *, on_image):
+    def first(path: Path, options, *, on_image, run):
         log.append((path.read_text(), options))
         tried = Attempt(mapper="incremental", initial_pair=None, registered=[])
         return Mapped([], [tried])
 
-    def again(made, path, two_views, options, *, on_image):
+    def again(made, path, two_views, options, *, on_image, run):
         log.append((path.read_text(), options))
         return Mapped([], [*made.attempts, *made.attempts]) if two_views else made
 

@@ -125,14 +125,14 @@ def rounds(monkeypatch, tmp_path) -> Callable[..., Run]:
 
         drafted = config.refinement is not None
 
-        def first(database, options, *, on_image):
+        def first(database, options, *, on_image, run):
             assert options == dataclasses.replace(OPTIONS, draft=drafted)
             pairs = frozenset(tuple(pair) for pair in json.loads(database.read_text()))
             given.append(set(pairs))
             tried = Attempt(mapper="incremental", initial_pair=None, registered=[len(given)])
             return Mapped([FakeModel(pairs)] * models, [tried])
 
-        def again(made, database, trusted, options, *, on_image):
+        def again(made, database, trusted, options, *, on_image, run):
             assert options.draft == drafted and set(trusted) == given[-1]
             if not left_out(made.models[0]):
                 return made

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import Attempt, Mapped, first_models
+from jaxsfm.colmap.mapper import Attempt, Mapped, MapperRun, first_models, run_mapper
 from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.colmap.model_images import ordered, registered
 from jaxsfm.io.pairs import Pair
@@ -43,6 +43,7 @@ def map_in_parts(
     options: MapOptions,
     *,
     on_image: Callable[[], None] = lambda: None,
+    run: MapperRun = run_mapper,
 ) -> Mapped | None:
     """Map the photos of a verified database in parts, and join the models of the parts.
 
@@ -50,6 +51,7 @@ def map_in_parts(
       database: with the verified pairs.
       matches: the number of verified matches of each pair in it.
       on_image: called for every image that the mapper registers.
+      run: runs the mapper, or gives what an earlier run gave.
 
     Returns:
       the models; None if the parts do not give one model of nearly all their photos.
@@ -62,7 +64,7 @@ def map_in_parts(
     found: list[pycolmap.Reconstruction] = []
     attempts: list[Attempt] = []
     for names in parts:
-        made = first_models(database, options, names=names, on_image=on_image)
+        made = first_models(database, options, names=names, on_image=on_image, run=run)
         found += [model for model in made.models if model.num_reg_images() >= MIN_SHARED]
         attempts += made.attempts
     found.sort(

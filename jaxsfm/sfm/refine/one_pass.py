@@ -75,13 +75,17 @@ class Refined(NamedTuple):
     model: Model
 
 
+PassOutcome = tuple[Refined, PassFigures]
+"""The model after a pass, and what was done."""
+
+
 def run_pass(
     before: Refined,
     images: DeviceImages,
     px: int,
     limits: AlignmentLimits,
     settings: PassSettings,
-) -> tuple[Refined, PassFigures]:
+) -> PassOutcome:
     """Align the observations of a model and adjust it.
 
     Args:

@@ -16,14 +16,21 @@ the points of the matches that the mapper was given. Then all others return.
 import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
-from jaxsfm.sfm.refine.one_pass import MIN_POINTS, PassFigures, PassSettings, Refined, run_pass
+from jaxsfm.sfm.refine.one_pass import (
+    MIN_POINTS,
+    PassFigures,
+    PassOutcome,
+    PassSettings,
+    Refined,
+    run_pass,
+)
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views, remove_unconfirmed
 
@@ -38,6 +45,29 @@ class RefinementFigures:
     passes: list[PassFigures]
     placed: list[Placement]
     """One for each view that was weak in any pass, and for each image that the mapper left out."""
+
+
+def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
+    """The figures that are given as plain data (`dataclasses.asdict`)."""
+    return RefinementFigures(
+        passes=[PassFigures(**each) for each in row["passes"]],
+        placed=[Placement(**each) for each in row["placed"]],
+    )
+
+
+def with_progress(on_pass: Callable[[], None], run: "PassRun" = run_pass) -> "PassRun":
+    """`run`, and a call after each pass."""
+
+    def told(*given: Any) -> PassOutcome:
+        done = run(*given)
+        on_pass()
+        return done
+
+    return told
+
+
+PassRun = Callable[[Refined, DeviceImages, int, AlignmentLimits, PassSettings], PassOutcome]
+"""What `run_pass` does."""
 
 
 def _as_arrays(reconstruction: "pycolmap.Reconstruction", sizes: Sizes) -> Refined:
@@ -79,7 +109,7 @@ def refine_model(
     evidence: Evidence = NO_EVIDENCE,
     with_all_points: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction] | None" = None,
     described_px: int = 1,
-    on_pass: Callable[[], None] = lambda: None,
+    run: PassRun = run_pass,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
     """Refine a model.
 
@@ -101,6 +131,7 @@ def refine_model(
         pixels. The `passes` are done with images of this size, and one more follows at each size
         above it, up to the working size: keypoints of a small image are too far off for a larger
         one.
+      run: does a pass, or gives what an earlier run of it gave.
 
     Raises:
       ImageError: an image of the model cannot be read any more.
@@ -118,9 +149,8 @@ def refine_model(
             limits = AlignmentLimits.of(refinement)  # the keypoints of new points are not aligned
         if len(now.model.tracks.points) < MIN_POINTS or len(now.model.views) < 2:
             break
-        now, done = run_pass(now, images, px, limits, settings)
+        now, done = run(now, images, px, limits, settings)
         figures.append(done)
-        on_pass()
         if not done.accepted:
             break
     if with_all_points is not None:  # the passes ended early
@@ -130,7 +160,7 @@ def refine_model(
     if doubtful := _doubtful(figures):
         model, placed = placing.placed(now.model, doubtful, unmapped=False)
         if model is not now.model:
-            now, done = run_pass(_as_arrays(model.to_colmap(), sizes), images, 1, limits, settings)
+            now, done = run(_as_arrays(model.to_colmap(), sizes), images, 1, limits, settings)
             figures.append(done)
     # A view that was weak in any pass is placed: what little agreed in the first pass looks like
     # much in the next (58 of 153 observations after 22 of 393, and the camera 0.4 m off).
