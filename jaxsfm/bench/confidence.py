@@ -16,7 +16,7 @@ from jaxsfm.bench.drawn_pairs import DrawnPair, drawn_pairs, posed_photos
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.inputs import usable_image
 from jaxsfm.bench.matches import Matcher, Matches
-from jaxsfm.bench.options import ConfidenceOptions
+from jaxsfm.bench.pair_options import ConfidenceOptions
 from jaxsfm.bench.reliability import (
     Bin,
     bins,

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsfm.bench.methods import NAIVE, method_config
 from jaxsfm.bench.naive import match_pairs_naively
-from jaxsfm.bench.options import PairOptions
+from jaxsfm.bench.pair_options import PairOptions
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database

@@ -17,7 +17,7 @@ from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, t
 from jaxsfm.bench.inputs import choose_sets, usable_image
 from jaxsfm.bench.matches import Matcher, Matches
 from jaxsfm.bench.methods import PAIR_METHODS
-from jaxsfm.bench.options import TurnsOptions
+from jaxsfm.bench.pair_options import TurnsOptions
 from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.io.images import ImageFile, read_image
 from jaxsfm.matching.pipeline import open_images

@@ -11,14 +11,12 @@ from jaxsfm.bench.model_options import (
     SequenceOptions,
     StrechaOptions,
 )
-from jaxsfm.bench.options import (
-    BenchOptions,
+from jaxsfm.bench.options import BenchOptions, PlanesOptions, RecallOptions, WarpsOptions
+from jaxsfm.bench.pair_options import (
     ConfidenceOptions,
     HomographyOptions,
-    PlanesOptions,
-    RecallOptions,
+    PosesOptions,
     TurnsOptions,
-    WarpsOptions,
     WxbsOptions,
 )
 from jaxsfm.cli.run_commands import check_writable
@@ -177,3 +175,14 @@ def confidence(bench: Unnamed[ConfidenceOptions]) -> int:
 
     check_writable(bench.diagram, "--diagram", (".png",))
     return _run(bench_confidence, table_lines, bench)
+
+
+def poses(bench: Unnamed[PosesOptions]) -> int:
+    """Compare relative poses from matches with known ones (ScanNet-1500, MegaDepth-1500).
+
+    For example
+        $ jaxsfm bench poses --root PHOTOS --pairs pairs_calibrated.txt --methods default
+    """
+    from jaxsfm.bench.poses import bench_poses, table_lines
+
+    return _run(bench_poses, table_lines, bench)
