@@ -66,7 +66,7 @@ class KeptRefinement(NamedTuple):
             self._write(folder, after, done and dataclasses.asdict(done))
 
         after, row = self._kept("refined", compute, [fingerprint(model), *about])
-        return after, row and figures_from_json(row)
+        return after, None if row is None else figures_from_json(row)
 
     def _write(
         self, folder: Path, model: "pycolmap.Reconstruction", figures: dict[str, Any] | None

@@ -219,3 +219,21 @@ def test_a_thinned_model_has_few_points_per_view_taken_evenly_with_their_observa
     assert len(thinned(model).tracks.points) == int(20 * 2 / per_point) < 70
     monkeypatch.setattr(module, "MAX_POINTS", 5)
     assert len(thinned(model).tracks.points) == 5
+
+
+def test_a_view_has_few_points_to_try_whether_it_observes_them_or_not(monkeypatch):
+    seen = scene([([big_wall(), poster(1)], cameras(ANGLES))]).model
+    points, views = seen.tracks.points, seen.views
+    inside = 0
+    for view in views:
+        for point in points:
+            (xy,), _ = view.project(point[None])
+            inside += bool((-0.5 < xy).all() and (xy < np.asarray(view.size) - 0.5).all())
+    monkeypatch.setattr(module, "TRIED_POINTS", len(points))
+    of_a_point = module._views_of_a_point(seen)
+    assert of_a_point == pytest.approx(inside / len(points))
+    monkeypatch.setattr(module, "TRIED_PER_VIEW", 30)
+    few = thinned(seen)
+    assert len(few.tracks.points) == int(30 * len(views) / of_a_point) < len(points)
+    tried = module._views_of_a_point(few) * len(few.tracks.points) / len(views)
+    assert tried == pytest.approx(30, rel=0.25)
