@@ -18,10 +18,9 @@ from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import describe_pixels
 from jaxsfm.sfm.two_photos.look import Look, look
 
-OCTAVES = ((1, 1), (0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1))
+OCTAVES = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1))
 """The octaves of the first and of the second photo that are matched: relative scales of 2, 1/2, 4
-and 1/4, and 1, 2 and 1/2 once more at half the size, where noise and another sensor disturb less.
-So photos that were enlarged are also matched as they are."""
+and 1/4, and 2 and 1/2 once more at half the size, where noise and another sensor disturb less."""
 LEAST_CELLS = 3
 """Coarse cells along the shorter side: one window of the coarse-to-fine step."""
 TURNED_SIZE = 800
