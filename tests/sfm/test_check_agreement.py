@@ -14,16 +14,12 @@ from wall_scene import (
     scene,
 )
 
-from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.tracks import Tracks
-from jaxsfm.sfm.check import agreement as module
 from jaxsfm.sfm.check.agreement import (
     MAX_ANGLE_DEG,
     MAX_DISTANCE_RATIO,
     MIN_COMPARED,
     Agreement,
     agreement,
-    thinned,
 )
 
 ANGLES = [-10.0, -4.0, 3.0, -7.0, 0.0, 8.0]
@@ -187,53 +183,3 @@ def test_single_failures_here_and_there_do_not_count(halves):
     assert len(chosen) > 30
     assert not agreement_of(spotted).contradicted.any()
     assert agreement_of(halves).contradicted[0, changed] > 20
-
-
-def random_tracks(points: int, views: int) -> Tracks:
-    rng = np.random.default_rng(0)
-    point, view = np.nonzero(rng.random((points, views)) < 0.5)
-    return Tracks(rng.normal(size=(points, 3)), point, view, rng.normal(size=(len(point), 2)))
-
-
-def test_a_thinned_model_has_few_points_per_view_taken_evenly_with_their_observations(monkeypatch):
-    views = scene([([big_wall()], cameras([0.0, 5.0]))]).model.views
-    model = Model(views, random_tracks(70, 2))
-    small = thinned(model, per_view=10)
-    assert len(small.tracks.points) == 10 * 2 and small.views == views
-    rows = [int(np.flatnonzero((model.tracks.points == p).all(1))[0]) for p in small.tracks.points]
-    assert set(np.diff(rows)) == {3, 4} and rows[0] < 4 and rows[-1] > 65
-    for k, row in enumerate(rows):
-        one, other = (
-            small.tracks.select(small.tracks.point == k),
-            model.tracks.select(model.tracks.point == row),
-        )
-        np.testing.assert_array_equal(one.view, other.view)
-        np.testing.assert_array_equal(one.xy, other.xy)
-    for one, other in zip(small.tracks, thinned(model, per_view=10).tracks, strict=True):
-        np.testing.assert_array_equal(one, other)
-    few = Model(views, random_tracks(20, 2))
-    assert thinned(few, per_view=10) is few
-    assert thinned(model) is model
-    monkeypatch.setattr(module, "OBSERVED_PER_VIEW", 20)
-    per_point = len(model.tracks.point) / 70
-    assert len(thinned(model).tracks.points) == int(20 * 2 / per_point) < 70
-    monkeypatch.setattr(module, "MAX_POINTS", 5)
-    assert len(thinned(model).tracks.points) == 5
-
-
-def test_a_view_has_few_points_to_try_whether_it_observes_them_or_not(monkeypatch):
-    seen = scene([([big_wall(), poster(1)], cameras(ANGLES))]).model
-    points, views = seen.tracks.points, seen.views
-    inside = 0
-    for view in views:
-        for point in points:
-            (xy,), _ = view.project(point[None])
-            inside += bool((-0.5 < xy).all() and (xy < np.asarray(view.size) - 0.5).all())
-    monkeypatch.setattr(module, "TRIED_POINTS", len(points))
-    of_a_point = module._views_of_a_point(seen)
-    assert of_a_point == pytest.approx(inside / len(points))
-    monkeypatch.setattr(module, "TRIED_PER_VIEW", 30)
-    few = thinned(seen)
-    assert len(few.tracks.points) == int(30 * len(views) / of_a_point) < len(points)
-    tried = module._views_of_a_point(few) * len(few.tracks.points) / len(views)
-    assert tried == pytest.approx(30, rel=0.25)

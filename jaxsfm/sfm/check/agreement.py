@@ -34,16 +34,6 @@ from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
-POINTS_PER_VIEW, MAX_POINTS = 1000, 100_000
-"""At most so many points of a model are tested, per view and in all. Each is seen by several views,
-so every view has more than these to show."""
-OBSERVED_PER_VIEW = 2500
-"""Points are tested until each view observes so many, on average. In a video each point is seen by
-many views: with 1000 points per view, the check of 50 frames of kitchen took a third longer than
-COLMAP's verification of their pairs (63 and 47 s), and with this limit a tenth less."""
-TRIED_PER_VIEW, TRIED_POINTS = 4000, 2000
-"""Points are tested until each view has so many to try, on average, whether it observes them or
-not. The average is that of so many points. In a video most points lie inside of many views."""
 OTHER_SCORE = 0.5
 """A patch shows something else if its normalised cross-correlation is lower. Patches that agree
 have at least `Refinement.min_score`. Between the two, a point is undecided."""
@@ -126,44 +116,6 @@ class _Seen(NamedTuple):
     """float64 (n, 3)."""
     shown: np.ndarray
     """bool (n, v)."""
-
-
-def thinned(model: Model, *, per_view: int = POINTS_PER_VIEW) -> Model:
-    """The model with at most `per_view` points per view and `MAX_POINTS` in all, and with at most
-    `OBSERVED_PER_VIEW` observations and `TRIED_PER_VIEW` points inside of each view, on average.
-
-    They are taken evenly by index.
-    """
-    rows = thinned_points(model, per_view=per_view)
-    if len(rows) == len(model.tracks.points):
-        return model
-    return model.with_tracks(model.tracks.select_points(rows))
-
-
-def thinned_points(model: Model, *, per_view: int = POINTS_PER_VIEW) -> np.ndarray:
-    """The points that `thinned` takes, int, ascending."""
-    count, views = len(model.tracks.points), len(model.views)
-    observed = max(len(model.tracks.point), 1)
-    enough = OBSERVED_PER_VIEW * views * count // observed
-    tried = int(TRIED_PER_VIEW * views / max(_views_of_a_point(model), 1.0))
-    most = min(per_view * views, MAX_POINTS, enough, tried)
-    return _evenly(count, most)
-
-
-def _evenly(count: int, most: int) -> np.ndarray:
-    """At most so many indices below `count`, int, ascending."""
-    return np.arange(count) if count <= most else np.arange(most) * count // most
-
-
-def _views_of_a_point(model: Model) -> float:
-    """Inside of how many views a point lies on average, whether they show it or not."""
-    points = model.tracks.points[_evenly(len(model.tracks.points), TRIED_POINTS)]
-    inside = 0
-    for view in model.views:
-        xy, _ = view.project(points)
-        with np.errstate(invalid="ignore"):  # NaN behind the camera
-            inside += int(((xy > -0.5) & (xy < np.asarray(view.size) - 0.5)).all(1).sum())
-    return inside / max(len(points), 1)
 
 
 def agreement(

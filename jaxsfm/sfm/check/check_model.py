@@ -9,11 +9,12 @@ from typing import NamedTuple
 from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.check.agreement import Agreement, agreement, thinned
+from jaxsfm.sfm.check.agreement import Agreement, agreement
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, parts, share
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.check.other_places import Refused, other_places
 from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
+from jaxsfm.sfm.check.thinning import thinned
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 

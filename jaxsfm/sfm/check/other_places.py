@@ -15,9 +15,10 @@ from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.check.agreement import agreement, thinned_points
+from jaxsfm.sfm.check.agreement import agreement
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import OtherPlace
+from jaxsfm.sfm.check.thinning import thinned_points
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.refine.track_alignment import may_show
