@@ -48,7 +48,10 @@ LONG = (
         f"jaxsfm.bench.{name}.bench_{name}"
         for name in ("strecha", "daynight", "ambiguous", "sequence", "recall", "wxbs")
     ),
-    *(f"jaxsfm.bench.{name}.bench_{name}" for name in ("homography", "planes", "warps")),
+    *(
+        f"jaxsfm.bench.{name}.bench_{name}"
+        for name in ("homography", "planes", "warps", "turns", "confidence", "poses")
+    ),
 )
 FENCED = re.compile(r"^```(?:bash|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 IN_FENCE = re.compile(r"^(?: {4}\$ |\$ |)(jaxsfm [a-z-].*)$", re.MULTILINE)

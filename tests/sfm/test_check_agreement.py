@@ -14,6 +14,7 @@ from wall_scene import (
     scene,
 )
 
+from jaxsfm.sfm.check import agreement as module
 from jaxsfm.sfm.check.agreement import (
     MAX_ANGLE_DEG,
     MAX_DISTANCE_RATIO,
