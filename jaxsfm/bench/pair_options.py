@@ -39,7 +39,7 @@ class PairOptions(NetworkOptions, SeedOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class WxbsOptions(SetOptions, PairOptions):
+class WxbsOptions(PairOptions, SetOptions):
     """Options of `bench wxbs`.
 
     Attributes:
@@ -56,7 +56,7 @@ class WxbsOptions(SetOptions, PairOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class HomographyOptions(SetOptions, PairOptions):
+class HomographyOptions(PairOptions, SetOptions):
     """Options of `bench homography`.
 
     Attributes:
@@ -68,7 +68,7 @@ class HomographyOptions(SetOptions, PairOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TurnsOptions(SetOptions, PairOptions):
+class TurnsOptions(PairOptions, SetOptions):
     """Options of `bench turns`.
 
     Attributes:
@@ -126,7 +126,7 @@ class TurnsOptions(SetOptions, PairOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ConfidenceOptions(SetOptions, PairOptions):
+class ConfidenceOptions(PairOptions, SetOptions):
     """Options of `bench confidence`.
 
     Attributes:

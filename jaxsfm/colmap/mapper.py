@@ -171,15 +171,15 @@ def first_models(
     *,
     names: Sequence[str] = (),
     on_image: Callable[[], None] = lambda: None,
-    run: MapperRun = run_mapper,
+    run: MapperRun | None = None,
 ) -> Mapped:
     """Run the mapper once; see `build_models`.
 
     Args:
       names: of the images that the incremental mapper may use; by default all.
-      run: runs the mapper, or gives what an earlier run gave.
+      run: runs the mapper, or gives what an earlier run gave; None: `run_mapper`.
     """
-    models = run(database, options, Start(names=names), on_image)
+    models = (run or run_mapper)(database, options, Start(names=names), on_image)
     return Mapped(models, [_attempt(options.mapper, None, models)])
 
 
@@ -190,7 +190,7 @@ def with_left_out_images(
     options: MapOptions,
     *,
     on_image: Callable[[], None] = lambda: None,
-    run: MapperRun = run_mapper,
+    run: MapperRun | None = None,
 ) -> Mapped:
     """Start the mapper again if its first run found no model or left out connected images.
 
@@ -202,7 +202,7 @@ def with_left_out_images(
     images replaces the former ones, except for models of other images.
 
     Args:
-      run: runs the mapper, or gives what an earlier run gave.
+      run: runs the mapper, or gives what an earlier run gave; None: `run_mapper`.
 
     Returns:
       `first` itself if nothing was tried.
@@ -210,6 +210,7 @@ def with_left_out_images(
     Raises:
       UserError: COLMAP failed.
     """
+    run = run or run_mapper
     models, attempts = first.models, list(first.attempts)
     pairs = sorted(two_views)
     if options.mapper == "incremental":

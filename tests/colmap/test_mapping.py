@@ -62,14 +62,14 @@ def model(names: str, points=10) -> Model:
 
 
 def runs(monkeypatch, outcomes):
-    """`_run` gives these outcomes in turn; the (mapper, initial pair) of every call are kept."""
+    """`run_mapper` gives these outcomes in turn; the (mapper, pair) of every call are kept."""
     calls, left = [], list(outcomes)
 
-    def run(database, options, initial, on_image, names=()):
-        calls.append((options.mapper, initial))
+    def run(database, options, start, on_image):
+        calls.append((options.mapper, start.pair))
         return left.pop(0)
 
-    monkeypatch.setattr(mapper, "_run", run)
+    monkeypatch.setattr(mapper, "run_mapper", run)
     return calls
 
 
@@ -102,11 +102,11 @@ def test_connected_images_left_out_are_tried_from_other_pairs_and_the_best_count
 def test_after_a_draft_the_whole_run_is_tried_before_other_pairs(monkeypatch, tmp_path):
     drafts, left = [], [[model("ab")], [model("abc")], [model("abcdef")], [model("ab")]]
 
-    def run(database, options, initial, on_image, names=()):
-        drafts.append((options.draft, initial))
+    def run(database, options, start, on_image):
+        drafts.append((options.draft, start.pair))
         return left.pop(0)
 
-    monkeypatch.setattr(mapper, "_run", run)
+    monkeypatch.setattr(mapper, "run_mapper", run)
     draft = dataclasses.replace(ONE, draft=True)
     models, attempts = build_models(tmp_path / "d.db", PAIRS, draft)
     assert drafts == [(True, None), (False, None), (False, ("a", "b"))]

@@ -30,6 +30,7 @@ from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import plane_affines
+from jaxsfm.sfm.refine.one_pass import run_pass
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.track_alignment import neighbourhoods
 
@@ -185,23 +186,19 @@ def test_all_points_return_before_the_last_pass(rendered):
 
 
 @pytest.mark.parametrize("returned", [False, True])
-def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(
-    rendered, monkeypatch, returned
-):
-    from jaxsfm.sfm.refine import passes
-
-    run, seen = passes.run_pass, []
+def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(rendered, returned):
+    seen = []
 
     def recorded(before, images, px, limits, settings):
         seen.append(limits.max_shift_px)
-        return run(before, images, px, limits, settings)
+        return run_pass(before, images, px, limits, settings)
 
-    monkeypatch.setattr(passes, "run_pass", recorded)
     refine_model(
         noisy_model(rendered, 0.7),
         read_of(rendered),
         settings_of(passes=3, max_shift_px=4.0),
         with_all_points=(lambda model: model) if returned else None,
+        run=recorded,
     )
     assert seen == [4.0, 2.0, 4.0 if returned else 2.0]
 
@@ -209,27 +206,25 @@ def test_keypoints_may_move_less_in_later_passes_unless_new_points_have_come(
 @pytest.mark.parametrize(
     ("described_px", "sizes"), [(1, [1, 1]), (2, [2, 2, 1]), (4, [4, 4, 2, 1])]
 )
-def test_passes_begin_at_the_size_of_the_descriptions(rendered, monkeypatch, described_px, sizes):
+def test_passes_begin_at_the_size_of_the_descriptions(rendered, described_px, sizes):
     """The points return before the last of the two passes at this size."""
-    from jaxsfm.sfm.refine import passes
-
-    run, seen, returned = passes.run_pass, [], []
+    seen, returned = [], []
 
     def recorded(before, images, px, limits, settings):
         seen.append((px, limits.max_shift_px))
-        return run(before, images, px, limits, settings)
+        return run_pass(before, images, px, limits, settings)
 
     def with_all_points(model):
         returned.append(len(seen))
         return model
 
-    monkeypatch.setattr(passes, "run_pass", recorded)
     refine_model(
         noisy_model(rendered, 0.7),
         read_of(rendered),
         settings_of(),
         with_all_points=with_all_points,
         described_px=described_px,
+        run=recorded,
     )
     assert [px for px, _ in seen] == sizes and returned == [1]
     assert [shift for _, shift in seen] == [4.0, 4.0, *[2.0] * (len(sizes) - 2)]

@@ -31,9 +31,10 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.sfm.evaluation import evaluate
-from jaxsfm.sfm.refine import one_pass, passes, plane_geometry, weak_views
+from jaxsfm.sfm.refine import one_pass, plane_geometry, weak_views
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, matched_points
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
+from jaxsfm.sfm.refine.one_pass import run_pass
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
@@ -394,20 +395,19 @@ def test_a_shared_camera_is_no_views_own(monkeypatch, rendered, own):
     assert not followed[-1].own_camera
 
 
-def test_a_doubtful_view_is_placed_again_and_one_pass_more_follows(rendered, monkeypatch):
+def test_a_doubtful_view_is_placed_again_and_one_pass_more_follows(rendered):
     """The mapper's pose is wrong, but as many observations agree as it had."""
-    run, calls = passes.run_pass, []
+    calls = []
 
     def doubting(before, images, px, limits, settings):
         calls.append((px, night_error(before.reconstruction, rendered)[1]))
-        after, done = run(before, images, px, limits, settings)
+        after, done = run_pass(before, images, px, limits, settings)
         if len(calls) > 2:
             return after, done
         return before, dataclasses.replace(done, weak_views=[], doubtful_views=[NIGHT_NAME])
 
-    monkeypatch.setattr(passes, "run_pass", doubting)
     before = lost_view(rendered, turn_deg=2.0)
-    after, figures = refine_model(before, read_of(rendered), settings_of())
+    after, figures = refine_model(before, read_of(rendered), settings_of(), run=doubting)
     turned = [error > 1.9 for _, error in calls]
     assert turned == [True, True, False] and [px for px, _ in calls] == [1, 1, 1]
     assert max(night_error(after, rendered)) < 0.03

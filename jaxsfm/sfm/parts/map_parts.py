@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import Attempt, Mapped, MapperRun, first_models, run_mapper
+from jaxsfm.colmap.mapper import Attempt, Mapped, MapperRun, first_models
 from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.colmap.model_images import ordered, registered
 from jaxsfm.io.pairs import Pair
@@ -43,7 +43,7 @@ def map_in_parts(
     options: MapOptions,
     *,
     on_image: Callable[[], None] = lambda: None,
-    run: MapperRun = run_mapper,
+    run: MapperRun | None = None,
 ) -> Mapped | None:
     """Map the photos of a verified database in parts, and join the models of the parts.
 
@@ -51,7 +51,7 @@ def map_in_parts(
       database: with the verified pairs.
       matches: the number of verified matches of each pair in it.
       on_image: called for every image that the mapper registers.
-      run: runs the mapper, or gives what an earlier run gave.
+      run: runs the mapper, or gives what an earlier run gave; None: `run_mapper`.
 
     Returns:
       the models; None if the parts do not give one model of nearly all their photos.
