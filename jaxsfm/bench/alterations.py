@@ -2,12 +2,16 @@
 night."""
 
 import dataclasses
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from jaxsfm.bench.inputs import usable_image
 from jaxsfm.bench.night import synthetic_night
+from jaxsfm.bench.synthetic import write_photo
+from jaxsfm.io.images import ImageFile
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,6 +51,11 @@ class Altered(NamedTuple):
     def pixel(self) -> float:
         """The side of its pixels, pixels of the photo as it was."""
         return float(np.sqrt(abs(np.linalg.det(self.to_original[:2, :2]))))
+
+    def written(self, path: Path) -> ImageFile:
+        """The photo in a file, which is written."""
+        write_photo(path, self.rgb)
+        return usable_image(path)
 
 
 def alter(rgb: np.ndarray, alteration: Alteration, *, seed: int = 0) -> Altered:

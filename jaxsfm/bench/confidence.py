@@ -27,7 +27,6 @@ from jaxsfm.bench.reliability import (
     write_diagram,
 )
 from jaxsfm.bench.strecha_sets import read_sets
-from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.bench.wxbs import HALVES, half_of
 from jaxsfm.config import PRESETS
 from jaxsfm.io.images import read_image
@@ -97,9 +96,8 @@ def _rows(
         rgb = read_image(original, max_size=max(original.size)).rgb
         altered = alter(rgb, pair.alteration, seed=zlib.crc32(pair.name.encode()))
         with TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-            path = Path(scratch) / "second.png"
-            write_photo(path, altered.rgb)
-            photos = usable_image(pair.first.path, name="first"), usable_image(path)
+            second = altered.written(Path(scratch) / "second.png")
+            photos = usable_image(pair.first.path, name="first"), second
             for method in methods:
                 for run in matcher.match(*photos, method):
                     yield _row(pair, method, run, pair.near_share(altered, run))

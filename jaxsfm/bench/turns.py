@@ -4,7 +4,6 @@ The place of every pixel in the copy is known. The figure is the share of the ma
 within 3 pixels of it.
 """
 
-import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,11 +13,10 @@ import numpy as np
 
 from jaxsfm.bench.alterations import Alteration, Altered, alter
 from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, table
-from jaxsfm.bench.inputs import choose_sets, usable_image
+from jaxsfm.bench.inputs import choose_sets
 from jaxsfm.bench.matches import Matcher, Matches
 from jaxsfm.bench.methods import PAIR_METHODS
 from jaxsfm.bench.pair_options import TurnsOptions
-from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.io.images import ImageFile, read_image
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.sfm.two_photos.common_view import mapped
@@ -101,18 +99,13 @@ def _rows(
             for quarters in options.chosen_quarters():
                 with TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
                     both = copies(rgb, quarters, scale)
-                    photo, copy = map(
-                        functools.partial(_written, Path(scratch)), both, both._fields
+                    photo, copy = (
+                        each.written(Path(scratch) / f"{name}.png")
+                        for name, each in both._asdict().items()
                     )
                     for method in methods:
                         runs = matcher.match(photo, copy, method)
                         yield _row(image.name, quarters, scale, method, both, runs)
-
-
-def _written(folder: Path, altered: Altered, name: str) -> ImageFile:
-    path = folder / f"{name}.png"
-    write_photo(path, altered.rgb)
-    return usable_image(path)
 
 
 def _row(

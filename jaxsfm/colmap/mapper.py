@@ -91,6 +91,7 @@ class Start(NamedTuple):
 
 
 USUAL_START = Start()
+"""From a pair of the mapper's own choice, with all images."""
 
 
 def run_mapper(

@@ -37,8 +37,9 @@ def thinned_points(model: Model, *, per_view: int = POINTS_PER_VIEW) -> np.ndarr
     count, views = len(model.tracks.points), len(model.views)
     observed = max(len(model.tracks.point), 1)
     enough = OBSERVED_PER_VIEW * views * count // observed
-    tried = int(TRIED_PER_VIEW * views / max(_views_of_a_point(model), 1.0))
-    most = min(per_view * views, MAX_POINTS, enough, tried)
+    most = min(per_view * views, MAX_POINTS, enough)
+    if min(count, most) > TRIED_PER_VIEW:  # fewer points cannot be too many in any view
+        most = min(most, int(TRIED_PER_VIEW * views / max(_views_of_a_point(model), 1.0)))
     return _evenly(count, most)
 
 

@@ -55,7 +55,11 @@ def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
     )
 
 
-def with_progress(on_pass: Callable[[], None], run: "PassRun" = run_pass) -> "PassRun":
+PassRun = Callable[[Refined, DeviceImages, int, AlignmentLimits, PassSettings], PassOutcome]
+"""What `run_pass` does."""
+
+
+def with_progress(on_pass: Callable[[], None], run: PassRun = run_pass) -> PassRun:
     """`run`, and a call after each pass."""
 
     def told(*given: Any) -> PassOutcome:
@@ -64,10 +68,6 @@ def with_progress(on_pass: Callable[[], None], run: "PassRun" = run_pass) -> "Pa
         return done
 
     return told
-
-
-PassRun = Callable[[Refined, DeviceImages, int, AlignmentLimits, PassSettings], PassOutcome]
-"""What `run_pass` does."""
 
 
 def _as_arrays(reconstruction: "pycolmap.Reconstruction", sizes: Sizes) -> Refined:
