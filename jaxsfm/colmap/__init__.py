@@ -6,3 +6,8 @@ heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even 
 """
 
 import cv2  # noqa: F401  must precede pycolmap, see above
+import pycolmap  # noqa: F401  here, so that signals are noted again right after it
+
+from jaxsfm.io import interrupt
+
+interrupt.note_again()

@@ -1,8 +1,9 @@
-"""An interrupt (Ctrl-C) is noted, so that it cannot get lost; loops look for it between items.
+"""An interrupt is noted, so that it cannot get lost; loops look for it between items.
 
-Python raises KeyboardInterrupt in whatever code is running. If that is a callback of native code,
-the exception may be swallowed: JAX's hook in the garbage collector did so in a test, and the run
-went on to its end.
+An interrupt is Ctrl-C (SIGINT) or SIGTERM, which `kill`, `timeout` and cluster schedulers send. Both
+raise KeyboardInterrupt in whatever Python code is running. If that is a callback of native code, the
+exception may be swallowed: JAX's hook in the garbage collector did so in a test, and the run went on
+to its end.
 """
 
 import contextlib
@@ -11,7 +12,9 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-_pending = threading.Event()
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+_pending, _noting = threading.Event(), threading.Event()
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
@@ -19,25 +22,44 @@ def _handle(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def _in_main_thread() -> bool:
+    """Only there does Python allow signal handlers."""
+    return threading.current_thread() is threading.main_thread()
+
+
 @contextlib.contextmanager
 def noted() -> Iterator[None]:
-    """Note every Ctrl-C while the block runs, so that `check` finds it.
+    """Note every interrupt while the block runs, so that `check` finds it.
 
-    This does nothing outside the main thread, where Python allows no signal handlers.
+    This does nothing outside the main thread.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if not _in_main_thread():
         yield
         return
     _pending.clear()
-    previous = signal.signal(signal.SIGINT, _handle)
+    previous = {number: signal.signal(number, _handle) for number in SIGNALS}
+    _noting.set()
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        _noting.clear()
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def note_again() -> None:
+    """Take the signals back from a library that was imported while interrupts are noted.
+
+    pycolmap handles SIGTERM by a stack trace and the end of the process. Outside of `noted` this
+    does nothing.
+    """
+    if _noting.is_set() and _in_main_thread():
+        for number in SIGNALS:
+            signal.signal(number, _handle)
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt if Ctrl-C was noted and the exception has not arrived."""
+    """Raise KeyboardInterrupt if an interrupt was noted and the exception has not arrived."""
     if _pending.is_set():
         _pending.clear()
         raise KeyboardInterrupt
