@@ -74,9 +74,10 @@ class Measured(NamedTuple):
 
 def device_rates() -> Rates:
     """Matrix products and memory of the default device."""
-    a = jnp.zeros(STREAM_ENTRIES, jnp.float32)
-    # A larger product, so that starting it takes no time in comparison.
-    side = SIDE if jax.default_backend() == "cpu" else 8192
+    # An accelerator gets larger arrays, so that starting the work takes no time in comparison.
+    cpu = jax.default_backend() == "cpu"
+    side, entries = (SIDE, STREAM_ENTRIES) if cpu else (8192, 8 * STREAM_ENTRIES)
+    a = jnp.zeros(entries, jnp.float32)
     float32, bfloat16 = matrix_product(side), matrix_product(side, "bfloat16")
     *times, stream = timed(float32.compute, bfloat16.compute, lambda: add_one(a))
     rates = [float32.operations / median(each) for each in times]
