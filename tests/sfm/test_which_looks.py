@@ -1,0 +1,113 @@
+"""Laws of the order of looks: what evidence makes a pair settled, and which looks follow otherwise."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from jaxsfm.config import preset
+from jaxsfm.sfm.two_photos import matched
+
+FEATURES: Any = SimpleNamespace(image="photo")
+
+
+def fake(evidence: float, inliers: int = 0, tentative: int = 0) -> Any:
+    """A look with this evidence, which is where the next one looks."""
+    counts = SimpleNamespace(num_inliers=inliers, num_tentative=tentative)
+    return SimpleNamespace(evidence=evidence, result=counts, located=lambda *_: evidence)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "share", "settled"),
+    [
+        (401, 0.01, True),
+        (399, 0.01, False),
+        (61, 0.21, True),
+        (61, 0.19, False),
+        (59, 0.9, False),
+    ],
+)
+def test_a_pair_is_settled_by_evidence_or_by_a_large_share_that_is_likely_right(
+    evidence, share, settled
+):
+    assert (
+        matched.is_settled(fake(evidence, inliers=round(1000 * share), tentative=1000)) == settled
+    )
+
+
+def test_a_pair_without_matches_is_not_settled():
+    assert not matched.is_settled(fake(0.0))
+
+
+@pytest.fixture
+def steps(monkeypatch):
+    """The looks that are taken, by name; all of them find what `found` says, or nothing."""
+    found: dict[str, list[float]] = {}
+    log: list[str] = []
+
+    def taken(name: str) -> list[Any]:
+        log.append(name)
+        return [fake(found[name].pop(0))] if found.get(name) else []
+
+    def one(name: str) -> Any:
+        return (taken(name) or [fake(0.0)])[0]
+
+    def closer(_, __, located: object, *, size: int, **___: object) -> Any:
+        name = "proposed" if size == matched.SMALL_SIZE else "closer"
+        return (taken(name) or [None])[0]
+
+    monkeypatch.setattr(matched, "image_features", lambda *_, **__: FEATURES)
+    monkeypatch.setattr(matched, "look", lambda *_, **__: one("enlarged"))
+    monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: taken("scales"))
+    monkeypatch.setattr(matched, "turned", lambda *_, **__: taken("turned"))
+    monkeypatch.setattr(matched, "proposals", lambda *_: ["a proposal"])
+    monkeypatch.setattr(matched, "closer_look", closer)
+
+    def looks(first: float, name: str = "default", **finds: list[float]) -> list[str]:
+        log.clear()
+        found.clear()
+        found.update(finds)
+        weights: Any = None
+        matched._look_closer(
+            weights, (FEATURES, FEATURES), [fake(first)], config=preset(name), seed=0
+        )
+        return list(log)
+
+    return looks
+
+
+def test_a_strong_look_is_followed_by_closer_ones_at_once(steps):
+    assert steps(151, closer=[200]) == ["closer", "closer"]
+    assert steps(149)[:3] == ["enlarged", "scales", "proposed"]
+
+
+def test_what_makes_a_pair_sure_ends_the_search(steps):
+    assert steps(60, enlarged=[151]) == ["enlarged", "scales", "closer"]
+    assert "proposed" in steps(60, enlarged=[149])
+
+
+def test_photos_that_are_enlarged_already_are_not_enlarged_again(steps):
+    assert steps(60, name="robust")[0] == "proposed"
+
+
+def test_photos_are_turned_only_if_nothing_was_found(steps):
+    assert "turned" in steps(20, proposed=[49])
+    assert "turned" not in steps(20, proposed=[51])
+
+
+def test_no_closer_look_follows_a_look_without_hope(steps):
+    assert "closer" in steps(16)
+    assert "closer" not in steps(14)
+    assert "closer" in steps(2, turned=[16])
+
+
+def test_closer_looks_end_when_one_is_not_stronger(steps):
+    assert preset("default").closer_looks == 2
+    assert steps(200, closer=[300, 400, 500]) == ["closer", "closer"]
+    assert steps(200, closer=[200, 400]) == ["closer"]
+    assert steps(200) == ["closer"]
+
+
+def test_confidence_is_half_at_the_evidence_of_a_pair_that_may_be_right_or_wrong():
+    assert matched.confidence(60) == pytest.approx(0.5)
+    assert matched.confidence(75) == pytest.approx(1 / (1 + 2.718281828**-1))
