@@ -117,8 +117,8 @@ def main(argv: list[str] | None = None) -> int:
 
     Returns:
       The exit status: 0 for success, 1 for a command that found no solution, 2 for arguments or
-      files that cannot be used, 3 for a model that may be wrong (`reconstruct`), 130 after Ctrl-C or
-      SIGTERM.
+      files that cannot be used, 3 for a model that may be wrong (`reconstruct`), 130 after Ctrl-C
+      or SIGTERM.
     """
     if (sys.argv[1:] if argv is None else argv) == ["--version"]:
         print("\n".join(version_lines()))

@@ -1,9 +1,9 @@
 """An interrupt is noted, so that it cannot get lost; loops look for it between items.
 
-An interrupt is Ctrl-C (SIGINT) or SIGTERM, which `kill`, `timeout` and cluster schedulers send. Both
-raise KeyboardInterrupt in whatever Python code is running. If that is a callback of native code, the
-exception may be swallowed: JAX's hook in the garbage collector did so in a test, and the run went on
-to its end.
+An interrupt is Ctrl-C (SIGINT) or SIGTERM, which `kill`, `timeout` and cluster schedulers send.
+Both raise KeyboardInterrupt in whatever Python code is running. If that is a callback of native
+code, the exception may be swallowed: JAX's hook in the garbage collector did so in a test, and the
+run went on to its end.
 """
 
 import contextlib

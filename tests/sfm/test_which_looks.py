@@ -1,4 +1,4 @@
-"""Laws of the order of looks: what evidence makes a pair settled, and which looks follow otherwise."""
+"""Laws of the order of looks: what evidence settles a pair, and which looks follow otherwise."""
 
 from types import SimpleNamespace
 from typing import Any
