@@ -33,6 +33,7 @@ EXTRACTED_BY = (
 
 LATER_SETTINGS = (
     "first_look",
+    "first_look_share",
     "aligned_octaves",
     "closer_looks",
     "view_graph",
@@ -114,6 +115,9 @@ class Config:
     photos. Only those photos that this leaves without a place are described again at `max_size`
     (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None, or without a
     refinement: photos are described at `max_size` from the beginning."""
+    first_look_share: float = 1.0
+    """The first look has at most this share of the median photo's longer side, so that small photos
+    are reduced as well."""
     octaves: int = 1
     """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
@@ -182,11 +186,18 @@ class Config:
             del parts[later]
         return parts
 
-    def of_first_look(self) -> "Config":
-        """The settings of a run's first look; these settings if there is none."""
+    def of_first_look(self, median: float) -> "Config":
+        """The settings of a run's first look; these settings if there is none.
+
+        Args:
+          median: the median of the longer sides of the working images, pixels.
+        """
         size = self.max_size
         if self.first_look is not None and self.refinement is not None:
             size = min(self.first_look, size)
+            if self.first_look_share < 1:
+                steps = int(self.first_look_share * median / FIRST_LOOK_STEP)
+                size = min(size, max(steps * FIRST_LOOK_STEP, LEAST_FIRST_LOOK))
         return dataclasses.replace(self, max_size=size, first_look=None)
 
     def __post_init__(self) -> None:
@@ -196,6 +207,8 @@ class Config:
             raise ValueError(
                 f"first_look must be at least {MIN_SIDE} pixels; got {self.first_look}"
             )
+        if not 0 < self.first_look_share <= 1:
+            raise ValueError(f"first_look_share must lie in (0, 1]; got {self.first_look_share}")
         if not self.enlarge >= 1:
             raise ValueError(f"enlarge must be at least 1; got {self.enlarge}")
         if self.closer_looks < 0:
@@ -238,11 +251,16 @@ class Config:
 MIN_SIDE = 48
 """Shortest usable side, pixels: three coarse cells, one window of the coarse-to-fine step."""
 
+LEAST_FIRST_LOOK, FIRST_LOOK_STEP = 480, 80
+"""By its share, a first look is never smaller than the first number, and always a multiple of the
+second one, pixels. So a few photos more seldom change its size, and matches are used again."""
+
 MAX_OCTAVES = 4
 """Largest number of octaves. At an eighth of 1600 px there are only 12 x 9 coarse cells left."""
 
 _DEFAULT = Config(
     first_look=800,
+    first_look_share=0.625,
     octaves=4,
     centred=True,
     pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
@@ -265,7 +283,7 @@ PRESETS: dict[str, Config] = {
 """The named presets.
 
 - `paper` has the constants of the authors' code.
-- `default` first describes the photos of a run at half the size. It adds octaves, centred
+- `default` first describes the photos of a run at about half the size. It adds octaves, centred
   descriptors and neighbourhood consensus (for night, seasons and weather), repeated local refits
   (one refit leaves up to a fifth of a plane's inliers behind, tests/core/test_ransac.py), planes
   that compete, the most similar of several matches of a cell, aligned matches of single pairs, the

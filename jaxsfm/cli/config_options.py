@@ -81,7 +81,8 @@ class ModelChoice(MatchingChoice):
         switches it off. Without it, as many as the preset says.
       first_look: Longer side, in pixels, at which photos are described and matched first. Photos
         that find no place in this way are looked at again at --max-size. 0, or --refine 0,
-        describes all photos at --max-size. Without it, as the preset says.
+        describes all photos at --max-size. Without it, as the preset says: default takes 800, but
+        at most five eighths of the median photo.
     """
 
     view_graph: Literal["preset", "yes", "no"] = "preset"
@@ -98,5 +99,6 @@ class ModelChoice(MatchingChoice):
             passes = Refinement(passes=self.refine) if self.refine else None
             config = dataclasses.replace(config, refinement=passes)
         if self.first_look is not None:
-            config = dataclasses.replace(config, first_look=self.first_look or None)
+            asked = self.first_look or None
+            config = dataclasses.replace(config, first_look=asked, first_look_share=1.0)
         return config

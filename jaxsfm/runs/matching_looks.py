@@ -51,13 +51,16 @@ class MatchedPairs(NamedTuple):
 
 def first_look(config: Config, images: Collection[ImageFile]) -> Config | None:
     """The settings of the first look; None if it would hardly be smaller than the second one."""
-    first = config.of_first_look()
 
-    def side(image: ImageFile, at: Config) -> int:
-        return max(working_size(image.size, at.max_size, at.enlarge))
+    def median(at: Config) -> int:
+        sides = sorted(max(working_size(each.size, at.max_size, at.enlarge)) for each in images)
+        return sides[len(sides) // 2]
 
-    ratios = sorted(side(image, config) / side(image, first) for image in images)
-    return first if ratios and ratios[len(ratios) // 2] >= WORTH else None
+    if not images:
+        return None
+    full = median(config)
+    first = config.of_first_look(full)
+    return first if full / median(first) >= WORTH else None
 
 
 def job_of_look(job: Job, identity: RunIdentity, config: Config) -> Job:

@@ -13,6 +13,7 @@ PAPER = {
     # What the paper and the authors' code say: section numbers are the paper's.
     "max_size": 1600,  # longer side, pixels; section 4
     "first_look": None,  # photos are described at one size
+    "first_look_share": 1.0,
     "layers": "pool4/pool3",  # conv4 and conv3 in the paper
     "keypoints": "relocalized",  # section 3.2
     "children": 2,  # K
@@ -66,6 +67,7 @@ REFINEMENT = {
 }
 DEFAULT = PAPER | {
     "first_look": 800,
+    "first_look_share": 0.625,
     "octaves": 4,
     "centred": True,
     "aligned_octaves": 4,
@@ -101,15 +103,25 @@ def test_there_are_three_presets_and_others_are_refused_by_name():
 
 def test_the_first_look_is_smaller_and_only_where_a_refinement_follows():
     default = preset("default")
-    assert default.of_first_look() == dataclasses.replace(default, max_size=800, first_look=None)
-    for changes, size in (
-        ({"max_size": 600}, 600),
-        ({"refinement": None}, 1600),
-        ({"first_look": None}, 1600),
-        ({"first_look": 2000}, 1600),
+    for changes, median, size in (
+        ({}, 1600, 800),
+        ({}, 1280, 800),
+        ({}, 1279, 720),
+        ({}, 1024, 640),
+        ({}, 768, 480),
+        ({}, 640, 480),
+        ({}, 500, 480),
+        ({"first_look": 300}, 640, 300),
+        ({"first_look_share": 1.0}, 640, 800),
+        ({"max_size": 600}, 600, 480),
+        ({"max_size": 300}, 300, 300),
+        ({"refinement": None}, 1600, 1600),
+        ({"first_look": None}, 1600, 1600),
+        ({"first_look": 2000, "first_look_share": 1.0}, 1600, 1600),
     ):
         config = dataclasses.replace(default, **changes)
-        assert config.of_first_look() == dataclasses.replace(config, max_size=size, first_look=None)
+        expected = dataclasses.replace(config, max_size=size, first_look=None)
+        assert config.of_first_look(median) == expected, (changes, median)
     # The matches of the second look are those of a run without a first one.
     assert default.matching() == dataclasses.replace(default, first_look=None).matching()
 
@@ -151,6 +163,8 @@ def test_a_pair_shape_needs_room_for_correspondences():
     [
         ("max_size", 48, 47),
         ("first_look", 48, 47),
+        ("first_look_share", 1.0, 1.01),
+        ("first_look_share", 0.01, 0.0),
         ("enlarge", 1.0, 0.99),
         ("octaves", 1, 0),
         ("octaves", 4, 5),

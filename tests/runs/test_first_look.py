@@ -1,0 +1,48 @@
+"""Laws of the size of the first look."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from jaxsfm.config import preset
+from jaxsfm.io.images import ImageFile
+from jaxsfm.runs.matching_looks import first_look
+
+DEFAULT = preset("default")
+
+
+def photos(*sides: int) -> list[ImageFile]:
+    """Photos with these longer sides."""
+    path = Path("a.png")
+    return [ImageFile(name="a", path=path, size=(side, 100), sha256="") for side in sides]
+
+
+@pytest.mark.parametrize(
+    ("sides", "size"),
+    [
+        ([4000], 800),
+        ([1000], 560),
+        ([640], 480),
+        ([600], 480),
+        ([599], None),  # reduced by less than a fifth
+        ([200], None),
+        ([640, 640, 4000], 480),
+        ([640, 4000, 4000], 800),
+        ([], None),
+    ],
+)
+def test_the_median_photo_is_reduced_or_there_is_no_first_look(sides, size):
+    found = first_look(DEFAULT, photos(*sides))
+    assert (found and found.max_size) == size
+
+
+def test_a_size_that_was_asked_for_is_taken():
+    asked = dataclasses.replace(DEFAULT, first_look=300, first_look_share=1.0)
+    found = first_look(asked, photos(640))
+    assert found is not None and found.max_size == 300
+    assert first_look(dataclasses.replace(asked, first_look=600), photos(640)) is None
+
+
+def test_robust_describes_photos_at_full_size():
+    assert first_look(preset("robust"), photos(4000)) is None
