@@ -116,8 +116,8 @@ class Config:
     (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None, or without a
     refinement: photos are described at `max_size` from the beginning."""
     first_look_share: float = 1.0
-    """The first look has at most this share of the median photo's longer side, so that small photos
-    are reduced as well."""
+    """Where `first_look` would hardly reduce the median photo, the first look has this share of its
+    longer side, so that small photos are reduced as well."""
     octaves: int = 1
     """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
@@ -195,7 +195,7 @@ class Config:
         size = self.max_size
         if self.first_look is not None and self.refinement is not None:
             size = min(self.first_look, size)
-            if self.first_look_share < 1:
+            if self.first_look_share < 1 and median < WORTH * size:
                 steps = int(self.first_look_share * median / FIRST_LOOK_STEP)
                 size = min(size, max(steps * FIRST_LOOK_STEP, LEAST_FIRST_LOOK))
         return dataclasses.replace(self, max_size=size, first_look=None)
@@ -251,6 +251,8 @@ class Config:
 MIN_SIDE = 48
 """Shortest usable side, pixels: three coarse cells, one window of the coarse-to-fine step."""
 
+WORTH = 1.25
+"""A first look is not worth its time if the median photo is reduced less than by this factor."""
 LEAST_FIRST_LOOK, FIRST_LOOK_STEP = 480, 80
 """By its share, a first look is never smaller than the first number, and always a multiple of the
 second one, pixels. So a few photos more seldom change its size, and matches are used again."""

@@ -81,8 +81,8 @@ class ModelChoice(MatchingChoice):
         switches it off. Without it, as many as the preset says.
       first_look: Longer side, in pixels, at which photos are described and matched first. Photos
         that find no place in this way are looked at again at --max-size. 0, or --refine 0,
-        describes all photos at --max-size. Without it, as the preset says: default takes 800, but
-        at most five eighths of the median photo.
+        describes all photos at --max-size. Without it, as the preset says: default takes 800, and
+        five eighths of the median photo if that has less than 1000 pixels.
     """
 
     view_graph: Literal["preset", "yes", "no"] = "preset"

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from jaxsfm.config import Config
+from jaxsfm.config import WORTH, Config
 from jaxsfm.io.images import ImageFile, working_size
 from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.pairs import Pair, PairCounts, best_pairs
@@ -18,9 +18,6 @@ from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.sfm.second_look import SecondLook
 
 logger = logging.getLogger("jaxsfm")
-
-WORTH = 1.25
-"""A first look is not worth its time if the median photo is reduced less than by this factor."""
 
 
 @contextmanager

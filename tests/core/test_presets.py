@@ -105,9 +105,8 @@ def test_the_first_look_is_smaller_and_only_where_a_refinement_follows():
     default = preset("default")
     for changes, median, size in (
         ({}, 1600, 800),
-        ({}, 1280, 800),
-        ({}, 1279, 720),
-        ({}, 1024, 640),
+        ({}, 1000, 800),
+        ({}, 999, 560),
         ({}, 768, 480),
         ({}, 640, 480),
         ({}, 500, 480),

@@ -22,7 +22,8 @@ def photos(*sides: int) -> list[ImageFile]:
     ("sides", "size"),
     [
         ([4000], 800),
-        ([1000], 560),
+        ([1000], 800),
+        ([999], 560),
         ([640], 480),
         ([600], 480),
         ([599], None),  # reduced by less than a fifth
