@@ -254,8 +254,8 @@ MIN_SIDE = 48
 WORTH = 1.25
 """A first look is not worth its time if the median photo is reduced less than by this factor."""
 LEAST_FIRST_LOOK, FIRST_LOOK_STEP = 480, 80
-"""By its share, a first look is never smaller than the first number, and always a multiple of the
-second one, pixels. So a few photos more seldom change its size, and matches are used again."""
+"""Pixels. By its share, a first look is not smaller than the first number. It is a multiple of the
+second one, so that a few photos more seldom change its size, and matches are used again."""
 
 MAX_OCTAVES = 4
 """Largest number of octaves. At an eighth of 1600 px there are only 12 x 9 coarse cells left."""

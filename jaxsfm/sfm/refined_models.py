@@ -15,7 +15,7 @@ from jaxsfm.colmap.model_folders import colour_points
 from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
-from jaxsfm.config import Config, Refinement
+from jaxsfm.config import WORTH, Config, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.kept_folders import Steps
@@ -168,10 +168,14 @@ def _with_one_camera(
 def described_px(ratio: float) -> int:
     """The size in which keypoints were found, as the nearest power of two of working pixels.
 
+    After a first look it is at least two, so that a pass at full size follows the others. With two
+    passes at full size instead, the demo (described at 480 px of 640) is 0.0145 instead of 0.0062
+    deg off.
+
     Args:
       ratio: working pixels per pixel of the images in which they were found, at least 1.
     """
-    return 2 ** max(0, round(math.log2(ratio)))
+    return 2 ** max(int(ratio >= WORTH), round(math.log2(ratio)))
 
 
 def _without_doubtful(
