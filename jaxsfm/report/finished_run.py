@@ -31,7 +31,7 @@ from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
 from jaxsfm.report.run_results import EvaluationReport
 from jaxsfm.report.typed_json import from_json, to_json
-from jaxsfm.sfm.evaluation import Similarity, common_alignment, evaluate
+from jaxsfm.sfm.evaluation import Similarity, common_alignment, evaluate, of_photos
 
 if TYPE_CHECKING:
     import pycolmap
@@ -180,7 +180,7 @@ def _with_reference(
     try:
         reference = read_poses(path)
         _, _, similarity = common_alignment(poses, reference)
-        evaluation = evaluation_report(poses, reference)
+        evaluation = evaluation_report(poses, of_photos(reference, report.photos()))
     except UserError as error:
         if given is not None:
             raise

@@ -108,6 +108,11 @@ class RunReport:
     extended: list[Extension] | None = field(default=None, metadata=OMITTED)
     """Calls of `jaxsfm extend` since the run."""
 
+    def photos(self) -> set[str]:
+        """The names of all photos that the run was given, those that it could not use included."""
+        placed = (name for model in self.models for name in model.images)
+        return {*self.identity.images, *self.images.skipped, *placed}
+
     @property
     def in_metres(self) -> bool:
         """Whether the best model was moved into metres."""

@@ -170,7 +170,7 @@ class EvaluationReport:
     registered: Count
     """Photos of the reference with a pose in the model."""
     reference_images: Count
-    """All photos of the reference."""
+    """All photos of the reference; of a run, those that it was given."""
     aligned_on: Count
     """Photos whose camera centres the model was aligned on."""
     position: ErrorSummary

@@ -31,6 +31,7 @@ from jaxsfm.report.run_results import ModelRow, PairRow, TriedPairs
 from jaxsfm.report.typed_json import from_json
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.runs.working_model import CameraPrior
+from jaxsfm.sfm.evaluation import of_photos
 from jaxsfm.sfm.georeference.georeference import Georeference
 from jaxsfm.sfm.reconstruction import Reconstructed
 from jaxsfm.sfm.register.grow import ExtendedModel
@@ -211,7 +212,8 @@ def extended_report(
 def evaluated(report: RunReport, poses: Poses, reference: Poses) -> RunReport:
     """The report with the errors against reference poses, or why they cannot be compared."""
     try:
-        return dataclasses.replace(report, evaluation=evaluation_report(poses, reference))
+        known = of_photos(reference, report.photos())
+        return dataclasses.replace(report, evaluation=evaluation_report(poses, known))
     except UserError as error:
         return dataclasses.replace(report, evaluation_failed=str(error))
 

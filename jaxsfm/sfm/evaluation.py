@@ -117,6 +117,11 @@ def pair_names(ours: Collection[str], reference: Collection[str]) -> dict[str, s
     return pairs
 
 
+def of_photos(reference: Poses, photos: Collection[str]) -> Poses:
+    """The reference poses of some photos. A reference may have many more than a run was given."""
+    return {name: reference[name] for name in pair_names(photos, reference).values()}
+
+
 def read_names(path: Path) -> list[str]:
     """The image names in a text file, one on each line; UserError if there are none."""
     names = [line for _, line in listed_lines(path, "--align-on")]

@@ -167,8 +167,12 @@ def test_the_global_mapper_builds_a_model_too(scene, copied):
 
 def test_reference_adds_an_evaluation(scene, tmp_path, plain):
     assert "evaluation" not in plain[1]
-    args = ("--intrinsics", scene / "K.txt", "--reference", scene / "reference")
-    assert run(scene, tmp_path / "out", *args)["evaluation"]["registered"] == 3
+    reference = shutil.copytree(scene / "reference", tmp_path / "reference")
+    one = next(iter(reference.rglob("view0*")))  # a photo more than the run is given
+    shutil.copyfile(one, one.with_name(one.name.replace("view0", "view9")))
+    args = ("--intrinsics", scene / "K.txt", "--reference", reference)
+    found = run(scene, tmp_path / "out", *args)["evaluation"]
+    assert (found["registered"], found["reference_images"], found["missing"]) == (3, 3, [])
 
 
 def test_match_writes_arrays_and_a_picture_in_original_pixels(scene, tmp_path, capsys):

@@ -11,6 +11,7 @@ from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.errors import UserError
 from jaxsfm.sfm.evaluation import (
     evaluate,
+    of_photos,
     own_rotation_deg,
     pair_names,
     read_names,
@@ -130,6 +131,14 @@ def test_shares_count_missing_and_turned_images_as_failures():
     figures = json.loads(json.dumps(result.as_dict()))
     assert (figures["registered"], figures["reference_images"]) == (6, 8)
     assert figures["within_10deg"]["0.5"] == 3 / 8 and figures["missing"] == names[6:]
+
+
+def test_a_reference_of_more_photos_is_cut_to_those_that_were_given():
+    truth = poses(8)
+    names = sorted(truth)
+    photos = [names[0], names[3].replace(".jpg", ".png"), "another.jpg"]
+    assert set(of_photos(truth, photos)) == {names[0], names[3]}
+    assert of_photos(truth, ["another.jpg"]) == {}
 
 
 # -- what determines no alignment ------------------------------------------------------------------
