@@ -116,8 +116,7 @@ class Config:
     (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None, or without a
     refinement: photos are described at `max_size` from the beginning."""
     first_look_share: float = 1.0
-    """Where `first_look` would hardly reduce the median photo, the first look has this share of its
-    longer side, so that small photos are reduced as well."""
+    """If `first_look` would hardly reduce the median photo, this share of its longer side is taken."""
     octaves: int = 1
     """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
@@ -187,11 +186,8 @@ class Config:
         return parts
 
     def of_first_look(self, median: float) -> "Config":
-        """The settings of a run's first look; these settings if there is none.
-
-        Args:
-          median: the median of the longer sides of the working images, pixels.
-        """
+        """The settings of the first look at working images whose median longer side is `median`
+        pixels; these settings if there is none."""
         size = self.max_size
         if self.first_look is not None and self.refinement is not None:
             size = min(self.first_look, size)
