@@ -116,7 +116,7 @@ class Config:
     (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None, or without a
     refinement: photos are described at `max_size` from the beginning."""
     first_look_share: float = 1.0
-    """If `first_look` would hardly reduce the median photo, this share of its longer side is taken."""
+    """Where `first_look` hardly reduces the median photo: this share of its longer side instead."""
     octaves: int = 1
     """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
