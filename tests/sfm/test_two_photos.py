@@ -22,7 +22,13 @@ from jaxsfm.io.photo_views import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.two_photos import evidence, matched, scale_search
 from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
-from jaxsfm.sfm.two_photos.common_view import Located, affine_between, common_views, mapped
+from jaxsfm.sfm.two_photos.common_view import (
+    Located,
+    affine_between,
+    common_views,
+    mapped,
+    view_change,
+)
 from jaxsfm.sfm.two_photos.look import Look, moved
 from jaxsfm.sfm.two_photos.matched import confidence, match_photos
 
@@ -89,6 +95,24 @@ def test_an_affine_map_is_found_among_false_matches(seed, scale):
     found = affine_between(Located(xy0, xy1))
     assert found is not None
     np.testing.assert_allclose(mapped(found, xy0), mapped(truth, xy0), atol=1.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-179, 179), st.floats(0.2, 5.0), st.floats(0.2, 5.0), st.floats(0, math.pi), seeds)
+def test_a_view_changes_by_a_turn_after_a_stretch_along_two_axes(turn, a, b, axis, seed):
+    def rotation(angle: float) -> np.ndarray:
+        cos, sin = math.cos(angle), math.sin(angle)
+        return np.asarray([[cos, -sin], [sin, cos]])
+
+    matrix = np.eye(3)
+    stretch = rotation(axis) @ np.diag([a, b]) @ rotation(-axis)
+    matrix[:2, :2] = rotation(math.radians(turn)) @ stretch
+    matrix[:2, 2] = rng_of(seed).uniform(-500, 500, 2)
+    change = view_change(matrix)
+    assert change.scale == pytest.approx(max(a, b, 1 / a, 1 / b))
+    assert change.turn == pytest.approx(abs(turn), abs=1e-6)
+    back = view_change(np.linalg.inv(matrix))
+    assert back == pytest.approx(change, abs=1e-6)
 
 
 def test_matches_that_determine_no_view_give_none():

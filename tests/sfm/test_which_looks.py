@@ -1,12 +1,16 @@
 """Laws of the order of looks: what evidence settles a pair, and which looks follow otherwise."""
 
+import dataclasses
+import math
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from jaxsfm.config import preset
 from jaxsfm.sfm.two_photos import matched
+from jaxsfm.sfm.two_photos.common_view import Located
 
 FEATURES: Any = SimpleNamespace(image="photo")
 
@@ -37,6 +41,58 @@ def test_a_pair_is_settled_by_evidence_or_by_a_large_share_that_is_likely_right(
 
 def test_a_pair_without_matches_is_not_settled():
     assert not matched.is_settled(fake(0.0))
+
+
+def seen_as(matrix: list[list[float]]) -> Any:
+    """A strong look at two photos of which one is the other after a 2 x 2 map."""
+    xy0 = np.random.default_rng(0).uniform(0, 400, (50, 2))
+    both = Located(xy0, xy0 @ np.asarray(matrix).T)
+    counts = SimpleNamespace(num_inliers=500, num_tentative=1000)
+    return SimpleNamespace(evidence=900.0, result=counts, located=lambda *_: both)
+
+
+def turn(degrees: float) -> list[list[float]]:
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return [[cos, -sin], [sin, cos]]
+
+
+UNLIKE = [
+    ([[1.51, 0], [0, 1.51]], True),
+    ([[1.49, 0], [0, 1.49]], False),
+    ([[1 / 1.51, 0], [0, 1 / 1.51]], True),
+    ([[1 / 1.49, 0], [0, 1 / 1.49]], False),
+    ([[1, 0], [0, 0.65]], True),
+    ([[1, 0], [0, 0.68]], False),
+    (turn(31), True),
+    (turn(-29), False),
+]
+
+
+@pytest.mark.parametrize(("matrix", "unlike"), UNLIKE)
+def test_a_strong_pair_is_looked_at_once_more_if_its_photos_show_it_differently(
+    monkeypatch, matrix, unlike
+):
+    asked: list[int] = []
+
+    def closer(*_, size: int, **__: object) -> Any:
+        asked.append(size)
+        return SimpleNamespace(evidence=2000.0, result=None)
+
+    features: Any = SimpleNamespace(image="photo")
+    weights: Any = None
+    monkeypatch.setattr(matched, "look", lambda *_, **__: seen_as(matrix))
+    monkeypatch.setattr(matched, "closer_look", closer)
+    monkeypatch.setattr(matched, "_aligned", lambda *_: None)
+    found = matched.match_photos(weights, features, features, config=preset("default"))
+    assert asked == [matched.SIZE] * unlike  # at most once, however much it brings
+    assert found.evidence == (2000.0 if unlike else 900.0)
+    once = dataclasses.replace(preset("default"), closer_looks=0)
+    assert matched.match_photos(weights, features, features, config=once).looks == 1
+
+
+def test_photos_whose_matches_show_no_view_are_not_looked_at_once_more():
+    photos: Any = ("photo", "photo")
+    assert matched.seen_alike(seen_as([[-1, 0], [0, 1]]), photos)  # a mirrored photo
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ show is cut out of them, at one size, and one photo is turned and slanted by the
 leads to the other. The network, which knows neither scale nor rotation, then sees twice the same.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -78,6 +79,23 @@ def affine_between(matches: Located) -> np.ndarray | None:
     if np.linalg.det(matrix[:2, :2]) <= 0 or stretch[0] > MOST_STRETCHED * stretch[1]:
         return None
     return matrix
+
+
+class ViewChange(NamedTuple):
+    """How differently two photos show the same: the parts of an affine map."""
+
+    scale: float
+    """The largest change of a length in any direction, as a factor of at least 1."""
+    turn: float
+    """The angle of the turn in the image plane, degrees, 0 to 180."""
+
+
+def view_change(affine: np.ndarray) -> ViewChange:
+    """The parts of an affine map (3, 3): the turn is that of the polar decomposition."""
+    u, stretch, vt = np.linalg.svd(affine[:2, :2])
+    turn = u @ vt
+    angle = abs(math.degrees(math.atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])))
+    return ViewChange(float(max(stretch[0], 1 / stretch[1])), angle)
 
 
 def common_views(

@@ -1,12 +1,12 @@
 """Two photos, matched with as many looks as they need.
 
-Most pairs are matched at the first look. A pair that this leaves weak is looked at again at other
-scales, then enlarged, then as seen from one place, and turned if that did not help. A closer look
-counts only if it is stronger than the look that led to it.
+Most pairs are matched at the first look. A strong pair whose photos show the same differently is
+looked at once more, as seen from one place. A weak pair is looked at again at other scales, then
+enlarged, then as seen from one place, and turned if that did not help. A closer look counts only if
+it is stronger than the look that led to it.
 """
 
 import dataclasses
-import functools
 import math
 from typing import NamedTuple
 
@@ -22,7 +22,13 @@ from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches, align, align_matches
 from jaxsfm.sfm.two_photos.closer_look import closer_look, proposals
-from jaxsfm.sfm.two_photos.common_view import SIZE, SMALL_SIZE, mapped
+from jaxsfm.sfm.two_photos.common_view import (
+    SIZE,
+    SMALL_SIZE,
+    affine_between,
+    mapped,
+    view_change,
+)
 from jaxsfm.sfm.two_photos.look import Look, look, moved, to_stored
 from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
 
@@ -41,6 +47,9 @@ HOPELESS = 15.0
 SURE = 150.0
 """A look with so much evidence is followed by a closer one at once. Below, the planes of all looks
 are tried one after the other."""
+MOST_SCALED, MOST_TURNED = 1.5, 30.0
+"""A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
+a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
 HALF_SURE, STEEPNESS = 60.0, 15.0
 """The logistic curve from evidence to confidence, fitted to pairs of WxBS and to photos of
 different places (docs/decisions/hard-pairs.md)."""
@@ -89,8 +98,12 @@ def match_photos(
       ImageError: a photo cannot be decoded again.
     """
     images = (features0.image, features1.image)
-    looks = [look(features0, features1, images, config=config, seed=seed)]
-    if config.closer_looks and not is_settled(looks[0]):
+    first = look(features0, features1, images, config=config, seed=seed)
+    looks = [first]
+    if config.closer_looks and is_settled(first):
+        if not seen_alike(first, images):
+            looks += _from_one_place(weights, images, looks, times=1, config=config, seed=seed)
+    elif config.closer_looks:
         looks += at_other_scales(features0, features1, config=config, seed=seed)
         if _best(looks).evidence >= worth_closer:
             looks = _look_closer(weights, (features0, features1), looks, config=config, seed=seed)
@@ -114,23 +127,46 @@ def _look_closer(
         looks.append(look(enlarged0, enlarged1, images, config=config, seed=seed))
         looks += at_other_scales(enlarged0, enlarged1, config=config, seed=seed)
         features = (enlarged0, enlarged1)
-    closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
     if _best(looks).evidence < SURE:
-        tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
+        tried = (
+            closer_look(weights, images, each, size=SMALL_SIZE, config=config, seed=seed)
+            for each in proposals(looks, images)
+        )
         looks += [each for each in tried if each is not None]
     if _best(looks).evidence < TURNED_BELOW:
         looks += turned(weights, features[0], images[1], config=config, seed=seed)
-    for _ in range(config.closer_looks):
-        best = _best(looks)
+    times = config.closer_looks
+    return looks + _from_one_place(weights, images, looks, times=times, config=config, seed=seed)
+
+
+def _from_one_place(
+    weights: Weights,
+    images: tuple[ImageFile, ImageFile],
+    looks: list[Look],
+    *,
+    times: int,
+    config: Config,
+    seed: int,
+) -> list[Look]:
+    """Further looks as seen from one place, each by the geometry of the best look before it.
+
+    Args:
+      looks: those that were taken before.
+      times: at most so many looks follow.
+    """
+    found: list[Look] = []
+    for _ in range(times):
+        best = _best([*looks, *found])
         if best.evidence < HOPELESS:
             break
-        found = closer(best.located(*images), size=SIZE)
-        if found is None:
+        place = best.located(*images)
+        nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
+        if nearer is None:
             break
-        looks.append(found)
-        if found.evidence <= best.evidence:
+        found.append(nearer)
+        if nearer.evidence <= best.evidence:
             break
-    return looks
+    return found
 
 
 def is_settled(first: Look) -> bool:
@@ -138,6 +174,15 @@ def is_settled(first: Look) -> bool:
     share = first.result.num_inliers / max(first.result.num_tentative, 1)
     likely = first.evidence > HALF_SURE and share >= ENOUGH_SHARE
     return likely or first.evidence >= ENOUGH
+
+
+def seen_alike(first: Look, images: tuple[ImageFile, ImageFile]) -> bool:
+    """Whether both photos show what they share at nearly one scale, without much turn or slant."""
+    affine = affine_between(first.located(*images))
+    if affine is None:
+        return True
+    change = view_change(affine)
+    return change.scale <= MOST_SCALED and change.turn <= MOST_TURNED
 
 
 def _best(looks: list[Look]) -> Look:
