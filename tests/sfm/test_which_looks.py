@@ -90,6 +90,18 @@ def test_a_strong_pair_is_looked_at_once_more_if_its_photos_show_it_differently(
     assert matched.match_photos(weights, features, features, config=once).looks == 1
 
 
+@pytest.mark.parametrize(("share", "counts"), [(0.51, True), (0.49, False)])
+def test_a_view_from_one_place_counts_if_it_confirms_the_first_look(monkeypatch, share, counts):
+    features: Any = SimpleNamespace(image="photo")
+    weights: Any = None
+    seen = SimpleNamespace(evidence=share * 900.0, result=None)
+    monkeypatch.setattr(matched, "look", lambda *_, **__: seen_as(turn(90)))
+    monkeypatch.setattr(matched, "closer_look", lambda *_, **__: seen)
+    monkeypatch.setattr(matched, "_aligned", lambda *_: None)
+    found = matched.match_photos(weights, features, features, config=preset("default"))
+    assert found.evidence == (seen.evidence if counts else 900.0)
+
+
 def test_photos_whose_matches_show_no_view_are_not_looked_at_once_more():
     photos: Any = ("photo", "photo")
     assert matched.seen_alike(seen_as([[-1, 0], [0, 1]]), photos)  # a mirrored photo

@@ -2,11 +2,12 @@
 
 Most pairs are matched at the first look. A strong pair whose photos show the same differently is
 looked at once more, as seen from one place. A weak pair is looked at again at other scales, then
-enlarged, then as seen from one place, and turned if that did not help. A closer look counts only if
-it is stronger than the look that led to it.
+enlarged, then as seen from one place, and turned if that did not help. For a weak pair, a closer
+look counts only if it is stronger than the look that led to it.
 """
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -50,6 +51,9 @@ are tried one after the other."""
 MOST_SCALED, MOST_TURNED = 1.5, 30.0
 """A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
 a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
+CONFIRMED = 0.5
+"""It counts if it has so large a share of the evidence of the first one: matches of photos that are
+seen alike are nearer, even if the view has fewer cells than the photos."""
 HALF_SURE, STEEPNESS = 60.0, 15.0
 """The logistic curve from evidence to confidence, fitted to pairs of WxBS and to photos of
 different places (docs/decisions/hard-pairs.md)."""
@@ -99,15 +103,19 @@ def match_photos(
     """
     images = (features0.image, features1.image)
     first = look(features0, features1, images, config=config, seed=seed)
-    looks = [first]
+    looks, best = [first], first
     if config.closer_looks and is_settled(first):
         if not seen_alike(first, images):
-            looks += _from_one_place(weights, images, looks, times=1, config=config, seed=seed)
+            place = first.located(*images)
+            nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
+            if nearer is not None:
+                looks.append(nearer)
+                best = nearer if nearer.evidence >= CONFIRMED * first.evidence else first
     elif config.closer_looks:
         looks += at_other_scales(features0, features1, config=config, seed=seed)
         if _best(looks).evidence >= worth_closer:
             looks = _look_closer(weights, (features0, features1), looks, config=config, seed=seed)
-    best = _best(looks)
+        best = _best(looks)
     return TwoPhotos(best.result, _aligned(best, images, config), best.evidence, len(looks))
 
 
@@ -127,46 +135,23 @@ def _look_closer(
         looks.append(look(enlarged0, enlarged1, images, config=config, seed=seed))
         looks += at_other_scales(enlarged0, enlarged1, config=config, seed=seed)
         features = (enlarged0, enlarged1)
+    closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
     if _best(looks).evidence < SURE:
-        tried = (
-            closer_look(weights, images, each, size=SMALL_SIZE, config=config, seed=seed)
-            for each in proposals(looks, images)
-        )
+        tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
         looks += [each for each in tried if each is not None]
     if _best(looks).evidence < TURNED_BELOW:
         looks += turned(weights, features[0], images[1], config=config, seed=seed)
-    times = config.closer_looks
-    return looks + _from_one_place(weights, images, looks, times=times, config=config, seed=seed)
-
-
-def _from_one_place(
-    weights: Weights,
-    images: tuple[ImageFile, ImageFile],
-    looks: list[Look],
-    *,
-    times: int,
-    config: Config,
-    seed: int,
-) -> list[Look]:
-    """Further looks as seen from one place, each by the geometry of the best look before it.
-
-    Args:
-      looks: those that were taken before.
-      times: at most so many looks follow.
-    """
-    found: list[Look] = []
-    for _ in range(times):
-        best = _best([*looks, *found])
+    for _ in range(config.closer_looks):
+        best = _best(looks)
         if best.evidence < HOPELESS:
             break
-        place = best.located(*images)
-        nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
-        if nearer is None:
+        found = closer(best.located(*images), size=SIZE)
+        if found is None:
             break
-        found.append(nearer)
-        if nearer.evidence <= best.evidence:
+        looks.append(found)
+        if found.evidence <= best.evidence:
             break
-    return found
+    return looks
 
 
 def is_settled(first: Look) -> bool:
