@@ -63,8 +63,8 @@ UNLIKE = [
     ([[1 / 1.49, 0], [0, 1 / 1.49]], False),
     ([[1, 0], [0, 0.65]], True),
     ([[1, 0], [0, 0.68]], False),
-    (turn(31), True),
-    (turn(-29), False),
+    (turn(16), True),
+    (turn(-14), False),
 ]
 
 

@@ -48,7 +48,7 @@ HOPELESS = 15.0
 SURE = 150.0
 """A look with so much evidence is followed by a closer one at once. Below, the planes of all looks
 are tried one after the other."""
-MOST_SCALED, MOST_TURNED = 1.5, 30.0
+MOST_SCALED, MOST_TURNED = 1.5, 15.0
 """A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
 a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
 CONFIRMED = 0.5
