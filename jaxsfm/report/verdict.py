@@ -55,6 +55,8 @@ class ModelVerdict(NamedTuple):
     """Photos that follow each other and do not agree with the model."""
     parts: list[Finding]
     """Photos that were in one model, which something spoke against, and are in several now."""
+    scale: list[Finding]
+    """Photos whose part of the model may have shrunk."""
     decisive: str
     """Photos that would decide between two places or two models; empty if there is no choice."""
     advice: str
@@ -87,7 +89,9 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
     contradictions = sorted(check.contradictions, key=lambda each: -each.contradicted)
     places = sorted(check.other_places, key=lambda each: -each.agreed)
     headline = in_words(colour)
-    if colour == "amber" and places:
+    if colour == "amber" and check.shrunk:
+        headline = f"{colour}: a part of the model may have shrunk"
+    elif colour == "amber" and places:
         count = len({place.image for place in places})
         fit = "1 photo fits" if count == 1 else f"{count} photos fit"
         headline += f"; {fit} into the model in a second place"
@@ -101,6 +105,7 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
         alternatives=[_other_model(check.alternative)] if check.alternative else [],
         neighbours=[Finding(_apart(pair), pair[:1], pair[1:]) for pair in check.apart],
         parts=[_told_apart(check.told_apart)] if check.told_apart else [],
+        scale=[_shrunk(check.shrunk)] if check.shrunk else [],
         decisive=_decides(check, places),
         advice=_advice(check, places),
     )
@@ -122,6 +127,7 @@ def _model_lines(verdict: ModelVerdict) -> list[str]:
         ("other model      ", verdict.alternatives),
         ("neighbours       ", verdict.neighbours),
         ("told apart       ", verdict.parts),
+        ("scale            ", verdict.scale),
     ):
         lines += [label + each.text for each in found[:MAX_FINDINGS]]
         if more := len(found[MAX_FINDINGS:]):
@@ -185,6 +191,15 @@ def _told_apart(groups: Sequence[list[str]]) -> Finding:
     )
 
 
+def _shrunk(names: list[str]) -> Finding:
+    see = "sees its" if len(names) == 1 else "see their"
+    return Finding(
+        f"{named(names)} {see} points a hundred times nearer than other photos do, or nearer still",
+        names,
+        [],
+    )
+
+
 def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
     """Which photos would decide between two places or two models; empty if there is nothing to."""
     if places:
@@ -207,6 +222,11 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
         return (
             f"do not use this model as it is: {instead}add photos taken on the way from one group "
             f"to the other, so that {_DECISIVE}, and run the same command again"
+        )
+    if colour == "amber" and check.shrunk:
+        return (
+            "do not trust distances in this model; look where these photos and the others meet, "
+            "add photos that show what both show, and run the same command again"
         )
     if colour == "amber" and check.told_apart:
         way = (

@@ -98,6 +98,21 @@ def test_photos_that_were_told_apart_are_amber_and_each_group_is_named():
     assert found.text.endswith(f"; {NAMES[5]}")
 
 
+def test_a_part_that_may_have_shrunk_is_amber_and_its_photos_are_named():
+    verdict = model_verdict(dataclasses.replace(check_of("green"), shrunk=NAMES[:2]))
+    head, scale, advice = verdict_lines([verdict])
+    assert head == "verdict          amber: a part of the model may have shrunk"
+    assert scale == (
+        f"scale            {NAMES[0]}, {NAMES[1]} see their points a hundred times nearer than "
+        "other photos do, or nearer still"
+    )
+    assert "do not trust distances in this model" in advice
+    (found,) = verdict.scale
+    assert found.images == NAMES[:2] and found.others == []
+    alone = model_verdict(dataclasses.replace(check_of("green"), shrunk=NAMES[:1]))
+    assert f"{NAMES[0]} sees its points" in alone.scale[0].text
+
+
 def test_the_model_that_was_told_apart_is_shown_as_one_way_to_join_the_groups():
     whole = Alternative(basis="order", images=8, elsewhere=NAMES[3:], contradicted=9, whole=True)
     groups = [NAMES[:3], NAMES[3:]]

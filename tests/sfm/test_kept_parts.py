@@ -111,7 +111,7 @@ def test_a_run_without_models_is_kept_too(database, steps, tmp_path, monkeypatch
 def some_outcome():
     against = Contradiction(images=["a"], others=["b", "c"], tested=50, contradicted=20)
     return outcome(["a"], ["b", "c"])._replace(
-        check=dataclasses.replace(check_of("red"), without_sky=True),
+        check=dataclasses.replace(check_of("red"), without_sky=True, shrunk=["b"]),
         refuted={("a", "b"): against},
         suspected={("b", "c"): against, ("a", "c"): against},
         explained={("b", "c")},

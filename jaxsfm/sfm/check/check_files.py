@@ -21,6 +21,7 @@ def check_from_json(row: dict[str, Any]) -> ModelCheck:
         apart=row["apart"],
         taken_out=row["taken_out"],
         told_apart=row["told_apart"],
+        shrunk=row["shrunk"],
         without_sky=row["without_sky"],
     )
 

@@ -14,6 +14,7 @@ from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, p
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.check.other_places import Refused, other_places
 from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
+from jaxsfm.sfm.check.scale import shrunk
 from jaxsfm.sfm.check.thinning import thinned
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -87,7 +88,7 @@ def check_model(
     """
     if len(model.views) < MIN_VIEWS or len(model.tracks.points) < MIN_POINTS:
         return None
-    seen = model.tracks
+    seen, near = model.tracks, shrunk(model)
     model = thinned(model)
     names = [view.name for view in model.views]
     found = agreement(model, images, refinement)
@@ -108,7 +109,7 @@ def check_model(
         if refuted or suspected:
             break
     groups = [sorted(names[k] for k in group) for group in grouping.groups]
-    check = ModelCheck(groups=groups, contradictions=contradictions, other_places=[])
+    check = ModelCheck(groups=groups, contradictions=contradictions, other_places=[], shrunk=near)
     agreeing = {pair for pair, fit in fits.items() if fit >= MIN_FIT}
     explained = {p for p in agreeing if not any(each.joined_by(p) for each in contradictions)}
     whole = parts(grouping, seen.view, seen.point) if contradictions else [range(len(names))]

@@ -12,8 +12,8 @@ MIN_VIEWS = 3
 VerdictColour = Literal["green", "amber", "red"]
 """Green: nothing speaks against the model. Amber: another model may explain the photos as well.
 Some fit into the model in a second place, another model was made, photos that follow each other do
-not agree with the model, or photos of the run contradicted each other and were told apart. Red:
-groups of its photos contradict each other."""
+not agree with the model, photos of the run contradicted each other and were told apart, or a part
+of the model has shrunk. Red: groups of its photos contradict each other."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,6 +95,9 @@ class ModelCheck:
     contradict, or in a model of an earlier round that something spoke against. Each group of three
     photos or more is in a model without the others now. They are the same for all models of a run:
     where there are any, the scene repeats itself, also elsewhere."""
+    shrunk: list[str] = dataclasses.field(default_factory=list)
+    """Photos that see their points so much nearer than others that a part of the model has shrunk
+    (`jaxsfm.sfm.check.scale`). Sorted."""
     without_sky: bool = False
     """Whether the sky was masked because something spoke against a model with it. What masked
     pixels show contradicts nothing, so this check is weaker than the one before."""
@@ -108,8 +111,8 @@ class ModelCheck:
 
     def doubted(self) -> bool:
         """Whether more speaks against the model than photos that follow each other (`apart`)."""
-        doubts = self.contradictions, self.other_places, self.alternative, self.told_apart
-        return any(doubts)
+        elsewhere = self.other_places, self.alternative, self.told_apart
+        return any((self.contradictions, *elsewhere, self.shrunk))
 
     def photos(self) -> set[str]:
         """The photos of the model."""
@@ -123,4 +126,5 @@ class ModelCheck:
             groups=sorted(filter(None, groups), key=lambda group: (-len(group), group)),
             apart=[pair for pair in self.apart if not set(pair) & set(names)],
             taken_out=sorted(names),
+            shrunk=[name for name in self.shrunk if name not in names],
         )
