@@ -33,6 +33,7 @@ from jaxsfm.core import (
     numerics,
     octaves,
     pair,
+    partners,
     planes,
     pooling,
     ransac,
@@ -553,6 +554,9 @@ def calls() -> dict[str, Call]:
             (1, 2),
             slow=True,
         ),
+        "partners.partners": Call(
+            _bind(partners.partners, k=3, candidates=9, block=16), (_rows(0),)
+        ),
         "planes.nearest_plane": Call(
             planes.nearest_plane,
             (hs, np.asarray([True, True]), Correspondences(xy0, xy1, xy0[:, 0] > -1), reach),
@@ -573,7 +577,6 @@ def calls() -> dict[str, Call]:
                 ),
             ),
         ),
-        "pooling.nearest": Call(_bind(pooling.nearest, k=3, block=16), (_rows(0),)),
         "ransac.sample_indices": Call(
             lambda key, count: ransac.sample_indices(key, 20, count), (KEY, n(9))
         ),

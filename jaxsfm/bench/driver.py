@@ -29,7 +29,7 @@ from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.store import Store
 from jaxsfm.matching.device_cache import tile_order
-from jaxsfm.matching.retrieval import nearest_pairs
+from jaxsfm.matching.retrieval import partner_pairs
 from jaxsfm.sfm.parts.map_parts import OVERLAP, PART
 from jaxsfm.sfm.parts.partition import graph_of, overlapping_parts
 from jaxsfm.sfm.view_graph import trusted_pairs
@@ -76,7 +76,7 @@ def measure(photos: int, folder: Path) -> dict[str, float]:
         return result
 
     vectors = descriptors(photos)
-    timed("similar photos", lambda: nearest_pairs(vectors, NEAREST))
+    timed("similar photos", lambda: partner_pairs(vectors, NEAREST))
     vectors.clear()
     street = SimulatedStreet(photos, density=DENSITY)
     images, pairs = street.images(), street.pairs()

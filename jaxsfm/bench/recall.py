@@ -25,7 +25,7 @@ from jaxsfm.io.pairs import Pair, exhaustive_pairs
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.weights import load_weights
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
+from jaxsfm.matching.retrieval import describe_photos, partner_pairs
 from jaxsfm.options import Retrieval
 
 KINDS: list[Retrieval] = ["vlad", "gem"]
@@ -139,7 +139,7 @@ def measure(
     for kind in kinds:
         described = describe_photos(weights, photos, kind=kind)
         for k in numbers:
-            tried = set(nearest_pairs(described.vectors, k))
+            tried = set(partner_pairs(described.vectors, k))
             found = found_pairs(tried, true)
             own = sum(places.issuperset(pair) for pair in tried)
             yield {

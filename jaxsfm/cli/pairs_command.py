@@ -39,7 +39,7 @@ def pairs(
     from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.pipeline import open_images
-    from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
+    from jaxsfm.matching.retrieval import describe_photos, partner_pairs
 
     usable, skipped = open_images(images, progress=True)
     names = [image.name for image in usable]
@@ -51,7 +51,7 @@ def pairs(
         weights = chosen_weights(network, backbone)
         with tqdm(total=len(usable), desc="retrieval", unit="image") as bar:
             alone = describe_photos(weights, usable, kind=retrieval, on_image=bar.update)
-        found.update(nearest_pairs(alone.vectors, selection.retrieval))
+        found.update(partner_pairs(alone.vectors, selection.retrieval))
         skipped |= {image.name: str(error) for image, error in alone.lost}
         found = {pair for pair in found if not skipped.keys() & set(pair)}
     for why in skipped.values():

@@ -8,15 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsfm.core.numerics import HIGHEST, unit
 from jaxsfm.core.vocabulary import Vocabulary, nearest_centre, seen, whitened
-
-TIE = 1e-5
-"""Products of global descriptors that differ by less count as equal, so that rounding does not
-order them."""
 
 
 def gem(x: Float[Array, "n c"], *, power: float = 3.0) -> Float[Array, " c"]:
@@ -66,28 +61,3 @@ def netvlad(x: Float[Array, "n c"], head: NetVLADHead) -> Float[Array, " o"]:
     rest = sums - head.centres * jnp.sum(weights, axis=0)
     whole = unit(unit(rest.T).T.reshape(-1))
     return unit(jnp.matmul(whole, head.whitening, precision=HIGHEST) + head.whitening_bias)
-
-
-def nearest(x: Float[Array, "n c"], *, k: int, block: int = 256) -> Int[Array, "n k"]:
-    """For each row the k other rows with the largest products, best first.
-
-    The lower index comes first among equals. `block` rows of the table of products exist at a time.
-
-    Raises:
-      ValueError: there are fewer than k other rows.
-    """
-    n = x.shape[0]
-    if not 1 <= k < n:
-        raise ValueError(f"k must lie in 1..{n - 1}, the number of other rows; got {k}")
-    block = min(block, n)
-    padded = jnp.pad(x, ((0, -n % block), (0, 0)))
-
-    def rows(start):
-        own = lax.dynamic_slice_in_dim(padded, start, block)
-        products = jnp.round(jnp.matmul(own, x.T, precision=HIGHEST) / TIE)
-        itself = start + jnp.arange(block, dtype=jnp.int32)
-        others = itself[:, None] != jnp.arange(n, dtype=jnp.int32)
-        return lax.top_k(jnp.where(others, products, -jnp.inf), k)[1]
-
-    starts = jnp.arange(-(-n // block), dtype=jnp.int32) * block
-    return lax.map(rows, starts).reshape(-1, k)[:n].astype(jnp.int32)

@@ -1,4 +1,4 @@
-"""Which photos may show the same scene: the nearest neighbours of their global descriptors."""
+"""Which photos may show the same scene: those with similar global descriptors."""
 
 import contextlib
 import importlib.metadata
@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsfm.core.pooling import nearest
+from jaxsfm.core.partners import partners
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, make_pair
@@ -26,6 +27,10 @@ from jaxsfm.matching.global_descriptors import (
 )
 from jaxsfm.options import Retrieval
 
+CANDIDATES = 5
+"""Partners of a photo are chosen among so many times more photos, the most similar ones. In a video
+they then reach beyond its neighbours in time (docs/decisions/retrieval.md)."""
+_partners = jax.jit(partners, static_argnames=("k", "candidates"))
 _DESCRIBE = {"gem": gem_descriptors, "vlad": vlad_descriptors, "netvlad": netvlad_descriptors}
 
 
@@ -54,7 +59,7 @@ def shortlist(
     kind: Retrieval = "vlad",
     execution: Execution | None = None,
 ) -> list[Pair]:
-    """Pairs of each image with its `k` most similar ones, each pair once, in order of names.
+    """Pairs of each image with `k` partners, each pair once, in order of names; see `partner_pairs`.
 
     The pairs depend on the photos and their names alone, not on their order.
 
@@ -65,7 +70,7 @@ def shortlist(
     found = describe_photos(weights, images, kind=kind, execution=execution)
     for _, error in found.lost:
         raise error
-    return nearest_pairs(found.vectors, k)
+    return partner_pairs(found.vectors, k)
 
 
 def describe_photos(
@@ -105,11 +110,21 @@ def describe_photos(
     )
 
 
-def nearest_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
-    """Pairs of each name with the `k` nearest others, each pair once, in order of names.
+def partner_pairs(
+    vectors: Mapping[str, np.ndarray], k: int, *, candidates: int | None = None
+) -> list[Pair]:
+    """Pairs of each name with `k` partners, each pair once, in order of names.
 
-    With fewer than `k` others, all of them are taken. Equally near ones are taken by name. Raises
-    ValueError if k is less than 1.
+    Partners are similar to it, and differ from each other (`jaxsfm.core.partners`). With fewer than
+    `k` other names, all of them are partners. Equally similar ones are taken by name.
+
+    Args:
+      vectors: global descriptors of unit length, float32 (c,).
+      candidates: the most similar ones, of which partners are chosen; `CANDIDATES` times k if None.
+        With k candidates, partners are the most similar ones.
+
+    Raises:
+      ValueError: k is less than 1, or there are fewer candidates than partners.
     """
     if k < 1:
         raise ValueError(f"k must be at least 1; got {k}")
@@ -117,5 +132,9 @@ def nearest_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
     if len(names) < 2:
         return []
     table = jnp.asarray(np.stack([vectors[name] for name in names]))
-    rows = np.asarray(nearest(table, k=min(k, len(names) - 1)))
+    few = min(k, len(names) - 1)
+    among = CANDIDATES * k if candidates is None else candidates
+    if among < k:
+        raise ValueError(f"candidates must be at least k = {k}; got {among}")
+    rows = np.asarray(_partners(table, k=few, candidates=max(few, min(among, len(names) - 1))))
     return sorted({make_pair(names[i], names[j]) for i, row in enumerate(rows) for j in row})

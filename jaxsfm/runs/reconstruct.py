@@ -23,7 +23,7 @@ from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import open_folder
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.matching.retrieval import check_retrieval, describe_photos, nearest_pairs
+from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
@@ -179,7 +179,7 @@ def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]
 def _retrieve(
     job: Job, images: list[ImageFile], kind: Retrieval, k: int
 ) -> tuple[list[Pair], dict[str, str]]:
-    """Pairs of each image with its k most similar ones, and why images have no descriptor."""
+    """Pairs of each image with k similar ones, and why images have no descriptor."""
     total, quiet = len(images), not job.progress
     with tqdm(total=total, desc="retrieval", unit="image", disable=quiet) as bar:
         found = describe_photos(
@@ -193,4 +193,4 @@ def _retrieve(
     for image, error in found.lost:
         job.store.record_failure(image, error)
     lost = {image.name: str(error) for image, error in found.lost}
-    return nearest_pairs(found.vectors, k), lost
+    return partner_pairs(found.vectors, k), lost

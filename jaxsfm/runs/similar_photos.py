@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from jaxsfm.core.pooling import TIE
+from jaxsfm.core.partners import TIE
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.store import Store

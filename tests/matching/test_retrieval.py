@@ -18,7 +18,7 @@ from jaxsfm.io.pairs import exhaustive_pairs, read_pairs
 from jaxsfm.io.store import Store
 from jaxsfm.io.weight_files import EXTRAS
 from jaxsfm.matching import global_descriptors
-from jaxsfm.matching.retrieval import describe_photos, nearest_pairs
+from jaxsfm.matching.retrieval import describe_photos, partner_pairs
 
 KINDS = pytest.mark.parametrize("kind", ["gem", "vlad"])
 
@@ -79,14 +79,14 @@ def assert_same(found, wanted):
 def test_photos_of_one_thing_find_each_other(before, kind):
     """(The room's walls show the pictures, so views of it may find those.)"""
     vectors = before[1][kind].vectors
-    assert ("c 1.png", "c 2.png") in nearest_pairs(vectors, 1)
-    assert nearest_pairs(vectors, 99) == jaxsfm.exhaustive_pairs(vectors)
+    assert ("c 1.png", "c 2.png") in partner_pairs(vectors, 1)
+    assert partner_pairs(vectors, 99) == jaxsfm.exhaustive_pairs(vectors)
 
 
 @pytest.mark.slow
 def test_the_shortlist_does_not_depend_on_the_order_of_photos(weights, images, before):
     pairs = jaxsfm.shortlist(weights, images[::-1], k=1)
-    assert pairs == nearest_pairs(before[1]["vlad"].vectors, 1)
+    assert pairs == partner_pairs(before[1]["vlad"].vectors, 1)
 
 
 def test_what_is_stored_is_not_computed_again(weights, images, before, again, computed):
@@ -158,7 +158,7 @@ def test_copies_of_a_photo_are_described_once_and_nearest(
     images = jaxsfm.open_images(tmp_path / "more")[0]
     found = describe_photos(weights, images, kind="vlad", store=again)
     assert computed == []
-    assert ("a copy.png", "d.png") in nearest_pairs(found.vectors, 1)
+    assert ("a copy.png", "d.png") in partner_pairs(found.vectors, 1)
 
 
 @pytest.mark.slow
@@ -186,8 +186,8 @@ def test_the_command_writes_pairs_that_a_run_reads(folder, images, before, tmp_p
     plan = "retrieval:1+sequential:1"
     assert main(["pairs", str(folder), "--out", str(out), "--pairs", plan]) == 0
     names = [image.name for image in images]
-    nearest = nearest_pairs(before[1]["vlad"].vectors, 1)
-    assert read_pairs(out, names) == sorted({*nearest, *sequential_pairs(names, 1)})
+    similar = partner_pairs(before[1]["vlad"].vectors, 1)
+    assert read_pairs(out, names) == sorted({*similar, *sequential_pairs(names, 1)})
     assert "6 photos" in capsys.readouterr().out
 
 
