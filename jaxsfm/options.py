@@ -94,9 +94,9 @@ class ReconstructionChoice:
 
     Attributes:
       pairs: Which pairs are tried. exhaustive: all pairs. FILE: a file with two image names on each
-        line. retrieval:K: each photo with the K photos most similar to it. sequential:K: each photo
-        with the next K photos by name. Join several of these with +. auto: exhaustive for up to 40
-        photos, and retrieval:20+sequential:3 for more.
+        line. retrieval:K: each photo with K photos that are similar to it, and differ from each
+        other. sequential:K: each photo with the next K photos by name. Join several of these with
+        +. auto: exhaustive for up to 40 photos, and retrieval:20+sequential:3 for more.
       retrieval: How a photo is described by one vector for retrieval:K. netvlad needs NetVLAD's
         weights, given with --weights.
       best_pairs: Map only the N pairs of each image that have the most inliers.

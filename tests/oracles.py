@@ -279,12 +279,21 @@ def lloyd(x: np.ndarray, centres: np.ndarray, iterations: int) -> np.ndarray:
     return centres
 
 
-def nearest(x: np.ndarray, k: int, tie: float) -> np.ndarray:
-    """The k best other rows by their product, in steps of `tie`; then the lower index."""
+def partners(x: np.ndarray, k: int, candidates: int, tie: float) -> np.ndarray:
+    """The best other rows by their product, in steps of `tie`, then the lower index. Of these, one
+    comes last if it is nearer to one before it that does not."""
+
+    def product(i: int, j: int) -> int:
+        return round(float(x[i].astype(np.float64) @ x[j]) / tie)
+
     rows = []
-    for i, row in enumerate(x.astype(np.float64)):
-        others = sorted((-round(float(row @ y) / tie), j) for j, y in enumerate(x) if j != i)
-        rows.append([j for _, j in others[:k]])
+    for i in range(len(x)):
+        others = sorted((-product(i, j), j) for j in range(len(x)) if j != i)[:candidates]
+        differing: list[int] = []
+        for _, j in others:
+            if all(product(j, taken) <= product(i, j) for taken in differing):
+                differing.append(j)
+        rows.append((differing + [j for _, j in others if j not in differing])[:k])
     return np.asarray(rows)
 
 

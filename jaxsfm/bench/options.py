@@ -123,7 +123,9 @@ class RecallOptions(BenchOptions):
         units of the poses.
       every: Each so many photos is used.
       methods: How a photo is described, separated by commas or blanks: vlad, gem.
-      nearest: Numbers of similar photos to look at, separated by commas or blanks.
+      partners: Numbers of partners of each photo, separated by commas or blanks.
+      candidates: For each partner, so many of the most similar photos are candidates. With 1, the
+        most similar photos are the partners. Numbers separated by commas or blanks.
     """
 
     root: Path
@@ -132,10 +134,12 @@ class RecallOptions(BenchOptions):
     depth: float = 2.0
     every: int = 1
     methods: tuple[str, ...] = ("vlad,gem",)
-    nearest: tuple[str, ...] = ("5,10,20,50",)
+    partners: tuple[str, ...] = ("5,10,20,50",)
+    candidates: tuple[str, ...] = ("5",)
 
     def __post_init__(self) -> None:
-        whole_numbers(self.nearest, "--nearest")
+        whole_numbers(self.partners, "--partners")
+        whole_numbers(self.candidates, "--candidates")
         if self.every < 1:
             raise UserError(f"--every must be at least 1; got {self.every}")
         if not self.depth > 0:

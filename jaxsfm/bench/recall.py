@@ -1,4 +1,4 @@
-"""How many of the pairs that show the same place are among the most similar photos.
+"""How many of the pairs that show the same place are among the partners that retrieval chooses.
 
 The photos are described as `reconstruct` does it. By a model, a pair is *true* if its photos have
 30 points in common. By poses alone, a pair is true if each of its cameras sees half of what lies
@@ -6,12 +6,14 @@ before the other one at a given distance. Pairs of photos of other places are no
 """
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.options import RecallOptions, whole_numbers
@@ -50,6 +52,10 @@ class Found(NamedTuple):
     """Of them."""
     connected: int
     """Photos with at least PARTNERS true partners among the pairs, or with all that they have."""
+    largest: int
+    """Photos in the largest group that true pairs join."""
+    resistance: float
+    """The mean of all pairs of photos in that group; see `mean_resistance`."""
 
 
 def pairs_by_model(folder: Path, least: int = COMMON_POINTS) -> set[Pair]:
@@ -93,7 +99,32 @@ def found_pairs(tried: set[Pair], true: set[Pair]) -> Found:
     partners = Counter(name for pair in true for name in pair)
     found = Counter(name for pair in true & tried for name in pair)
     connected = sum(found[name] >= min(PARTNERS, count) for name, count in partners.items())
-    return Found(len(tried), len(tried & true), connected)
+    return Found(len(tried), len(tried & true), connected, *mean_resistance(tried & true))
+
+
+def mean_resistance(pairs: set[Pair]) -> tuple[int, float]:
+    """The size of the largest group of photos, and how far errors add up in it.
+
+    Each pair measures how its photos lie to each other, with an error of variance 1. The mean
+    resistance is the variance of the best estimate of how any two photos lie to each other. It is
+    the electrical resistance between them if each pair is a resistor of 1 ohm. In a chain of n
+    photos it is (n + 1) / 3; if all pairs are measured, 2 / n. Without pairs, the result is (0, 0).
+
+    Source: Barooah and Hespanha 2007, "Estimation on graphs from relative measurements".
+    """
+    names = sorted({name for pair in pairs for name in pair})
+    if not names:
+        return 0, 0.0
+    index = {name: i for i, name in enumerate(names)}
+    joined = np.zeros((len(names), len(names)))
+    for a, b in pairs:
+        joined[index[a], index[b]] = joined[index[b], index[a]] = 1
+    _, group = connected_components(joined, directed=False)
+    own = group == np.bincount(group).argmax()
+    joined = joined[np.ix_(own, own)]
+    count = len(joined)
+    values = np.linalg.eigvalsh(np.diag(joined.sum(1)) - joined)[1:]
+    return count, float(2 / (count - 1) * (1 / values).sum())
 
 
 def _photos(root: Path, strangers: Path | None) -> list[ImageFile]:
@@ -131,31 +162,43 @@ def _true_pairs(truth: Path, depth: float, photos: list[ImageFile]) -> set[Pair]
 
 
 def measure(
-    photos: list[ImageFile], true: set[Pair], kinds: list[Retrieval], numbers: list[int]
+    photos: list[ImageFile],
+    true: set[Pair],
+    kinds: list[Retrieval],
+    numbers: list[int],
+    times: list[int],
 ) -> Iterator[dict[str, Json]]:
-    """A row for each way to compare photos and each number of similar photos."""
+    """A row for each way to compare photos, number of partners, and number of candidates.
+
+    Args:
+      numbers: of partners.
+      times: how many candidates there are for each partner.
+    """
     weights = load_weights()
     places = {name for pair in true for name in pair}
     for kind in kinds:
         described = describe_photos(weights, photos, kind=kind)
-        for k in numbers:
-            tried = set(partner_pairs(described.vectors, k))
+        for k, many in itertools.product(numbers, times):
+            tried = set(partner_pairs(described.vectors, k, candidates=many * k))
             found = found_pairs(tried, true)
             own = sum(places.issuperset(pair) for pair in tried)
             yield {
                 "retrieval": kind,
-                "nearest": k,
+                "partners": k,
+                "candidates": many * k,
                 "pairs": found.pairs,
                 "true": found.true,
                 "of": len(true),
                 "among_own": own,
                 "connected": found.connected,
                 "photos": len(places),
+                "largest": found.largest,
+                "resistance": found.resistance,
             }
 
 
 def bench_recall(options: RecallOptions) -> dict[str, Json]:
-    """Measure some numbers of similar photos.
+    """Measure some numbers of partners.
 
     Raises:
       UserError: a folder or an option cannot be used.
@@ -165,7 +208,9 @@ def bench_recall(options: RecallOptions) -> dict[str, Json]:
     photos = _photos(options.root, options.strangers)[:: options.every]
     true = _true_pairs(options.truth, options.depth, photos)
     rows: list[dict[str, Json]] = []
-    for row in measure(photos, true, kinds, whole_numbers(options.nearest, "--nearest")):
+    numbers = whole_numbers(options.partners, "--partners")
+    times = whole_numbers(options.candidates, "--candidates")
+    for row in measure(photos, true, kinds, numbers, times):
         rows.append(row)
         if options.json:
             write_json(options.json, {"rows": rows})
@@ -175,9 +220,11 @@ def bench_recall(options: RecallOptions) -> dict[str, Json]:
 def table_lines(figures: Mapping[str, Json]) -> list[str]:
     """A line for each way to compare photos and each number of similar photos."""
     rows: Any = figures["rows"]
-    lines = ["retrieval  nearest   pairs    true of      among own  connected photos"]
+    head = "retrieval partners  of      pairs    true of      among own"
+    lines = [f"{head}  connected photos  largest  resistance"]
     return lines + [
-        f"{row['retrieval']:<9} {row['nearest']:>8} {row['pairs']:>7} {row['true']:>7} "
-        f"{row['of']:<7} {row['among_own']:>9}  {row['connected']:>9} of {row['photos']}"
+        f"{row['retrieval']:<9} {row['partners']:>8}  {row['candidates']:<4} {row['pairs']:>7} "
+        f"{row['true']:>7} {row['of']:<7} {row['among_own']:>9}  {row['connected']:>9} of "
+        f"{row['photos']:<4} {row['largest']:>7} {row['resistance']:>11.3f}"
         for row in rows
     ]

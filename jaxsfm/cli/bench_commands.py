@@ -143,7 +143,7 @@ def sequence(bench: Unnamed[SequenceOptions]) -> int:
 
 
 def recall(bench: Unnamed[RecallOptions]) -> int:
-    """Count the pairs of photos of one place among the most similar photos.
+    """Count the pairs of photos of one place among the pairs that retrieval chooses.
 
     For example
         $ jaxsfm bench recall --root PHOTOS --truth MODEL

@@ -1,6 +1,5 @@
 """Which photos are matched with each photo, by the products of their global descriptors."""
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -19,8 +18,8 @@ def partners(
 
     The candidates of a row are the rows with the largest products with it. They are taken in this
     order, without those that have a larger product with a taken one than with the row itself. If
-    fewer than k are left, the largest of the others follow. With k candidates, the result is the k
-    nearest rows. The lower index comes first among equals.
+    fewer than k are left, the largest of the others follow. So k candidates are all partners. The
+    lower index comes first among equals.
 
     In a video, the nearest rows are neighbours in time, and those are neighbours of each other.
     Source of the rule: Malkov and Yashunin, TPAMI 2020, algorithm 4 (there it keeps a graph of
@@ -58,8 +57,6 @@ def partners(
 
     starts = jnp.arange(-(-n // block), dtype=jnp.int32) * block
     products, at = (each.reshape(-1, candidates)[:n] for each in lax.map(rows, starts))
-    if candidates == k:
-        return at.astype(jnp.int32)
     return lax.map(chosen, (products, at)).astype(jnp.int32)
 
 

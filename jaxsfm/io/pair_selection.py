@@ -59,7 +59,7 @@ class PairSelection(NamedTuple):
     sequential: int = 0
     """Each image is paired with this many images that follow it."""
     retrieval: int = 0
-    """Each image is paired with this many images that are most similar to it."""
+    """Each image is paired with this many images that are similar to it."""
 
 
 def parse_pair_selection(text: str) -> PairSelection:

@@ -59,9 +59,10 @@ def shortlist(
     kind: Retrieval = "vlad",
     execution: Execution | None = None,
 ) -> list[Pair]:
-    """Pairs of each image with `k` partners, each pair once, in order of names; see `partner_pairs`.
+    """Pairs of each image with `k` partners, each pair once, in order of names.
 
-    The pairs depend on the photos and their names alone, not on their order.
+    Partners are chosen by `partner_pairs`. The pairs depend on the photos and their names alone,
+    not on their order.
 
     Raises:
       ImageError: an image cannot be decoded.

@@ -1,13 +1,12 @@
 """Laws of the descriptors of whole images."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
 import tolerances
 
-from jaxsfm.core.pooling import TIE, NetVLADHead, gem, nearest, netvlad, vlad
+from jaxsfm.core.pooling import NetVLADHead, gem, netvlad, vlad
 from jaxsfm.core.vocabulary import Vocabulary
 
 N, C, D, K = 30, 12, 6, 5
@@ -80,23 +79,3 @@ def test_padding_and_the_order_of_cells_do_not_matter(given, kind):
 @KINDS
 def test_an_image_without_descriptors_has_a_finite_one(given, kind):
     assert np.isfinite(ours(given, kind, np.zeros((4, C), np.float32))).all()
-
-
-@pytest.mark.parametrize("block", [1, 4, 7, 256])
-def test_the_nearest_are_those_of_the_whole_table(block):
-    x = units(np.random.default_rng(2), 21)
-    found = jax.jit(nearest, static_argnames=("k", "block"))(jnp.asarray(x), k=6, block=block)
-    np.testing.assert_array_equal(found, oracles.nearest(x, 6, TIE))
-
-
-def test_equally_near_rows_come_in_their_order_and_nothing_is_near_itself():
-    x = np.ones((5, 4), np.float32) / 2
-    x[3] *= np.float32(1 + 1e-6)  # rounding, no reason
-    found = np.asarray(nearest(jnp.asarray(x), k=4))
-    np.testing.assert_array_equal(found, [[j for j in range(5) if j != i] for i in range(5)])
-
-
-@pytest.mark.parametrize("k", [0, 3])
-def test_more_neighbours_than_there_are_is_an_error(k):
-    with pytest.raises(ValueError, match=f"1..2, .*; got {k}"):
-        nearest(jnp.eye(3, dtype=jnp.float32), k=k)
