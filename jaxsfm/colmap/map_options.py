@@ -1,6 +1,9 @@
 """The settings of a mapping, and what they are in COLMAP's own options."""
 
 import dataclasses
+import math
+import statistics
+from collections.abc import Iterable
 
 import pycolmap
 
@@ -10,6 +13,14 @@ from jaxsfm.options import Mapper
 DRAFT_GROWTH = 1.4
 """A draft is adjusted as a whole when it has grown by this factor; COLMAP's own is 1.1. On *statue*
 a run takes 138 s instead of 240."""
+
+LEAST_PARALLAX = 27.0
+"""A draft has only points whose directions from two images differ by so many working pixels.
+COLMAP's own limit of 1.5 deg is 31 pixels in a photo with a focal length of 1200, and its keypoints
+are three times as exact as ours. In frames of 480 pixels, 1.5 deg are 10 pixels. Of points with so
+little parallax, those that noise moved nearer are kept, and those that it moved away are not: all
+frames of *kitchen* shrank to a four-thousandth within 40 frames
+(docs/decisions/repeated-structure.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,6 +71,20 @@ def incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOpti
     p.triangulation.complete_max_reproj_error *= options.scale
     p.triangulation.merge_max_reproj_error *= options.scale
     return p
+
+
+def narrowest_angle_deg(cameras: Iterable[pycolmap.Camera], scale: float) -> float:
+    """The least angle between two rays of a point of a draft: see `LEAST_PARALLAX`.
+
+    It is never less than COLMAP's own limit.
+
+    Args:
+      cameras: of all images.
+      scale: original pixels per working pixel.
+    """
+    focal = statistics.median(camera.mean_focal_length() for camera in cameras)
+    own = pycolmap.IncrementalTriangulatorOptions().min_angle
+    return max(own, math.degrees(math.atan(LEAST_PARALLAX * scale / focal)))
 
 
 def global_options(options: MapOptions) -> pycolmap.GlobalPipelineOptions:

@@ -13,7 +13,12 @@ from typing import NamedTuple
 import pycolmap
 
 from jaxsfm.colmap.database import read_images
-from jaxsfm.colmap.map_options import MapOptions, global_options, incremental_options
+from jaxsfm.colmap.map_options import (
+    MapOptions,
+    global_options,
+    incremental_options,
+    narrowest_angle_deg,
+)
 from jaxsfm.colmap.model_images import ordered, registered
 from jaxsfm.colmap.native import native
 from jaxsfm.colmap.two_views import TwoView
@@ -118,10 +123,12 @@ def run_mapper(
                 grace_s=1,  # it cannot be cancelled
             )
             return ordered(list(found.values()))
-        p = incremental_options(options)
+        p, images = incremental_options(options), read_images(database)
         p.image_names = list(start.names)
+        if options.draft and images:
+            angle = narrowest_angle_deg((camera for _, camera in images.values()), options.scale)
+            p.triangulation.min_angle = p.mapper.filter_min_tri_angle = angle
         if start.pair is not None:
-            images = read_images(database)
             p.init_image_id1, p.init_image_id2 = (images[name][0] for name in start.pair)
             p.multiple_models = (
                 False  # otherwise COLMAP starts every model from this pair, 50 times
