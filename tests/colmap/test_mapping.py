@@ -4,14 +4,16 @@ import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
+import pycolmap
 import pytest
 from mapped import map_database, verified
 from room_scene import noisy_model
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.colmap import mapper
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import drop_pairs, write_database
-from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.map_options import LEAST_PARALLAX, MapOptions, narrowest_angle_deg
 from jaxsfm.colmap.mapper import build_models, initial_pairs
 from jaxsfm.colmap.model_images import registered, take_out
 from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views
@@ -149,6 +151,35 @@ def test_a_draft_is_adjusted_less_often_and_takes_no_image_for_a_single_pair():
     assert not draft.structure_less_registration_fallback
     assert draft.ba_global_frames_ratio > colmap.ba_global_frames_ratio
     assert draft.ba_global_points_ratio > colmap.ba_global_points_ratio
+
+
+def test_points_of_a_draft_have_a_parallax_in_pixels_or_colmaps_own_angle():
+    """A turn by an angle a moves what lies in the middle of a photo by f tan(a)."""
+    cameras = [
+        pycolmap.Camera(model="PINHOLE", width=9, height=9, params=[f, f, 4, 4])
+        for f in (90, 500, 7000)
+    ]
+    angle = np.radians(narrowest_angle_deg(cameras, 1.25))
+    assert 500 * np.tan(angle) == pytest.approx(1.25 * LEAST_PARALLAX)
+    assert (
+        narrowest_angle_deg(cameras[2:], 1.25)
+        == mapper.incremental_options(ONE).mapper.filter_min_tri_angle
+    )
+
+
+@pytest.mark.parametrize("draft", [False, True])
+def test_only_a_draft_asks_for_more_parallax(monkeypatch, tmp_path, scene, draft):
+    write_database(tmp_path / "d.db", scene.images, scene.results, Cameras())
+    given = []
+    monkeypatch.setattr(
+        mapper.pycolmap, "incremental_mapping", lambda *args, **_: given.append(args[3]) or {}
+    )
+    options = dataclasses.replace(ONE, draft=draft, scale=10.0)
+    assert mapper.run_mapper(tmp_path / "d.db", options) == []
+    own = mapper.incremental_options(options).mapper.filter_min_tri_angle
+    (p,) = given
+    assert p.triangulation.min_angle == p.mapper.filter_min_tri_angle
+    assert (p.mapper.filter_min_tri_angle > own) == draft
 
 
 def test_without_any_model_the_global_mapper_is_the_last_try(monkeypatch, tmp_path):
