@@ -3,7 +3,9 @@
 import math
 from collections import Counter
 from collections.abc import Iterable
+from typing import NamedTuple
 
+import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.native import native
@@ -33,7 +35,9 @@ def bundle_adjust(
 ) -> None:
     """Adjust all poses and points of a model, in place.
 
-    Observations of points that end behind a camera are taken out.
+    Observations of points that end behind a camera are taken out. The model keeps its size and its
+    place: the solver holds two cameras, and in a video they may be a millimetre apart. All 500
+    frames of *kitchen* were a hundred thousand units wide after three passes.
 
     Args:
       loss_px: scale of the Cauchy loss, original pixels. If it is well above the noise (0.1 px
@@ -55,6 +59,7 @@ def bundle_adjust(
     options.ceres.solver_options.function_tolerance = 1e-7
     options.ceres.solver_options.initial_trust_region_radius = TRUST_RADIUS
     before = {number: _centre(reconstruction.camera(number)) for number in sorted(shared)}
+    place = _place(reconstruction)
     options.refine_principal_point = refine_intrinsics and shared == views.keys()
     _solve(reconstruction, options, fixed=())
     if refine_intrinsics and shared and not options.refine_principal_point:
@@ -70,7 +75,34 @@ def bundle_adjust(
     # The solver moves points behind cameras. COLMAP gives them an error of 1e154, and a model file
     # with it is refused.
     pycolmap.ObservationManager(reconstruction).filter_observations_with_negative_depth()
+    _move_to(reconstruction, place)
     reconstruction.update_point_3d_errors()  # the solver does not update them
+
+
+class _Place(NamedTuple):
+    """Where most cameras of a model are. A camera that runs away does not change it."""
+
+    middle: np.ndarray
+    """The median of each coordinate, float64 (3,)."""
+    size: float
+    """The median distance from the middle."""
+
+
+def _place(reconstruction: pycolmap.Reconstruction) -> _Place:
+    numbers = sorted(reconstruction.reg_image_ids())
+    centres = np.stack([reconstruction.image(n).projection_center() for n in numbers])
+    middle = np.median(centres, axis=0)
+    return _Place(middle, float(np.median(np.linalg.norm(centres - middle, axis=1))))
+
+
+def _move_to(reconstruction: pycolmap.Reconstruction, place: _Place) -> None:
+    """Give a model the size and the place that it had; it is not turned."""
+    now = _place(reconstruction)
+    if not (now.size > 0 and place.size > 0):
+        return
+    scale = place.size / now.size
+    shift = place.middle - scale * now.middle
+    reconstruction.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), shift))
 
 
 def _centre(camera: pycolmap.Camera) -> tuple[float, float]:

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pycolmap
+import pytest
 from room_scene import Room, arrays, camera, exact_model
 
 from jaxsfm.colmap import bundle_adjustment
@@ -45,6 +46,28 @@ def test_an_exact_model_stays_as_it_is(rendered):
     after = arrays(model, rendered)
     np.testing.assert_allclose(after.tracks.points, before.tracks.points, atol=1e-6)
     assert after.errors_px().max() < 1e-4
+
+
+def test_a_model_keeps_its_size_and_place_whichever_cameras_hold_the_solver(rendered):
+    """The solver holds the first camera, and its distance to another one, which is wrong here."""
+    model = exact_model(rendered).to_colmap()
+    second = model.image(sorted(model.reg_image_ids())[1])
+    pose = second.cam_from_world()
+    pose.translation = pose.translation + [0.05, -0.08, 0.1]
+    second.frame.set_cam_from_world(second.camera_id, pose)
+
+    def centres() -> np.ndarray:
+        numbers = sorted(model.reg_image_ids())
+        return np.stack([model.image(n).projection_center() for n in numbers])
+
+    before = centres()
+    bundle_adjust(model, loss_px=1000.0, refine_intrinsics=False, threads=1)
+    for place in (lambda x: np.median(x, 0), lambda x: x[3] - x[4]):
+        np.testing.assert_allclose(place(centres()), place(before), atol=0.02)
+    distances = [
+        np.median(np.linalg.norm(x - np.median(x, axis=0), axis=1)) for x in (before, centres())
+    ]
+    assert distances[0] == pytest.approx(distances[1], rel=1e-9)
 
 
 TRUTH = camera().params
