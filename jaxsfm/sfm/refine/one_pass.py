@@ -1,6 +1,7 @@
 """One pass of the refinement: observations are aligned, and the bundle is adjusted."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -134,7 +135,8 @@ def _mean_shift(views: Sequence[View], blocks: Sequence[AlignedBlock]) -> float 
         moved = (block.moved[rows] - block.before[rows]) * scale[block.found.view[rows]]
         shifts.append(np.linalg.norm(moved, axis=1))
     every = np.concatenate(shifts)
-    return float(every.mean()) if len(every) else None
+    # The sum is exact, so that it does not depend on the blocks.
+    return math.fsum(every) / len(every) if len(every) else None
 
 
 def _doubtful(views: Sequence[View], blocks: Sequence[AlignedBlock]) -> list[View]:
