@@ -83,6 +83,23 @@ def test_photos_of_one_thing_find_each_other(before, kind):
     assert partner_pairs(vectors, 99) == jaxsfm.exhaustive_pairs(vectors)
 
 
+def test_partners_are_chosen_of_more_photos_than_the_most_similar_ones():
+    """A camera walks twice along a way, the second time in other light."""
+    way = np.linspace(0, 1, 30)
+    vectors = {}
+    for k, light in enumerate((0.1, -0.1)):
+        for i, a in enumerate(way):
+            x = np.asarray([np.cos(a), np.sin(a), light], np.float32)
+            vectors[f"{k} {i:02d}"] = x / np.linalg.norm(x)
+
+    def joined(**options) -> bool:
+        return any(a[0] != b[0] for a, b in partner_pairs(vectors, 4, **options))
+
+    assert joined() and not joined(candidates=4)
+    with pytest.raises(ValueError, match="at least k = 4; got 3"):
+        partner_pairs(vectors, 4, candidates=3)
+
+
 @pytest.mark.slow
 def test_the_shortlist_does_not_depend_on_the_order_of_photos(weights, images, before):
     pairs = jaxsfm.shortlist(weights, images[::-1], k=1)
