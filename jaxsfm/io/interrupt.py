@@ -14,12 +14,19 @@ from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
+SWALLOWS = "_xla_gc_callback"
+"""JAX's hook in the garbage collector. Python prints an exception in it with a traceback, and goes
+on. So nothing is raised there, and `check` finds the interrupt."""
+
 _pending, _noting = threading.Event(), threading.Event()
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
     _pending.set()
-    raise KeyboardInterrupt
+    while frame is not None and frame.f_code.co_name != SWALLOWS:
+        frame = frame.f_back
+    if frame is None:
+        raise KeyboardInterrupt
 
 
 def _in_main_thread() -> bool:
