@@ -218,7 +218,7 @@ def bench_recall(options: RecallOptions) -> dict[str, Json]:
 
 
 def table_lines(figures: Mapping[str, Json]) -> list[str]:
-    """A line for each way to compare photos and each number of similar photos."""
+    """A line for each way to compare photos, number of partners, and number of candidates."""
     rows: Any = figures["rows"]
     head = "retrieval partners  of      pairs    true of      among own"
     lines = [f"{head}  connected photos  largest  resistance"]

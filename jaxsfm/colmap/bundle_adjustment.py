@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.native import native
 
 VIEWS_FOR_CENTRE = 3
@@ -102,7 +103,7 @@ def _move_to(reconstruction: pycolmap.Reconstruction, place: _Place) -> None:
         return
     scale = place.size / now.size
     shift = place.middle - scale * now.middle
-    reconstruction.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), shift))
+    move_model(reconstruction, scale, np.eye(3), shift)
 
 
 def _centre(camera: pycolmap.Camera) -> tuple[float, float]:

@@ -1,6 +1,5 @@
 """A model with the poses, cameras and points that a refinement found, and all else as it was."""
 
-import numpy as np
 import pycolmap
 
 
@@ -48,15 +47,3 @@ def updated(
 def has_rigs(model: pycolmap.Reconstruction) -> bool:
     """Whether the model has a rig of more than one camera."""
     return any(rig.num_sensors() > 1 for rig in model.rigs.values())
-
-
-def move(
-    model: pycolmap.Reconstruction, scale: float, rotation: np.ndarray, translation: np.ndarray
-) -> None:
-    """Move a model by a similarity, in place: x becomes scale * rotation @ x + translation.
-
-    Args:
-      rotation: float64 (3, 3).
-      translation: float64 (3,), world units.
-    """
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation))

@@ -137,5 +137,5 @@ def partner_pairs(
     among = CANDIDATES * k if candidates is None else candidates
     if among < k:
         raise ValueError(f"candidates must be at least k = {k}; got {among}")
-    rows = np.asarray(_partners(table, k=few, candidates=max(few, min(among, len(names) - 1))))
+    rows = np.asarray(_partners(table, k=few, candidates=among))
     return sorted({make_pair(names[i], names[j]) for i, row in enumerate(rows) for j in row})

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import Poses, model_poses
-from jaxsfm.colmap.updated_model import move
 from jaxsfm.errors import UserError
 from jaxsfm.sfm.evaluation import align
 
@@ -39,4 +39,4 @@ def move_back(model: "pycolmap.Reconstruction", before: Poses) -> None:
             found = align(own[nearest], wanted[nearest])
     except UserError:
         return
-    move(model, found.scale, found.rotation, found.translation)
+    move_model(model, found.scale, found.rotation, found.translation)

@@ -11,8 +11,8 @@ from room_scene import SIZE, arrays, errors, noisy_model
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import model_poses, read_model
-from jaxsfm.colmap.updated_model import move
 from jaxsfm.runs.merge import REPORT, merge_folders
 
 FIRST, SECOND = ["0.png", "1.png", "2.png", "3.png"], ["1.png", "2.png", "3.png", "4.png"]
@@ -53,7 +53,7 @@ def write(folder, model):
 
 
 def moved(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    move(model, 7.0, TURN, np.asarray([20.0, -3.0, 11.0]))
+    move_model(model, 7.0, TURN, np.asarray([20.0, -3.0, 11.0]))
     return model
 
 

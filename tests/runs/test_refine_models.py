@@ -14,8 +14,9 @@ from room_scene import SIZE, Room, arrays, errors, exact_tracks, noisy_model, ot
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import model_poses, read_model
-from jaxsfm.colmap.updated_model import has_rigs, move
+from jaxsfm.colmap.updated_model import has_rigs
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.runs.refine import REPORT, RefineOptions, RefineReport, refine_folder
@@ -188,7 +189,7 @@ def test_the_model_stays_where_it_was(tmp_path, rendered, photos):
     truth = noisy_model(rendered, 0.0)
     before = noisy_model(rendered, 0.5)
     for each in (truth, before):
-        move(each, 40.0, turn, np.asarray([3000.0, -500.0, 70.0]))
+        move_model(each, 40.0, turn, np.asarray([3000.0, -500.0, 70.0]))
     write(tmp_path / "in", before)
     after, _ = refined(tmp_path / "in", photos, tmp_path / "out")
     assert centre_shift(after, before) < 2 * centre_shift(truth, before)

@@ -5,8 +5,8 @@ import pytest
 from room_scene import SIZE, noisy_model
 
 from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import CameraPose, model_poses
-from jaxsfm.colmap.updated_model import move
 from jaxsfm.sfm.given_refinement import _described_px
 from jaxsfm.sfm.old_frame import move_back
 
@@ -29,7 +29,7 @@ def test_a_corrected_camera_does_not_move_the_others(rendered):
     wrong = truth["4.png"]
     before = truth | {"4.png": CameraPose(wrong.rotation, wrong.centre + [0.5, -0.2, 0.3])}
     turn = np.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    move(model, 1.3, turn, np.asarray([1.0, 2.0, 3.0]))
+    move_model(model, 1.3, turn, np.asarray([1.0, 2.0, 3.0]))
     move_back(model, before)
     after = model_poses(model)
     for name, pose in truth.items():
