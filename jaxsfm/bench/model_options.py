@@ -16,6 +16,9 @@ from jaxsfm.bench.options import (
 from jaxsfm.errors import UserError
 from jaxsfm.options import MapperChoice, check_seed, check_threads
 
+CameraUse = Literal["known", "start", "unknown"]
+"""Whether a camera of a folder is held, where its adjustment starts, or not used."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Runs(SetOptions, NetworkOptions):
@@ -172,7 +175,8 @@ class SequenceOptions(BenchOptions):
       every: Which frames are used, separated by commas or blanks. 10,1: each tenth frame, then all.
       localize: Of the frames that are used, each so many is left out of the model and localized in
         it. 0: none.
-      intrinsics: known: K.txt is the camera of all frames. unknown: it is estimated.
+      intrinsics: known: K.txt is the camera of all frames. start: it is adjusted. unknown: it is
+        estimated.
       mapper: As in reconstruct.
       out: Folder for databases and models. A later run continues from what is there.
     """
@@ -181,7 +185,7 @@ class SequenceOptions(BenchOptions):
     methods: tuple[str, ...] = ("default,rootsift",)
     every: tuple[str, ...] = ("10",)
     localize: int = 0
-    intrinsics: Literal["known", "unknown"] = "known"
+    intrinsics: CameraUse = "known"
     mapper: MapperChoice = "incremental"
     out: Path
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.model_options import SequenceOptions
+from jaxsfm.bench.model_options import CameraUse, SequenceOptions
 from jaxsfm.bench.options import whole_numbers
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
@@ -131,11 +131,21 @@ class FrameSequence(NamedTuple):
     frames: Frames
     work: Path
     """Where results are kept."""
-    known: str | None
-    """The value of `--intrinsics`; None: the camera is not known."""
+    camera: CameraUse
+    """What is done with the camera of the folder."""
     mapper: MapperChoice
     """Of the presets."""
     truth: Poses
+
+    @property
+    def intrinsics(self) -> str | None:
+        """The value of `--intrinsics`; None: the camera is not known."""
+        return None if self.camera == "unknown" else str(self.folder / "K.txt")
+
+    @property
+    def held(self) -> str | None:
+        """The value of `--intrinsics` for photos whose camera is not adjusted."""
+        return self.intrinsics if self.camera == "known" else None
 
 
 def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[Pair]]:
@@ -146,7 +156,11 @@ def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[P
         out,
         config=preset(name),
         options=RunOptions(
-            intrinsics=given.known, mapper=given.mapper, keep_features=True, progress=True
+            intrinsics=given.intrinsics,
+            refine_intrinsics="no" if given.held else "yes",
+            mapper=given.mapper,
+            keep_features=True,
+            progress=True,
         ),
     )
     row: dict[str, Json] = {
@@ -158,7 +172,7 @@ def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[P
     if given.frames.localized:
         start = time.monotonic()
         options = LocalizeOptions(
-            intrinsics=given.known, reference=given.folder, keep_features=True, progress=True
+            intrinsics=given.held, reference=given.folder, keep_features=True, progress=True
         )
         found = localize_photos(given.frames.localized, out, options=options).photos
         seconds = time.monotonic() - start
@@ -180,7 +194,7 @@ def with_rootsift(given: FrameSequence, pairs: set[Pair]) -> dict[str, Json]:
     out.mkdir(parents=True, exist_ok=True)
     every = [*given.frames.mapped, *given.frames.localized]
     images, _ = open_images(_linked(every, given.work / "all"))
-    known = parse_intrinsics(given.known) if given.known else None
+    known = parse_intrinsics(given.intrinsics) if given.intrinsics else None
     database, start = out / "database.db", time.monotonic()
     write_rootsift_database(
         database,
@@ -192,7 +206,7 @@ def with_rootsift(given: FrameSequence, pairs: set[Pair]) -> dict[str, Json]:
     )
     matched = time.monotonic()
     names = [frame.name for frame in given.frames.mapped]
-    options = MapOptions(refine_intrinsics=known is None)
+    options = MapOptions(refine_intrinsics=given.held is None)
     models = first_models(database, options, names=names).models
     mapped = time.monotonic()
     row: dict[str, Json] = {
@@ -257,7 +271,7 @@ def _measured(given: FrameSequence, methods: list[str]) -> Iterator[dict[str, Js
         else:
             row, pairs = with_jaxsfm(given, method)
         frames = len(given.frames.mapped)
-        yield {"method": method, "frames": frames, "known": given.known is not None, **row}
+        yield {"method": method, "frames": frames, "camera": given.camera, **row}
 
 
 def bench_sequence(options: SequenceOptions) -> dict[str, Json]:
@@ -270,14 +284,14 @@ def bench_sequence(options: SequenceOptions) -> dict[str, Json]:
     if methods == [ROOTSIFT]:
         raise UserError("--methods: rootsift needs a preset beside it, which chooses the pairs")
     truth = read_poses(options.root)
-    known = str(options.root / "K.txt") if options.intrinsics == "known" else None
     rows: list[dict[str, Json]] = []
     for every in whole_numbers(options.every, "--every"):
         frames = chosen_frames(options.root, every, options.localize)
-        parts = [f"every-{every}", "" if known else "unknown", *_others(options)]
+        parts = [f"every-{every}", *_others(options)]
         work = options.out / "-".join(filter(None, parts))
         for row in _measured(
-            FrameSequence(options.root, frames, work, known, options.mapper, truth), methods
+            FrameSequence(options.root, frames, work, options.intrinsics, options.mapper, truth),
+            methods,
         ):
             rows.append(row)
             if options.json:
@@ -287,8 +301,9 @@ def bench_sequence(options: SequenceOptions) -> dict[str, Json]:
 
 def _others(options: SequenceOptions) -> list[str]:
     """What else a folder of results is named after."""
+    camera = "" if options.intrinsics == "known" else options.intrinsics
     mapper = "" if options.mapper == "incremental" else options.mapper
-    return [mapper, f"localize-{options.localize}" if options.localize else ""]
+    return [camera, mapper, f"localize-{options.localize}" if options.localize else ""]
 
 
 def table_lines(figures: Mapping[str, Json]) -> list[str]:
@@ -298,9 +313,8 @@ def table_lines(figures: Mapping[str, Json]) -> list[str]:
     for row in rows:
         ends = ", ".join(f"{end:.4f}" for end in row["ends"])
         stages = ", ".join(f"{name} {value:.0f}" for name, value in row["seconds"].items())
-        camera = "known" if row["known"] else "unknown"
         lines.append(
-            f"{row['frames']:<7} {camera:<8} {row['method']:<10} {row['registered']:>10}  "
+            f"{row['frames']:<7} {row['camera']:<8} {row['method']:<10} {row['registered']:>10}  "
             f"{row['position']:>8.4f}  {ends:<17}  {sum(row['seconds'].values()):.0f} ({stages})"
         )
         if found := row.get("localized"):

@@ -33,6 +33,7 @@ def bundle_adjust(
     loss_px: float,
     refine_intrinsics: bool,
     threads: int,
+    steps: int = 50,
 ) -> None:
     """Adjust all poses and points of a model, in place.
 
@@ -46,6 +47,7 @@ def bundle_adjust(
       refine_intrinsics: also adjust focal lengths and distortion, and the principal points of
         cameras that `VIEWS_FOR_CENTRE` views share.
       threads: of the solver; -1 takes all cores.
+      steps: the solver ends after so many, if it has not ended before.
     """
     images = (reconstruction.image(i) for i in reconstruction.reg_image_ids())
     views = Counter(image.camera_id for image in images)
@@ -56,7 +58,7 @@ def bundle_adjust(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_px
     options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.max_num_iterations = steps
     options.ceres.solver_options.function_tolerance = 1e-7
     options.ceres.solver_options.initial_trust_region_radius = TRUST_RADIUS
     before = {number: _centre(reconstruction.camera(number)) for number in sorted(shared)}

@@ -96,6 +96,8 @@ def refinement_lines(refinement: RefinementFigures) -> list[str]:
                 f"not refined      {name}: too few points agree; it keeps the observations of the "
                 "mapper"
             )
+    if refinement.camera is not None:
+        lines.append(f"camera           {refinement.camera.in_words()}")
     return lines
 
 

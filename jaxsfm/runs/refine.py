@@ -204,6 +204,8 @@ def refine_lines(report: RefineReport) -> list[str]:
         )
     intrinsics = "were refined" if report.refined_intrinsics else "stayed as they were"
     lines.append(f"intrinsics {intrinsics}")
+    if report.refinement.camera is not None:
+        lines.append(f"camera: {report.refinement.camera.in_words()}")
     lines += [f"not read: {reason}" for reason in report.unread.values()]
     for at in report.refinement.placed:
         if at.name in report.removed:

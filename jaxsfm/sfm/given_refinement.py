@@ -1,5 +1,6 @@
 """The refinement of a model that another tool has made."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,6 +10,7 @@ import numpy as np
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.model_folders import colour_points
+from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.updated_model import has_rigs, updated
 from jaxsfm.config import Refinement
@@ -65,6 +67,8 @@ def refine_given(
     if has_rigs(model):
         bundle_adjust(model, loss_px=1.0, refine_intrinsics=refine_intrinsics, threads=threads)
     move_back(model, model_poses(given))
+    if not refine_intrinsics:
+        figures = dataclasses.replace(figures, camera=other_camera(model, threads=threads))
     return GivenRefinement(model, figures)
 
 

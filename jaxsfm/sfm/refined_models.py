@@ -13,6 +13,7 @@ from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import colour_points
 from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
 from jaxsfm.config import WORTH, Config, Refinement
@@ -145,6 +146,9 @@ class _Refining(NamedTuple):
             return self._whole(model), None
         if options.refine_intrinsics:
             new = _with_one_camera(new, self.photos, options.threads)
+        else:
+            camera = other_camera(new, threads=options.threads)
+            done = dataclasses.replace(done, camera=camera)
         return new, done
 
     def _whole(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":

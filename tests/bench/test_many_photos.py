@@ -1,6 +1,7 @@
 """Laws of what many photos are measured with: a rendered street, simulated matches, the driver, and
 frames of a sequence."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from jaxsfm.bench import driver, sequence
 from jaxsfm.bench.long_street import SIZE, walk, write_street
+from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.simulated import NOISE_PX, REACH, SimulatedStreet
 from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.cli.main import main
@@ -92,6 +94,27 @@ def test_options_of_a_sequence_that_make_no_sense_are_refused(tmp_path, capsys, 
     both = ["--root", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(["bench", "sequence", *both, *given]) == 2
     assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("camera", ["known", "start", "unknown"])
+def test_the_camera_of_a_folder_is_held_adjusted_or_not_used(
+    street_sequence, tmp_path, monkeypatch, camera
+):
+    seen = []
+
+    def reconstruct(folder, out, *, config, options):
+        seen.append((out.parent.name, options))
+        raise UserError("seen")
+
+    monkeypatch.setattr(sequence, "reconstruct_folder", reconstruct)
+    options = SequenceOptions(root=street_sequence, intrinsics=camera, out=tmp_path)
+    with pytest.raises(UserError, match="seen"):
+        sequence.bench_sequence(dataclasses.replace(options, every=("2",)))
+    ((folder, given),) = seen
+    assert folder == ("every-2" if camera == "known" else f"every-2-{camera}")
+    k = str(street_sequence / "K.txt")
+    assert given.intrinsics == (None if camera == "unknown" else k)
+    assert given.refines == (camera != "known")
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ from kept_runs import HOSTILE, change_report, renamed
 from verdicts import NAMES, check_of, with_verdicts
 
 from jaxsfm.cli.main import main
+from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.core.types import Status
@@ -28,6 +29,7 @@ from jaxsfm.report.run_results import LostPhoto, PairRow
 from jaxsfm.report.scene import shown_scene
 from jaxsfm.report.verdict import model_verdicts
 from jaxsfm.sfm.evaluation import Similarity
+from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.view_graph import Verdict
 
 SECTIONS = ("the-model", "photos", "pairs", "matches", "keypoints", "run", "next")
@@ -297,6 +299,16 @@ def test_a_page_of_a_doubtful_model_has_no_green_outcome(plain):
         report = with_verdicts(run.report, colour)
         text = page(dataclasses.replace(run, report=report))
         assert f'class="outcome {word}"' in text
+
+
+def test_the_page_names_the_camera_that_the_photos_speak_for(plain):
+    run = read_run(plain[0])
+    assert 'id="camera"' not in page(run)
+    camera = OtherCamera(model="PINHOLE", params=[5, 5, 3, 2], distance_px=4, halves_px=0.5)
+    figures = RefinementFigures(passes=[], placed=[], camera=camera)
+    report = dataclasses.replace(run.report, refinement=[figures])
+    body = without_scripts(page(dataclasses.replace(run, report=report)))
+    assert f"<b>Camera:</b> {camera.in_words()}." in body
 
 
 def test_names_in_a_verdict_are_only_ever_text(plain):

@@ -95,9 +95,13 @@ def test_second_tries_and_refinement_are_said():
         in text
     )
     assert "never" not in text and text.count("left it out") == 1 and "doubtful" not in text
+    assert "camera  " not in text
     back = {"passes": [figures | {"accepted": False}], "placed": []}
-    text = "\n".join(summary_lines(report(refinement=[back])))
+    other = {"model": "PINHOLE", "params": [5, 5, 3, 2], "distance_px": 4.52, "halves_px": 0.44}
+    text = "\n".join(summary_lines(report(refinement=[back | {"camera": other}])))
     assert "too few agreed, so this pass was taken back" in text
+    assert "camera           the photos speak for another one, PINHOLE:5,5,3,2. It mov" in text
+    assert "4.5 px, and two halves of the points agree on it to 0.4 px" in text
 
 
 def test_a_failed_evaluation_is_said():

@@ -19,7 +19,7 @@ from jaxsfm.colmap.poses import model_poses, read_model
 from jaxsfm.colmap.updated_model import has_rigs
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError
-from jaxsfm.runs.refine import REPORT, RefineOptions, RefineReport, refine_folder
+from jaxsfm.runs.refine import REPORT, RefineOptions, RefineReport, refine_folder, refine_lines
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 ONE_PASS = RefineOptions(
@@ -294,7 +294,7 @@ def test_intrinsics_are_refined_unless_they_look_calibrated(tmp_path, rendered, 
     write(tmp_path / "guessed", model)
     options = RefineOptions(threads=1)
     after, report = refined(tmp_path / "guessed", photos, tmp_path / "a", options)
-    assert report.refined_intrinsics
+    assert report.refined_intrinsics and report.refinement.camera is None
     assert abs(after.camera(1).focal_length_x / focal - 1) < 0.005
     change = report.cameras[1]
     assert change.before[0] == 1.02 * focal and change.after[0] == after.camera(1).params[0]
@@ -304,6 +304,9 @@ def test_intrinsics_are_refined_unless_they_look_calibrated(tmp_path, rendered, 
     after, report = refined(tmp_path / "known", photos, tmp_path / "b", options)
     assert not report.refined_intrinsics
     assert np.array_equal(after.camera(1).params, camera.params)
+    other = report.refinement.camera  # the one that was held is wrong
+    assert other is not None and abs(other.params[0] / focal - 1) < 0.01
+    assert f"camera: {other.in_words()}" in refine_lines(report)
 
 
 # -- what is refused ---------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from room_scene import SIZE, noisy_model, read_of
 
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_images import part_of, registered
+from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module
@@ -55,7 +56,14 @@ def refined(rendered, monkeypatch):
     small = noisy_model(rendered, 0.0)
     small.deregister_frame(small.image(5).frame_id)
 
-    def run(placed: Placement, against: dict, *, checked: bool = True, gone: bool = False):
+    def run(
+        placed: Placement,
+        against: dict,
+        *,
+        checked: bool = True,
+        gone: bool = False,
+        options: MapOptions = OPTIONS,
+    ):
         offered, asked = [], []
 
         def refine_model(model, read, settings, *, evidence, with_all_points, **_):
@@ -67,8 +75,8 @@ def refined(rendered, monkeypatch):
             new = noisy_model(rendered, 0.0) if added else model
             return new, RefinementFigures(passes=[], placed=[placed] if added else [])
 
-        def whole(model, database, options):
-            assert (database, options) == (DATABASE, OPTIONS)
+        def whole(model, database, given):
+            assert (database, given) == (DATABASE, options)
             return "whole" if model == "a model" else part_of(model, NAMES[:3])
 
         def doubts(model, images, refinement, given):
@@ -86,7 +94,7 @@ def refined(rendered, monkeypatch):
             FakePhotos(rendered),  # pyright: ignore[reportArgumentType]
             Believed(DATABASE, {}, PAIRS),
             config=Config(refinement=Refinement(), checked=checked),
-            options=OPTIONS,
+            options=options,
         )
         return made, offered, asked
 
@@ -136,6 +144,17 @@ def test_a_photo_that_went_away_leaves_the_mappers_models_with_all_points(refine
     made, _, _ = refined(placement(), {}, gone=True)
     assert made.figures == [None, None] and [len(registered(m)) for m in made.models] == [3, 3]
     assert "2.png: cannot be read" in caplog.text
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_camera_that_was_held_is_compared_with_the_one_that_the_photos_speak_for(
+    refined, monkeypatch, held
+):
+    other = OtherCamera(model="OPENCV", params=[1.0] * 8, distance_px=4.0, halves_px=0.5)
+    monkeypatch.setattr(module, "other_camera", lambda model, *, threads: other)
+    options = MapOptions(refine_intrinsics=not held)
+    made, _, _ = refined(placement(), {NEW: "a reason"}, options=options)
+    assert [figures.camera for figures in made.figures] == [other if held else None] * 2
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from verdicts import OTHER, check_of
 
 from jaxsfm.colmap.mapper import Attempt
+from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.one_pass import PassFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
@@ -92,7 +93,11 @@ def test_figures_of_refinement_survive_a_file_with_the_order_of_the_models(tmp_p
     models = [
         RefinementFigures(passes=[one, dataclasses.replace(one, accepted=False)], placed=[placed]),
         None,
-        RefinementFigures(passes=[], placed=[]),
+        RefinementFigures(
+            passes=[],
+            placed=[],
+            camera=OtherCamera(model="PINHOLE", params=[9.0] * 4, distance_px=4.5, halves_px=0.5),
+        ),
     ]
     write_refinement(tmp_path, models, [2, 0, 1])
     assert read_refinement(tmp_path) == (models, [2, 0, 1])

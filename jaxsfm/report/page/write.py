@@ -102,11 +102,14 @@ def page(run: FinishedRun) -> str:
     names = photo_names(report)
     pictures, photos = pair_pictures(run)
     anchors = _anchors(report)
+    refinement = report.refinement[0] if report.refinement else None
+    camera = refinement.camera if refinement else None
     return _ENVIRONMENT.get_template("page.html").render(
         title=shown_name(run.folder.absolute().name),
         plotly=Markup(plotly.offline.get_plotlyjs()),
         report=report,
         verdicts=model_verdicts(report.checked),
+        camera=camera and camera.in_words(),
         most_findings=MAX_FINDINGS,
         named_photos=MOST_NAMED,
         reference=run.reference,

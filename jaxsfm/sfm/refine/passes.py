@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxsfm.colmap.model import Model, Sizes
+from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -45,6 +46,8 @@ class RefinementFigures:
     passes: list[PassFigures]
     placed: list[Placement]
     """One for each view that was weak in any pass, and for each image that the mapper left out."""
+    camera: OtherCamera | None = None
+    """The camera that the photos speak for, if it is not the one that was held."""
 
 
 def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
@@ -52,6 +55,7 @@ def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
     return RefinementFigures(
         passes=[PassFigures(**each) for each in row["passes"]],
         placed=[Placement(**each) for each in row["placed"]],
+        camera=OtherCamera(**row["camera"]) if row.get("camera") else None,
     )
 
 
