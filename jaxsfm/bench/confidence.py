@@ -2,7 +2,8 @@
 
 Pairs of photos with known poses are drawn, from one set or from two, and the second photo of each
 is altered. A pair is right if at least half of its matches lie near their true epipolar lines. So
-photos of different places are never right.
+photos of different places are never right. Photos of two sets of one place are not drawn together,
+because their common poses are not known.
 """
 
 import zlib
@@ -61,8 +62,7 @@ class Reliability(TypedDict):
     calibration_error: float
     squared_error: float
     fitted: tuple[float, float] | None
-    """The evidence with a confidence of one half and the width of the curve that fit half A best.
-    """
+    """The evidence with a confidence of one half, and the power, that fit half A best."""
     on_other_half: tuple[float, float] | None
     """The squared error on half B of the curve that `match` uses, and of the fitted one."""
 
@@ -185,10 +185,10 @@ def table_lines(result: BenchFigures[ConfidenceRow, Reliabilities]) -> list[str]
             f"{found['squared_error']:.3f}"
         )
         if found["fitted"] is not None and found["on_other_half"] is not None:
-            half, width = found["fitted"]
+            half, power = found["fitted"]
             ours, theirs = found["on_other_half"]
             line += (
-                f"; half A is fitted best by a curve at {half:.0f} with width {width:.0f}, which "
+                f"; half A is fitted best by a curve at {half:.0f} with power {power:.1f}, which "
                 f"has {theirs:.3f} on half B, and the curve in use {ours:.3f}"
             )
         lines.append(line)

@@ -1,5 +1,6 @@
 """Pairs of photos with known poses, drawn from sets of them; the second photo is altered."""
 
+import itertools
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ import numpy as np
 
 from jaxsfm.bench.alterations import Alteration, Altered
 from jaxsfm.bench.matches import Matches
-from jaxsfm.bench.strecha_sets import StrechaSet
+from jaxsfm.bench.strecha_sets import StrechaSet, place_of
 from jaxsfm.bench.wxbs import symmetric_epipolar_error
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.errors import UserError
@@ -21,7 +22,7 @@ NEAR_PX = 10.0
 """A match this near to its epipolar lines may be right, pixels of the altered photo. Of random
 matches a few per cent are."""
 STRANGERS = 1 / 3
-"""The share of the drawn pairs whose photos are of two sets."""
+"""The share of the draws whose photos are of two sets; it is less if sets show one place."""
 
 
 class PosedPhoto(NamedTuple):
@@ -94,19 +95,29 @@ def posed_photos(given: StrechaSet) -> list[PosedPhoto]:
 
 
 def drawn_pairs(sets: Sequence[Sequence[PosedPhoto]], number: int) -> Iterator[DrawnPair]:
-    """The first `number` pairs of an endless list that depends on the names of the sets alone."""
-    names = [zlib.crc32(photos[0].scene.encode()) for photos in sets]
-    for k in range(number):
-        rng = np.random.default_rng([k, *names])
-        own = int(rng.integers(len(sets)))
-        strange = len(sets) > 1 and rng.random() < STRANGERS
-        other = (own + int(rng.integers(1, len(sets)))) % len(sets) if strange else own
-        first = int(rng.integers(len(sets[own])))
-        if strange:
-            second = int(rng.integers(len(sets[other])))
-        else:
-            second = (first + int(rng.integers(1, len(sets[own])))) % len(sets[own])
-        yield DrawnPair(sets[own][first], sets[other][second], drawn_alteration(rng))
+    """The first `number` pairs of an endless list that depends on the names of the sets alone.
+
+    Photos of two sets are of two places: the poses of two sets of one place are not comparable.
+    """
+    endless = filter(None, (_drawn(sets, k) for k in itertools.count()))
+    return itertools.islice(endless, number)
+
+
+def _drawn(sets: Sequence[Sequence[PosedPhoto]], k: int) -> DrawnPair | None:
+    """The k-th pair; None if its photos are of two sets of one place."""
+    names = [photos[0].scene for photos in sets]
+    rng = np.random.default_rng([k, *(zlib.crc32(name.encode()) for name in names)])
+    own = int(rng.integers(len(sets)))
+    strange = len(sets) > 1 and rng.random() < STRANGERS
+    other = (own + int(rng.integers(1, len(sets)))) % len(sets) if strange else own
+    first = int(rng.integers(len(sets[own])))
+    if strange:
+        second = int(rng.integers(len(sets[other])))
+    else:
+        second = (first + int(rng.integers(1, len(sets[own])))) % len(sets[own])
+    if strange and place_of(names[own]) == place_of(names[other]):
+        return None
+    return DrawnPair(sets[own][first], sets[other][second], drawn_alteration(rng))
 
 
 def drawn_alteration(rng: np.random.Generator) -> Alteration:

@@ -61,27 +61,44 @@ def squared_error(confidences: Sequence[float], right: Sequence[bool]) -> float:
 
 
 def fitted_curve(evidence: Sequence[float], right: Sequence[bool]) -> tuple[float, float] | None:
-    """The logistic curve that makes what is right most likely: where it is one half, and its width.
+    """The curve (`curve_at`) that makes what is right most likely, and its parameters too.
+
+    Few things may be parted by one evidence, and then the most likely curve is a step. So the
+    parameters have the weakly informative prior of Gelman et al. 2008, "A weakly informative
+    default prior distribution for logistic and other regression models": Cauchy, of scale 2.5 for
+    the slope and 10 for the offset, after the logarithms have a standard deviation of one half.
 
     Returns:
       None if all are right or none is.
     """
-    given, truth = np.asarray(evidence, np.float64), np.asarray(right, bool)
+    given, truth = _logarithms(evidence), np.asarray(right, bool)
     if truth.all() or not truth.any():
         return None
+    middle, width = float(given.mean()), max(2 * float(given.std()), 1e-6)
+    scaled = (given - middle) / width
 
     def unlikelihood(of: np.ndarray) -> float:
-        z = (given - of[0]) / np.exp(of[1])
-        return float(np.logaddexp(0, np.where(truth, -z, z)).mean())
+        offset, slope = of
+        z = offset + slope * scaled
+        prior = np.log1p((offset / 10) ** 2) + np.log1p((slope / 2.5) ** 2)
+        return float(np.logaddexp(0, np.where(truth, -z, z)).sum() + prior)
 
-    start = [float(np.median(given)), np.log(max(float(np.std(given)) / 4, 1.0))]
-    found = minimize(unlikelihood, start, method="Nelder-Mead", options={"maxiter": 2000})
-    return float(found.x[0]), float(np.exp(found.x[1]))
+    offset, slope = minimize(unlikelihood, [0.0, 1.0], method="Nelder-Mead").x
+    return float(np.exp(middle - width * offset / slope)), float(slope / width)
+
+
+def _logarithms(evidence: Sequence[float]) -> np.ndarray:
+    return np.log(np.maximum(np.asarray(evidence, np.float64), 1.0))
 
 
 def curve_at(evidence: Sequence[float], curve: tuple[float, float]) -> list[float]:
-    """The confidences that a curve of `fitted_curve` gives."""
-    return expit((np.asarray(evidence, np.float64) - curve[0]) / curve[1]).tolist()
+    """Confidences: one half at an evidence, and odds that grow with a power of it.
+
+    Args:
+      curve: this evidence, and the power.
+    """
+    half, power = curve
+    return expit(power * (_logarithms(evidence) - np.log(half))).tolist()
 
 
 def write_diagram(path: Path, methods: Mapping[str, Sequence[Bin]]) -> None:

@@ -30,8 +30,9 @@ logger = logging.getLogger("jaxsfm")
 
 CLOSER = 3
 """Pairs of a photo that are looked at closer. Each takes 3 to 60 s on two cores."""
-LIKELY = 0.5
-"""Matches of a pair count if their confidence is at least this."""
+WORTH_A_TRY = 60.0
+"""Matches of a pair count if they have at least this evidence. They are more often wrong than right
+then: alignment has to confirm the place that they give."""
 KEPT_FEATURES = CLOSER + 1
 """Photos whose features are in memory: those of one photo and of its partners."""
 
@@ -49,7 +50,7 @@ def look_closer(
       store: where the results are kept, so that an interrupted run need not look again.
 
     Returns:
-      the matches of the pairs that are likely right, original pixels. Pairs of photos that cannot
+      the matches of the pairs that are worth a try, original pixels. Pairs of photos that cannot
       be decoded are left out.
     """
 
@@ -58,7 +59,7 @@ def look_closer(
         found = job.load_features(images[name])
         return found or image_features(job.weights, images[name], config=job.config)
 
-    likely = {}
+    worth = {}
     for pair in pairs:
         interrupt.check()
         found = store.load_matches(pair) if store else None
@@ -70,16 +71,16 @@ def look_closer(
             if store:
                 store.save_matches(found)
         if found.num_inliers:
-            likely[pair] = found
-    return likely
+            worth[pair] = found
+    return worth
 
 
 def _matched(job: Job, features: tuple[ImageFeatures, ImageFeatures]) -> PairResult:
-    """The matches of a pair; none if they are likely wrong."""
+    """The matches of a pair; none if they are hardly ever right."""
     found = match_photos(
         job.weights, *features, config=job.config, seed=job.seed, worth_closer=HOPELESS
     )
-    return found.result if found.confidence >= LIKELY else without_matches(found.result)
+    return found.result if found.evidence >= WORTH_A_TRY else without_matches(found.result)
 
 
 def without_matches(result: PairResult) -> PairResult:

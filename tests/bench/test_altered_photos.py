@@ -18,7 +18,7 @@ from jaxsfm.bench.drawn_pairs import (
     true_fundamental_matrix,
 )
 from jaxsfm.bench.matches import Matches
-from jaxsfm.bench.strecha_sets import read_sets
+from jaxsfm.bench.strecha_sets import place_of, read_sets
 from jaxsfm.bench.turns import copies, means
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose
@@ -123,6 +123,17 @@ def test_pairs_are_of_two_photos_and_a_third_of_them_of_two_places(two_sets):
     assert {p.alteration.quarters for p in pairs} == {0, 1, 2, 3}
     one_set = list(drawn_pairs(two_sets[:1], 20))
     assert all(pair.one_place for pair in one_set)
+
+
+def test_photos_of_two_sets_of_one_place_are_not_drawn_together(tmp_path):
+    names = ("castle-P19", "entry-P10", "Herz-Jesus-P8")
+    rng = rng_of(0)
+    sets = [[posed(name, rng, tmp_path / f"{k}.png") for k in range(6)] for name in names]
+    pairs = list(drawn_pairs(sets, 200))
+    drawn = {frozenset((p.first.scene, p.second.scene)) for p in pairs if not p.one_place}
+    assert drawn == {frozenset(("castle-P19", names[2])), frozenset(("entry-P10", names[2]))}
+    places = [place_of(name) for name in (*names, "fountain-P11", "Herz-Jesus-P25", "a")]
+    assert places == ["castle", "castle", "Herz-Jesus", "castle", "Herz-Jesus", "a"]
 
 
 def test_photos_of_a_set_have_their_camera_in_our_pixels(strecha):

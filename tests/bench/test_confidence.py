@@ -17,7 +17,7 @@ from jaxsfm.bench.reliability import (
 )
 from jaxsfm.bench.wxbs import HALVES
 from jaxsfm.cli.main import main
-from jaxsfm.sfm.two_photos.matched import HALF_SURE, STEEPNESS, confidence
+from jaxsfm.sfm.two_photos.matched import HALF_SURE, POWER, confidence
 
 
 def test_everything_is_in_the_bin_of_its_confidence():
@@ -50,16 +50,25 @@ def test_squared_errors_are_those_of_certainty():
 
 def test_a_fitted_curve_is_the_one_that_made_the_data():
     rng = rng_of(0)
-    evidence = rng.uniform(-100, 300, 4000)
-    right = rng.random(4000) < curve_at(evidence, (HALF_SURE, STEEPNESS))
-    half, width = fitted_curve(evidence, right)
-    assert half == pytest.approx(HALF_SURE, abs=4) and width == pytest.approx(STEEPNESS, abs=4)
+    evidence = np.exp(rng.uniform(0, 9, 4000))
+    right = rng.random(4000) < curve_at(evidence, (90.0, 1.5))
+    half, power = fitted_curve(evidence, right)
+    assert half == pytest.approx(90, rel=0.15) and power == pytest.approx(1.5, rel=0.1)
     assert fitted_curve([1.0, 2.0], [True, True]) is None
 
 
+def test_few_things_that_one_evidence_parts_are_not_fitted_by_a_step():
+    """The most likely curve would be a step between 100 and 200."""
+    half, power = fitted_curve([10.0, 50.0, 100.0, 200.0, 900.0], [False] * 3 + [True] * 2)
+    assert 100 < half < 200 and 0.5 < power < 10
+    more = [*np.linspace(1, 100, 200), *np.linspace(200, 900, 200)]
+    assert fitted_curve(more, [False] * 200 + [True] * 200)[1] > 2 * power
+
+
 def test_the_curve_in_use_is_that_of_the_confidence():
-    found = curve_at([0.0, 60.0, 500.0], (HALF_SURE, STEEPNESS))
-    assert found == pytest.approx([confidence(e) for e in (0.0, 60.0, 500.0)])
+    given = [0.0, 1.0, 60.0, HALF_SURE, 5000.0]
+    found = curve_at(given, (HALF_SURE, POWER))
+    assert found == pytest.approx([confidence(e) for e in given])
 
 
 def test_the_curve_is_fitted_on_one_half_and_tested_on_the_other():
@@ -67,15 +76,15 @@ def test_the_curve_is_fitted_on_one_half_and_tested_on_the_other():
         given = {"half": half, "evidence": evidence, "right": right, "method": "default"}
         return {**given, "confidence": confidence(evidence)}
 
-    chosen = [row(HALVES[0], e, e > 100) for e in (0, 40, 80, 90, 110, 120, 400)]
+    chosen = [row(HALVES[0], e, e > 100) for e in (0, 40, 80, 90, 110, 120, 400) * 20]
     tested = [row(HALVES[1], 80, False), row(HALVES[1], 150, True)]
     found = summary(chosen + tested)["default"]
-    assert found["pairs"] == 9
-    half, width = found["fitted"]
+    assert found["pairs"] == 142
+    half, power = found["fitted"]
     assert 90 < half < 110
     ours, fitted = found["on_other_half"]
     assert ours == pytest.approx(squared_error([confidence(80), confidence(150)], [False, True]))
-    assert fitted == pytest.approx(squared_error(curve_at([80, 150], (half, width)), [False, True]))
+    assert fitted == pytest.approx(squared_error(curve_at([80, 150], (half, power)), [False, True]))
     assert fitted < ours
     assert summary(tested)["default"]["on_other_half"] is None
 

@@ -14,7 +14,7 @@ from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches
 from jaxsfm.io.store import Store
 from jaxsfm.runs import closer_looks
 from jaxsfm.runs.closer_looks import CLOSER, look_closer, pairs_to_look_at, without_matches
-from jaxsfm.sfm.two_photos.matched import HOPELESS, confidence
+from jaxsfm.sfm.two_photos.matched import HOPELESS
 
 
 def test_the_strongest_pairs_with_placed_photos_are_looked_at():
@@ -51,7 +51,7 @@ def looked(monkeypatch):
             assert worth_closer == HOPELESS and seed == 7
             pair = (a.image.name, b.image.name)
             done.append(pair)
-            return SimpleNamespace(result=result(pair), confidence=confidence(evidence[pair]))
+            return SimpleNamespace(result=result(pair), evidence=evidence[pair])
 
         monkeypatch.setattr(closer_looks, "image_features", features)
         monkeypatch.setattr(closer_looks, "match_photos", match)
@@ -60,7 +60,7 @@ def looked(monkeypatch):
     return of
 
 
-def test_only_likely_matches_count_and_none_of_photos_that_cannot_be_decoded(looked):
+def test_only_matches_with_enough_evidence_count_and_none_of_photos_that_cannot_be_decoded(looked):
     job, images = job_and_images()
     evidence = {("a", "b"): 61.0, ("a", "c"): 59.0}
     done = looked(evidence, damaged="d")

@@ -80,7 +80,7 @@ def test_cells_of_an_enlarged_photo_are_counted_in_larger_cells():
 
 
 def test_confidence_grows_from_none_to_certainty():
-    values = [confidence(e) for e in (0.0, 30.0, 60.0, 90.0, 400.0)]
+    values = [confidence(e) for e in (0.0, 30.0, 60.0, 200.0, 4000.0)]
     assert values == sorted(values) and values[0] < 0.05 and values[-1] > 0.99
 
 

@@ -177,5 +177,8 @@ def test_closer_looks_end_when_one_is_not_stronger(steps):
 
 
 def test_confidence_is_half_at_the_evidence_of_a_pair_that_may_be_right_or_wrong():
-    assert matched.confidence(60) == pytest.approx(0.5)
-    assert matched.confidence(75) == pytest.approx(1 / (1 + 2.718281828**-1))
+    half, power = matched.HALF_SURE, matched.POWER
+    assert matched.confidence(half) == pytest.approx(0.5)
+    odds = [c / (1 - c) for c in map(matched.confidence, (half / 2, half, 3 * half))]
+    assert odds == pytest.approx([0.5**power, 1.0, 3.0**power])
+    assert matched.confidence(0.0) == matched.confidence(1.0) < 1e-3

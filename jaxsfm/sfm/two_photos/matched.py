@@ -8,7 +8,6 @@ look counts only if it is stronger than the look that led to it.
 
 import dataclasses
 import functools
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -35,9 +34,9 @@ from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
 
 ENOUGH = 400.0
 """A first look with so much evidence is not followed by another (docs/decisions/hard-pairs.md)."""
-ENOUGH_SHARE = 0.2
-"""Nor is one in which so large a share of the matches agrees, and which is more likely right than
-not: small photos have too few cells for much evidence. First looks of hard pairs have 2 to 13 %."""
+ENOUGH_SHARE, AT_LEAST = 0.2, 60.0
+"""Nor is one in which so large a share of the matches agrees, and which has at least so much
+evidence: small photos have too few cells for more. First looks of hard pairs have 2 to 13 %."""
 MOST_ENLARGED = 2.0
 """Small photos are described once more, enlarged so much, if no scale is sure. The preset `robust`
 does so at the first look."""
@@ -54,9 +53,9 @@ a greater factor, in any direction, or turned by more degrees (docs/decisions/ha
 CONFIRMED = 0.5
 """It counts if it has so large a share of the evidence of the first one: matches of photos that are
 seen alike are nearer, even if the view has fewer cells than the photos."""
-HALF_SURE, STEEPNESS = 60.0, 15.0
-"""The logistic curve from evidence to confidence, fitted to pairs of WxBS and to photos of
-different places (docs/decisions/hard-pairs.md)."""
+HALF_SURE, POWER = 166.0, 2.5
+"""A pair with the evidence `HALF_SURE` is as probably right as wrong, and the odds grow with this
+power of the evidence. Fitted to drawn pairs with known poses (docs/decisions/hard-pairs.md)."""
 
 
 class TwoPhotos(NamedTuple):
@@ -79,7 +78,7 @@ class TwoPhotos(NamedTuple):
 
 def confidence(evidence: float) -> float:
     """The probability that a pair with this evidence is right."""
-    return 1 / (1 + math.exp(-(evidence - HALF_SURE) / STEEPNESS))
+    return 1 / (1 + (HALF_SURE / max(evidence, 1.0)) ** POWER)
 
 
 def match_photos(
@@ -157,7 +156,7 @@ def _look_closer(
 def is_settled(first: Look) -> bool:
     """Whether a first look needs no other."""
     share = first.result.num_inliers / max(first.result.num_tentative, 1)
-    likely = first.evidence > HALF_SURE and share >= ENOUGH_SHARE
+    likely = first.evidence > AT_LEAST and share >= ENOUGH_SHARE
     return likely or first.evidence >= ENOUGH
 
 
