@@ -7,16 +7,16 @@ errors after a similarity over all frames, and those of the first and the last t
 """
 
 import dataclasses
-import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.model_options import CameraUse, SequenceOptions
+from jaxsfm.bench.frames import FrameSequence, chosen_frames, linked
+from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.options import whole_numbers
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
@@ -36,7 +36,6 @@ from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.options import MapperChoice
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizedPhoto
 from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 ROOTSIFT = "rootsift"
-PHOTOS = (".jpg", ".jpeg", ".png")
 END = 0.1
 """The share of the frames at either end whose errors are reported apart."""
 NEAR, NEAR_DEG = 0.05, 5.0
@@ -61,36 +59,6 @@ NEAR, NEAR_DEG = 0.05, 5.0
 limits of 7-Scenes (Shotton et al. 2013)."""
 MATCH_ERROR_PX = 12.0
 """Of a match of RootSIFT with a point: the limit of COLMAP's mapper."""
-
-
-class Frames(NamedTuple):
-    """The frames of a folder that are used."""
-
-    mapped: list[Path]
-    localized: list[Path]
-
-
-def chosen_frames(folder: Path, every: int, localize: int) -> Frames:
-    """Each `every`-th frame by name; of these, each `localize`-th is localized (0: none).
-
-    Raises:
-      UserError: there are fewer than three frames.
-    """
-    found = [p for p in folder.iterdir() if p.suffix.lower() in PHOTOS]
-    frames = sorted(found, key=lambda path: natural(path.name))[::every]
-    if len(frames) < 3:
-        raise UserError(f"{folder}: fewer than three frames")
-    out = frames[localize // 2 :: localize] if localize else []
-    return Frames([path for path in frames if path not in out], out)
-
-
-def _linked(frames: list[Path], folder: Path) -> Path:
-    """A folder with links to some frames."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for frame in frames:
-        if not (folder / frame.name).exists():
-            os.symlink(frame.absolute(), folder / frame.name)
-    return folder
 
 
 def errors(model: Poses, truth: Poses) -> dict[str, Json]:
@@ -123,36 +91,11 @@ def _summary(found: Mapping[str, PoseError], frames: int, seconds: float) -> dic
     }
 
 
-class FrameSequence(NamedTuple):
-    """The input of all methods."""
-
-    folder: Path
-    """Of the frames and their poses."""
-    frames: Frames
-    work: Path
-    """Where results are kept."""
-    camera: CameraUse
-    """What is done with the camera of the folder."""
-    mapper: MapperChoice
-    """Of the presets."""
-    truth: Poses
-
-    @property
-    def intrinsics(self) -> str | None:
-        """The value of `--intrinsics`; None: the camera is not known."""
-        return None if self.camera == "unknown" else str(self.folder / "K.txt")
-
-    @property
-    def held(self) -> str | None:
-        """The value of `--intrinsics` for photos whose camera is not adjusted."""
-        return self.intrinsics if self.camera == "known" else None
-
-
 def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[Pair]]:
     """Models of a preset, and localized frames; the pairs that were tried, for other methods."""
     out = given.work / name
     report = reconstruct_folder(
-        _linked(given.frames.mapped, given.work / "frames"),
+        linked(given.frames.mapped, given.work / "frames"),
         out,
         config=preset(name),
         options=RunOptions(
@@ -193,7 +136,7 @@ def with_rootsift(given: FrameSequence, pairs: set[Pair]) -> dict[str, Json]:
     out = given.work / "rootsift"
     out.mkdir(parents=True, exist_ok=True)
     every = [*given.frames.mapped, *given.frames.localized]
-    images, _ = open_images(_linked(every, given.work / "all"))
+    images, _ = open_images(linked(every, given.work / "all"))
     known = parse_intrinsics(given.intrinsics) if given.intrinsics else None
     database, start = out / "database.db", time.monotonic()
     write_rootsift_database(

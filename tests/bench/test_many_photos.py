@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench import driver, sequence
+from jaxsfm.bench.frames import chosen_frames
 from jaxsfm.bench.long_street import SIZE, walk, write_street
 from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.simulated import NOISE_PX, REACH, SimulatedStreet
@@ -71,13 +72,13 @@ def test_the_driver_is_measured_stage_by_stage(tmp_path, monkeypatch):
 
 def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street_sequence):
     folder = street_sequence
-    every = sequence.chosen_frames(folder, 1, 0)
+    every = chosen_frames(folder, 1, 0)
     assert len(every.mapped) == 11 and not every.localized
-    second = sequence.chosen_frames(folder, 2, 3)
+    second = chosen_frames(folder, 2, 3)
     assert [path.stem for path in second.localized] == ["photo00002", "photo00008"]
     assert len(second.mapped) == 4 and not {*second.mapped} & {*second.localized}
     with pytest.raises(UserError, match="fewer than three"):
-        sequence.chosen_frames(folder, 5, 0) and sequence.chosen_frames(folder, 10, 0)
+        chosen_frames(folder, 5, 0) and chosen_frames(folder, 10, 0)
 
 
 @pytest.mark.parametrize(
