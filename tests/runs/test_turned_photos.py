@@ -17,23 +17,24 @@ from jaxsfm.runs.turned_photos import LEAST_INLIERS, find_turned
 class Trials:
     """Trials that note what they are asked."""
 
-    def __init__(self, names: Iterable[str] = "abxy", turns: int = 0) -> None:
+    def __init__(self, names: Iterable[str] = "abxy", turns: int = 0, only: str = "") -> None:
         self.images = {n: ImageFile(name=n, path=Path(n), size=(4, 3), sha256=n) for n in names}
         self.asked: list[str] = []
-        self.turns = turns
+        self.turns, self.only = turns, only
 
     def turn_of(self, name: str, partners: list[str]) -> int:
         assert set(partners) <= set("ab")
         self.asked.append(name)
-        return self.turns
+        return self.turns if not self.only or name in self.only else 0
 
 
-def model(monkeypatch, *, green: bool = True) -> Any:
-    """A model of `a` and `b`, which are upright."""
+def model(monkeypatch, *, green: bool = True, smaller: str = "") -> Any:
+    """A model of `a` and `b`, which are upright, and a smaller one."""
     monkeypatch.setattr(turned_photos, "model_poses", lambda model: {})
     monkeypatch.setattr(turned_photos, "quarter_turns", lambda poses, codes: {})
-    monkeypatch.setattr(turned_photos, "registered", lambda model: {"a", "b"})
-    return SimpleNamespace(stage=SimpleNamespace(models=lambda: ["model"]), green=lambda: green)
+    monkeypatch.setattr(turned_photos, "registered", set)
+    models = ["ab", smaller] if smaller else ["ab"]
+    return SimpleNamespace(stage=SimpleNamespace(models=lambda: models), green=lambda: green)
 
 
 @pytest.mark.parametrize(
@@ -66,3 +67,13 @@ def test_a_doubtful_model_is_not_made_again_for_one_photo_of_many(
     found = PairCounts(LEAST_INLIERS, 1, LEAST_INLIERS, 0, Status.VERIFIED)
     counts = {("a", name): found for name in photos if name not in "ax"}
     assert [*find_turned(model(monkeypatch, green=green), trials, counts)] == [*turned]
+
+
+@pytest.mark.parametrize(
+    ("only", "turned"), [("c", ""), ("cd", ""), ("cde", "cde"), ("x", "x"), ("cx", "x")]
+)
+def test_photos_of_a_smaller_model_are_turned_if_most_of_them_are(monkeypatch, only, turned):
+    """Photos `c` to `f` are in the smaller model, and `x` is in none."""
+    trials: Any = Trials("abcdefx", turns=1, only=only)
+    found = find_turned(model(monkeypatch, smaller="acdef"), trials, {})
+    assert [*found] == [*turned]
