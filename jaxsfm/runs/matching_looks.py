@@ -82,7 +82,7 @@ def match_pairs(
     with timed(seconds, "extraction"):
         counts = {p: r.counts for p in pairs if (r := store.load_matches(p)) is not None}
         missing = [pair for pair in pairs if pair not in counts]
-        if counts:
+        if counts and job.progress:  # a trial of a few pairs is no news
             logger.info("%d of %d pairs have been matched before", len(counts), len(pairs))
         lost = job.extract_missing(images_of(missing, by_name))
     with timed(seconds, "matching"):
