@@ -77,3 +77,11 @@ def test_photos_of_a_smaller_model_are_turned_if_most_of_them_are(monkeypatch, o
     trials: Any = Trials("abcdefx", turns=1, only=only)
     found = find_turned(model(monkeypatch, smaller="acdef"), trials, {})
     assert [*found] == [*turned]
+
+
+def test_a_photo_of_the_largest_model_is_judged_by_its_place_there(monkeypatch):
+    """`b` lies sideways in the largest model, and is in the smaller one, too."""
+    models = model(monkeypatch, smaller="bcdef")
+    monkeypatch.setattr(turned_photos, "quarter_turns", lambda poses, codes: {"b": 3})
+    trials: Any = Trials("abcdef", turns=1, only="c")
+    assert [*find_turned(models, trials, {})] == ["b"]
