@@ -70,12 +70,15 @@ class MappedRun:
         return self.green() and self.largest() == len(self.given.images)
 
     def better_than(self, other: "MappedRun") -> bool:
-        """Whether there are more photos in the best model. Models that something speaks against are
-        worse than others, and so are models that are too small to be checked, and none."""
+        """Whether there are more photos in the best model, or in the next one if those are equal.
 
-        def rank(run: MappedRun) -> tuple[bool, int]:
-            largest = run.largest()
-            return run.green() and largest >= MIN_VIEWS, largest
+        Models that something speaks against are worse than others, and so are models that are too
+        small to be checked, and none.
+        """
+
+        def rank(run: MappedRun) -> tuple[bool, list[int]]:
+            sizes = [len(photos) for photos in run.photos]
+            return run.green() and run.largest() >= MIN_VIEWS, sorted(sizes, reverse=True)
 
         return rank(self) > rank(other)
 

@@ -1,0 +1,32 @@
+"""Which of two mappings of the same photos is better."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from jaxsfm.runs.run_stages import MappedRun
+
+
+def run(*sizes: int, green: bool = True) -> Any:
+    """Models of so many photos."""
+    photos = [set(range(size)) for size in sizes]
+    return SimpleNamespace(
+        photos=photos, green=lambda: green, largest=lambda: max(map(len, photos), default=0)
+    )
+
+
+ORDER = [
+    [run(), run(50, green=False)],  # none, or a doubtful one
+    [run(2, 2), run(3)],
+    [run(24, 10, 7, 6), run(24, 19, 10)],  # four places, of which one fell apart
+    [run(10), run(10, 3)],
+    [run(24, 19, 10), run(25)],
+]
+
+
+@pytest.mark.parametrize(("worse", "better"), ORDER)
+def test_larger_models_are_better_the_largest_first(worse, better):
+    assert MappedRun.better_than(better, worse)
+    assert not MappedRun.better_than(worse, better)
+    assert not MappedRun.better_than(better, better)
