@@ -23,7 +23,7 @@ from jaxsfm.matching.execution import Execution, images_at_once, pairs_at_once
 from jaxsfm.matching.extraction import extraction_settings
 from jaxsfm.matching.pair_matching import thresholds
 
-ENOUGH = 64
+ENOUGH = 256
 """Images, or pairs, of which batches are made: as many as a run has at least."""
 
 
