@@ -13,8 +13,8 @@ CPU, whose caches they fill. An accelerator has thousands of lanes to fill, and 
 costs it the start of several kernels. The factors follow from that and from the memory that a pair
 may take (`jaxsfm.matching.execution`). Of 400 x 300 pairs, an H200 matches 18 % fewer a second with
 two steps at once than with eight, and 3 % fewer with 32. The others have not been measured. None of
-them changes a result. The tile of coarse products stays as it is: a larger one has a smaller share of margins, but
-leaves room for fewer pairs side by side (docs/decisions/accelerators.md)."""
+them changes a result. The tile of coarse products stays as it is: a larger one has a smaller share
+of margins, but leaves room for fewer pairs side by side (docs/decisions/accelerators.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
