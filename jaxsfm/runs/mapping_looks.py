@@ -26,6 +26,7 @@ from jaxsfm.runs.matching_looks import (
     match_pairs,
     timed,
 )
+from jaxsfm.runs.places import show_different_places
 from jaxsfm.runs.run_stages import MappedRun, RunStages
 from jaxsfm.runs.sky_masks import sky_masks, without_sky
 from jaxsfm.runs.turned_photos import Trials, find_turned
@@ -127,6 +128,12 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
         return found
     looks = UsedLooks(first_px=matched.described.max_size)
     again = mapped.unsettled(matched.counts)
+    if (
+        again
+        and again.whole
+        and show_different_places(photos.job, photos.images, mapped, matched.counts, seconds)
+    ):
+        again = mapped.unsettled(matched.counts, in_any_model=True)
     if again is None:
         return found._replace(looks=looks)
     if again.whole and masked_sky and mapped.doubted():

@@ -49,21 +49,35 @@ class MappedRun:
         """The pairs whose matches were written into COLMAP's database."""
         return self.given.matches.keys()
 
-    def unsettled(self, counts: Mapping[Pair, PairCounts]) -> SecondLook | None:
+    def unsettled(
+        self, counts: Mapping[Pair, PairCounts], *, in_any_model: bool = False
+    ) -> SecondLook | None:
         """What to look at again; None if nothing.
 
         Args:
           counts: of all pairs that were tried.
+          in_any_model: as in `settled_photos`.
         """
         names = [image.name for image in self.given.images]
-        return second_look(counts, names, self.settled_photos(), self.trusted())
+        return second_look(counts, names, self.settled_photos(in_any_model), self.trusted())
 
-    def settled_photos(self) -> set[str]:
-        """The photos that have a sure place in the best model (`jaxsfm.sfm.second_look`)."""
-        checks = [check for check in self.stage.figures.checks if check is not None]
+    def settled_photos(self, in_any_model: bool = False) -> set[str]:
+        """The photos that have a sure place (`jaxsfm.sfm.second_look`).
+
+        Args:
+          in_any_model: whether every model that is large enough to be checked counts, because each
+            shows a place of its own; otherwise only the best one counts.
+        """
         if not self.photos or self.doubted():
             return set()
-        return self.photos[0].difference(*(pair for check in checks for pair in check.apart))
+        models = self.checked_models() if in_any_model else self.photos[:1]
+        checks = [check for check in self.stage.figures.checks if check is not None]
+        return set().union(*models).difference(*(pair for c in checks for pair in c.apart))
+
+    def checked_models(self) -> list[set[str]]:
+        """The photos of each model that is large enough to be checked, the largest first."""
+        checks = self.stage.figures.checks
+        return [own for own, check in zip(self.photos, checks, strict=False) if check is not None]
 
     def settled(self) -> bool:
         """Whether all photos are in one model, and nothing speaks against it."""

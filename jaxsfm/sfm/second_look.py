@@ -2,8 +2,9 @@
 
 Most photos find their places in a model from small descriptions, at a quarter of the network's work
 and a sixteenth of the products of descriptors. A photo is *settled* if it is in the best model, its
-neighbours by name agree with its place, and nothing else speaks against the models. The others get
-a second look:
+neighbours by name agree with its place, and nothing else speaks against the models. If the models
+show different places (`jaxsfm.runs.places`), photos of each of them are settled. The others get a
+second look:
 
 * If most photos are unsettled, or if something speaks against the model, all pairs are matched
   again. The matches of the first look are not used then.
@@ -74,5 +75,9 @@ def closest_pairs(name: str, counts: Mapping[Pair, PairCounts]) -> list[Pair]:
     Args:
       counts: of pairs that were tried.
     """
-    own = [pair for pair in counts if name in pair]
-    return sorted(own, key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))
+    return strongest_first([pair for pair in counts if name in pair], counts)
+
+
+def strongest_first(pairs: Collection[Pair], counts: Mapping[Pair, PairCounts]) -> list[Pair]:
+    """Pairs, those with most inliers first, then those with most tentative matches."""
+    return sorted(pairs, key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))

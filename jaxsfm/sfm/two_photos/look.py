@@ -85,18 +85,32 @@ def look(
       images: the photos.
     """
     found = match_features(features0, features1, config=config, seed=seed)
-    zoom0, zoom1 = (
-        1 / float(np.mean(features.scale)) if view is None else view.zoom
-        for features, view in zip((features0, features1), views, strict=True)
+    evidence = evidence_of_planes(found, (features0, features1), views=views, config=config)
+    return Look(
+        moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views
     )
-    evidence = plane_evidence(
+
+
+def evidence_of_planes(
+    found: PairResult,
+    features: tuple[ImageFeatures, ImageFeatures],
+    *,
+    views: Views = WHOLE,
+    config: Config,
+) -> np.ndarray:
+    """The evidence of each plane of a pair, float64 (p,).
+
+    Args:
+      features: what was matched, with the same config.
+    """
+    zoom0, zoom1 = (
+        1 / float(np.mean(each.scale)) if view is None else view.zoom
+        for each, view in zip(features, views, strict=True)
+    )
+    return plane_evidence(
         found,
-        features0,
-        features1,
+        *features,
         threshold_px=config.threshold_px,
         fine_stride=config.fine_stride,
         zooms=(zoom0, zoom1),
-    )
-    return Look(
-        moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views
     )

@@ -1,0 +1,81 @@
+"""Whether the models of a run show different places.
+
+Photos of several places in one folder give a model for each place. Photos outside the largest model
+need no second look then. But the models may also be parts of one place that the first look has not
+connected. So the strongest pairs between models are matched at full size first.
+"""
+
+import logging
+from collections.abc import Collection, Mapping, Sequence
+
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import Pair, PairCounts
+from jaxsfm.runs.job import Job
+from jaxsfm.runs.matching_looks import match_pairs
+from jaxsfm.runs.run_stages import MappedRun
+from jaxsfm.sfm.second_look import strongest_first
+from jaxsfm.sfm.two_photos.evidence import total
+from jaxsfm.sfm.two_photos.look import evidence_of_planes
+from jaxsfm.sfm.two_photos.matched import confidence
+
+logger = logging.getLogger("jaxsfm")
+
+BRIDGES = 5
+"""Pairs of each smaller model that are matched at full size."""
+ONE_PLACE = 0.7
+"""Two models show one place if a pair between them is right with at least this probability. The
+surest of 266 pairs of different places has 0.60 (docs/decisions/photos.md)."""
+
+
+def show_different_places(
+    job: Job,
+    images: Mapping[str, ImageFile],
+    mapped: MappedRun,
+    counts: Mapping[Pair, PairCounts],
+    seconds: dict[str, float],
+) -> bool:
+    """Whether there are several models, and none of the strongest pairs between them is sure.
+
+    Args:
+      job: that of the run, at full size. What it matches is kept for a second look.
+      images: the photos of the run, by name.
+      counts: of all pairs that were tried in the first look.
+      seconds: the time is added to that of the stages.
+    """
+    models = mapped.checked_models()
+    if len(models) < 2 or mapped.doubted() or len(set().union(*models)) < sum(map(len, models)):
+        return False
+    pairs = bridges(models, counts)
+    match_pairs(job, images, pairs, seconds)
+    strongest = max((_evidence(job, images, pair) for pair in pairs), default=0.0)
+    different = confidence(strongest) < ONE_PLACE
+    if different:
+        logger.info("the %d largest models show different places", len(models))
+    return different
+
+
+def bridges(models: Sequence[Collection[str]], counts: Mapping[Pair, PairCounts]) -> list[Pair]:
+    """The strongest pairs of each smaller model with photos of other models.
+
+    Args:
+      models: the photos of each model, the largest model first.
+      counts: of all pairs that were tried.
+    """
+    model_of = {name: k for k, model in enumerate(models) for name in model}
+    placed = [pair for pair in counts if model_of.keys() >= set(pair)]
+    joined = {pair: {model_of[name] for name in pair} for pair in placed}
+    between = strongest_first([pair for pair in placed if len(joined[pair]) == 2], counts)
+    chosen: dict[Pair, None] = {}
+    for smaller in range(1, len(models)):
+        own = [pair for pair in between if smaller in joined[pair]]
+        chosen |= dict.fromkeys(own[:BRIDGES])
+    return list(chosen)
+
+
+def _evidence(job: Job, images: Mapping[str, ImageFile], pair: Pair) -> float:
+    """The evidence of a pair that was matched; 0 if a photo cannot be decoded."""
+    found = job.store.load_matches(pair)
+    features0, features1 = (job.load_features(images[name]) for name in pair)
+    if found is None or features0 is None or features1 is None:
+        return 0.0
+    return total(evidence_of_planes(found, (features0, features1), config=job.config))

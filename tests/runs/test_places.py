@@ -1,0 +1,76 @@
+"""When the models of a run show different places, and which photos are settled then."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from jaxsfm.core.types import Status
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import Pair, PairCounts
+from jaxsfm.runs import places
+from jaxsfm.runs.places import BRIDGES, ONE_PLACE, bridges, show_different_places
+from jaxsfm.sfm.two_photos.matched import HALF_SURE, POWER
+
+LIMIT = HALF_SURE * (ONE_PLACE / (1 - ONE_PLACE)) ** (1 / POWER)
+"""The evidence of a pair that is right with the probability `ONE_PLACE`."""
+
+
+def counts(**inliers: int) -> dict[Pair, PairCounts]:
+    """Counts of pairs of photos with names of one letter."""
+    return {
+        (name[0], name[1]): PairCounts(n, 1, 100, 0, Status.VERIFIED) for name, n in inliers.items()
+    }
+
+
+def run(*models: str, doubted: bool = False) -> Any:
+    """A run whose models have these photos."""
+    own = [set(model) for model in models]
+    return SimpleNamespace(checked_models=lambda: own, doubted=lambda: doubted)
+
+
+def different(
+    monkeypatch, mapped: Any, tried: dict[Pair, PairCounts], evidence: dict[Pair, float]
+) -> tuple[bool, list[Pair]]:
+    """Whether the models show different places, and which pairs were matched to find out."""
+    matched: list[Pair] = []
+    images = {n: ImageFile(name=n, path=Path(n), size=(4, 3), sha256=n) for n in "abcdef"}
+    monkeypatch.setattr(places, "match_pairs", lambda j, i, pairs, s: matched.extend(pairs))
+    monkeypatch.setattr(places, "_evidence", lambda job, images, pair: evidence.get(pair, 0.0))
+    job: Any = None
+    return show_different_places(job, images, mapped, tried, {}), matched
+
+
+@pytest.mark.parametrize(("evidence", "places_differ"), [(LIMIT - 1, True), (LIMIT + 1, False)])
+def test_models_show_one_place_if_a_pair_between_them_is_probably_right(
+    monkeypatch, evidence, places_differ
+):
+    tried = counts(ab=900, cd=800, ac=30, bd=40)
+    found = different(monkeypatch, run("ab", "cd"), tried, {("a", "c"): evidence})
+    assert found == (places_differ, [("b", "d"), ("a", "c")])
+
+
+@pytest.mark.parametrize(
+    "mapped",
+    [run(), run("ab"), run("ab", "cd", doubted=True), run("abc", "cd")],
+    ids=["no model", "one", "in doubt", "a photo in both"],
+)
+def test_without_two_sure_models_apart_nothing_is_matched_and_nothing_is_said(monkeypatch, mapped):
+    assert different(monkeypatch, mapped, counts(ac=30), {}) == (False, [])
+
+
+def test_models_without_a_tried_pair_between_them_show_different_places(monkeypatch):
+    assert different(monkeypatch, run("ab", "cd"), counts(ab=900, cd=800), {}) == (True, [])
+
+
+def test_bridges_are_the_strongest_pairs_of_each_smaller_model_and_each_comes_once():
+    assert bridges(["ab", "cd"], counts(ab=9, ac=3, bd=5, xc=99)) == [("b", "d"), ("a", "c")]
+    three = counts(ac=5, ae=4, ce=9)
+    assert bridges(["ab", "cd", "ef"], three) == [("c", "e"), ("a", "c"), ("a", "e")]
+
+
+def test_a_smaller_model_has_a_limited_number_of_bridges():
+    many = {(f"a{k:02}", "z"): PairCounts(k, 1, 100, 0, Status.VERIFIED) for k in range(20)}
+    found = bridges([[a for a, _ in many], ["z"]], many)
+    assert found == [(f"a{k:02}", "z") for k in range(19, 19 - BRIDGES, -1)]
