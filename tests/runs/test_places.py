@@ -5,11 +5,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fake_runs import Mapped, Matched, Photos, Stages, image
 
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairCounts
-from jaxsfm.runs import places
+from jaxsfm.runs import mapping_looks, places
+from jaxsfm.runs.mapping_looks import map_in_looks
 from jaxsfm.runs.places import BRIDGES, ONE_PLACE, bridges, show_different_places
 from jaxsfm.sfm.two_photos.matched import HALF_SURE, POWER
 
@@ -74,3 +76,31 @@ def test_a_smaller_model_has_a_limited_number_of_bridges():
     many = {(f"a{k:02}", "z"): PairCounts(k, 1, 100, 0, Status.VERIFIED) for k in range(20)}
     found = bridges([[a for a, _ in many], ["z"]], many)
     assert found == [(f"a{k:02}", "z") for k in range(19, 19 - BRIDGES, -1)]
+
+
+@pytest.mark.parametrize(
+    ("found", "evidence", "looked_again"),
+    [
+        (Mapped(True, 20, many_lost=True, places=2), 0.0, False),
+        (Mapped(True, 20, many_lost=True, places=2), LIMIT + 1, True),
+        (Mapped(True, 20, many_lost=True), 0.0, True),
+        (Mapped(True, 20, few_apart=True, places=2), 0.0, True),  # few photos are unsettled
+    ],
+)
+def test_photos_of_different_places_need_no_second_look(
+    monkeypatch, tmp_path, found, evidence, looked_again
+):
+    monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
+    monkeypatch.setattr(mapping_looks, "match_again", lambda *_: Matched("again"))
+    monkeypatch.setattr(Photos, "sky_masks", {"a": b""})
+    monkeypatch.setattr(places, "match_pairs", lambda *_: None)
+    monkeypatch.setattr(places, "_evidence", lambda *_: evidence)
+    monkeypatch.setattr(
+        Matched, "counts", counts() | {("0a", "1b"): PairCounts(*[30] * 4, Status.VERIFIED)}
+    )
+    images = {name: image(name) for name in "ab"}
+    photos: Any = Photos(images, SimpleNamespace(config=SimpleNamespace(checked=True)))
+    made = {"": found, "again": Mapped(True, 40)}
+    stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
+    looks = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]
+    assert looks.mapped is (made["again"] if looked_again else found)
