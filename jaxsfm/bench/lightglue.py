@@ -15,7 +15,7 @@ import numpy as np
 from jaxsfm.colmap.database import KeypointMatches
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, read_image
-from jaxsfm.io.pairs import exhaustive_pairs
+from jaxsfm.io.pairs import Pair, exhaustive_pairs
 from jaxsfm.runs.matching_looks import timed
 
 MAX_KEYPOINTS, MAX_SIZE = 2048, 1024
@@ -23,11 +23,16 @@ MAX_KEYPOINTS, MAX_SIZE = 2048, 1024
 
 
 def lightglue_matches(
-    images: Sequence[ImageFile], *, threads: int, seconds: dict[str, float]
+    images: Sequence[ImageFile],
+    pairs: Sequence[Pair] | None = None,
+    *,
+    threads: int,
+    seconds: dict[str, float],
 ) -> KeypointMatches:
-    """The matches of all pairs of photos.
+    """The matches of pairs of photos.
 
     Args:
+      pairs: names; None takes all pairs.
       threads: of PyTorch; -1 takes all cores.
       seconds: the times of extraction and matching are written there.
 
@@ -58,7 +63,7 @@ def lightglue_matches(
                 xy = (found["keypoints"][0].numpy() + 0.5) * np.asarray(working.scale) - 0.5
                 keypoints[image.name] = xy.astype(np.float32)
         with timed(seconds, "matching"):
-            for a, b in exhaustive_pairs(keypoints):
+            for a, b in exhaustive_pairs(keypoints) if pairs is None else pairs:
                 found = matcher({"image0": features[a], "image1": features[b]})
                 matches[a, b] = found["matches"][0].numpy().astype(np.uint32)
     return KeypointMatches(keypoints, matches)

@@ -1,9 +1,9 @@
 """Frames of a video with reference poses: models of some of them, and the others localized.
 
-Models are made with jaxsfm, and with COLMAP's RootSIFT on the same pairs and with the same camera.
-The figures are those of a run: seconds of each stage, the number of registered frames, the position
-errors after a similarity over all frames, and those of the first and the last tenth of the frames
-(drift).
+Models are made with jaxsfm, and with RootSIFT or ALIKED and LightGlue in COLMAP, on the same pairs
+and with the same camera. The figures are those of a run: seconds of each stage, the number of
+registered frames, the position errors after a similarity over all frames, and those of the first
+and the last tenth of the frames (drift).
 """
 
 import dataclasses
@@ -16,10 +16,12 @@ import numpy as np
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.frames import FrameSequence, chosen_frames, linked
+from jaxsfm.bench.lightglue import lightglue_matches
+from jaxsfm.bench.methods import LIGHTGLUE, ROOTSIFT
 from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.options import whole_numbers
 from jaxsfm.colmap.cameras import Cameras
-from jaxsfm.colmap.database import read_images
+from jaxsfm.colmap.database import read_images, write_keypoint_matches
 from jaxsfm.colmap.inliers import read_inliers
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
@@ -27,7 +29,7 @@ from jaxsfm.colmap.mapper import first_models
 from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions
+from jaxsfm.colmap.two_views import VerificationOptions, verify
 from jaxsfm.colmap.view import View
 from jaxsfm.config import PRESETS, preset
 from jaxsfm.errors import UserError
@@ -38,6 +40,7 @@ from jaxsfm.io.pixels import Pixels
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizedPhoto
+from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import LocalizeOptions, RunOptions
 from jaxsfm.sfm.evaluation import (
@@ -51,7 +54,8 @@ from jaxsfm.sfm.evaluation import (
 if TYPE_CHECKING:
     import pycolmap
 
-ROOTSIFT = "rootsift"
+OTHERS = (ROOTSIFT, LIGHTGLUE)
+"""The methods that get the pairs of the last preset."""
 END = 0.1
 """The share of the frames at either end whose errors are reported apart."""
 NEAR, NEAR_DEG = 0.05, 5.0
@@ -130,36 +134,45 @@ def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[P
     return row, pairs
 
 
-def with_rootsift(given: FrameSequence, pairs: set[Pair]) -> dict[str, Json]:
-    """The same of COLMAP's features on given pairs: a model of its incremental mapper, and frames
+def with_other_features(given: FrameSequence, method: str, pairs: set[Pair]) -> dict[str, Json]:
+    """The same of `OTHERS` on given pairs: a model of COLMAP's incremental mapper, and frames
     localized by the matches with points of the model."""
-    out = given.work / "rootsift"
+    out = given.work / method
     out.mkdir(parents=True, exist_ok=True)
-    every = [*given.frames.mapped, *given.frames.localized]
-    images, _ = open_images(linked(every, given.work / "all"))
-    known = parse_intrinsics(given.intrinsics) if given.intrinsics else None
-    database, start = out / "database.db", time.monotonic()
-    write_rootsift_database(
-        database,
-        given.work / "all",
-        images,
-        Cameras(known=known),
-        VerificationOptions(),
-        pairs=sorted(pairs),
-    )
-    matched = time.monotonic()
+    database, seconds = out / "database.db", {}
+    _write_matches(database, given, method, sorted(pairs), seconds)
     names = [frame.name for frame in given.frames.mapped]
     options = MapOptions(refine_intrinsics=given.held is None)
-    models = first_models(database, options, names=names).models
-    mapped = time.monotonic()
+    with timed(seconds, "mapping"):
+        models = first_models(database, options, names=names).models
     row: dict[str, Json] = {
-        "seconds": {"matching": matched - start, "mapping": mapped - matched},
+        "seconds": dict(seconds),
         **errors(model_poses(models[0]), given.truth),
     }
     if given.frames.localized:
+        start = time.monotonic()
         placed = _placed_by_matches(given, database, models[0])
-        row["localized"] = _summary(placed, len(given.frames.localized), time.monotonic() - mapped)
+        row["localized"] = _summary(placed, len(given.frames.localized), time.monotonic() - start)
     return row
+
+
+def _write_matches(
+    database: Path, given: FrameSequence, method: str, pairs: list[Pair], seconds: dict[str, float]
+) -> None:
+    """Describe, match and verify the pairs with other features."""
+    folder = linked([*given.frames.mapped, *given.frames.localized], given.work / "all")
+    images, _ = open_images(folder)
+    cameras = Cameras(known=parse_intrinsics(given.intrinsics) if given.intrinsics else None)
+    if method == ROOTSIFT:
+        with timed(seconds, "matching"):
+            write_rootsift_database(
+                database, folder, images, cameras, VerificationOptions(), pairs=pairs
+            )
+        return
+    found = lightglue_matches(images, pairs, threads=-1, seconds=seconds)
+    with timed(seconds, "matching"):
+        write_keypoint_matches(database, images, found, cameras)
+        verify(database, VerificationOptions())
 
 
 def _placed_by_matches(
@@ -209,8 +222,8 @@ def _measured(given: FrameSequence, methods: list[str]) -> Iterator[dict[str, Js
     """A row for each method; presets come first, because they choose the pairs."""
     pairs: set[Pair] = set()
     for method in methods:
-        if method == ROOTSIFT:
-            row = with_rootsift(given, pairs)
+        if method in OTHERS:
+            row = with_other_features(given, method, pairs)
         else:
             row, pairs = with_jaxsfm(given, method)
         frames = len(given.frames.mapped)
@@ -223,9 +236,11 @@ def bench_sequence(options: SequenceOptions) -> dict[str, Json]:
     Raises:
       UserError: a frame, a pose or an option cannot be used.
     """
-    methods = options.chosen_methods([*PRESETS, ROOTSIFT])
-    if methods == [ROOTSIFT]:
-        raise UserError("--methods: rootsift needs a preset beside it, which chooses the pairs")
+    methods = options.chosen_methods([*PRESETS, *OTHERS])
+    if methods[0] in OTHERS:
+        raise UserError(
+            f"--methods: {methods[0]} needs a preset beside it, which chooses the pairs"
+        )
     truth = read_poses(options.root)
     rows: list[dict[str, Json]] = []
     for every in whole_numbers(options.every, "--every"):

@@ -24,7 +24,7 @@ BRIDGES = 5
 """Pairs of each smaller model that are matched at full size."""
 ONE_PLACE = 0.7
 """Two models show one place if a pair between them is right with at least this probability. The
-surest of 266 pairs of different places has 0.60 (docs/decisions/photos.md)."""
+surest of 266 pairs of different places has 0.60 (docs/decisions/effort.md)."""
 
 
 def show_different_places(

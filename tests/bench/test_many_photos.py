@@ -88,6 +88,7 @@ def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street_sequen
         (["--every", "0"], "--every: '0' is not a whole number of at least 1"),
         (["--every", ","], "--every: none given"),
         (["--methods", "rootsift"], "rootsift needs a preset beside it"),
+        (["--methods", "aliked+lightglue"], "aliked+lightglue needs a preset beside it"),
         (["--methods", "sift"], "no method 'sift'"),
     ],
 )
@@ -116,6 +117,28 @@ def test_the_camera_of_a_folder_is_held_adjusted_or_not_used(
     k = str(street_sequence / "K.txt")
     assert given.intrinsics == (None if camera == "unknown" else k)
     assert given.refines == (camera != "known")
+
+
+def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
+    street_sequence, tmp_path, monkeypatch
+):
+    chosen = {("photo00000.jpg", "photo00002.jpg"), ("photo00002.jpg", "photo00004.jpg")}
+    seen = []
+
+    def lightglue_matches(images, pairs, *, threads, seconds):
+        seen.append(([image.name for image in images], pairs))
+        raise UserError("seen")
+
+    monkeypatch.setattr(sequence, "with_jaxsfm", lambda given, name: ({}, chosen))
+    monkeypatch.setattr(sequence, "lightglue_matches", lightglue_matches)
+    options = SequenceOptions(
+        root=street_sequence, every=("2",), methods=("default,aliked+lightglue",), out=tmp_path
+    )
+    with pytest.raises(UserError, match="seen"):
+        sequence.bench_sequence(options)
+    ((names, pairs),) = seen
+    assert names == [path.name for path in chosen_frames(street_sequence, 2, 0).mapped]
+    assert pairs == sorted(chosen)
 
 
 @pytest.mark.slow
