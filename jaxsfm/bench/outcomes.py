@@ -47,20 +47,14 @@ def doubt(report: RunReport | None) -> str:
     """What a run says against its own models; empty if it presents them as right.
 
     Photos that are missing, and groups of photos that no pair joins, say nothing against the photos
-    that are in a model. A run has two things to say: that its verdict is amber or red, and that the
-    refinement of its best model was taken back, because too few patches agreed with it. COLMAP says
-    nothing.
+    that are in a model. COLMAP says nothing.
 
     Args:
       report: None for a method without a report.
     """
     if report is None:
         return ""
-    said = [in_words(report.verdict)] if report.verdict in ("amber", "red") else []
-    refinement = report.refinement[0] if report.refinement else None
-    if refinement and refinement.passes and not refinement.passes[0].accepted:
-        said.append("too few patches agreed")
-    return "; ".join(said)
+    return in_words(report.verdict) if report.verdict in ("amber", "red") else ""
 
 
 def judge(models: Sequence[Poses], truth: Poses, *, noticed: bool) -> Judgement:

@@ -27,6 +27,10 @@ FOLLOWS: dict[Basis, str] = {
     "pairs": "most of the pairs",
     "order": "the order of the photos' names",
 }
+_UNCONFIRMED = (
+    "less than a quarter of the points were found where they should be seen, so the refinement was "
+    "taken back"
+)
 _DECISIVE = "neighbours overlap by more than half and something that occurs only once is in view"
 
 
@@ -57,6 +61,8 @@ class ModelVerdict(NamedTuple):
     """Photos that were in one model, which something spoke against, and are in several now."""
     scale: list[Finding]
     """Photos whose part of the model may have shrunk."""
+    unconfirmed: str
+    """That the photos do not show the points of the model; empty if they do."""
     decisive: str
     """Photos that would decide between two places or two models; empty if there is no choice."""
     advice: str
@@ -89,7 +95,9 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
     contradictions = sorted(check.contradictions, key=lambda each: -each.contradicted)
     places = sorted(check.other_places, key=lambda each: -each.agreed)
     headline = in_words(colour)
-    if colour == "amber" and check.shrunk:
+    if colour == "amber" and check.unconfirmed:
+        headline = f"{colour}: the photos do not show most points of the model"
+    elif colour == "amber" and check.shrunk:
         headline = f"{colour}: a part of the model may have shrunk"
     elif colour == "amber" and places:
         count = len({place.image for place in places})
@@ -106,6 +114,7 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
         neighbours=[Finding(_apart(pair), pair[:1], pair[1:]) for pair in check.apart],
         parts=[_told_apart(check.told_apart)] if check.told_apart else [],
         scale=[_shrunk(check.shrunk)] if check.shrunk else [],
+        unconfirmed=_UNCONFIRMED if check.unconfirmed else "",
         decisive=_decides(check, places),
         advice=_advice(check, places),
     )
@@ -132,6 +141,8 @@ def _model_lines(verdict: ModelVerdict) -> list[str]:
         lines += [label + each.text for each in found[:MAX_FINDINGS]]
         if more := len(found[MAX_FINDINGS:]):
             lines.append(f"{label}{more} more {'is' if more == 1 else 'are'} in report.json")
+    if verdict.unconfirmed:
+        lines.append(f"not confirmed    {verdict.unconfirmed}")
     if verdict.decisive:
         lines.append(f"would decide     {verdict.decisive}")
     if verdict.advice:
@@ -222,6 +233,11 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
         return (
             f"do not use this model as it is: {instead}add photos taken on the way from one group "
             f"to the other, so that {_DECISIVE}, and run the same command again"
+        )
+    if colour == "amber" and check.unconfirmed:
+        return (
+            "do not use this model before you have looked at it; give the camera if it is known, "
+            "add photos that overlap more, and run the same command again"
         )
     if colour == "amber" and check.shrunk:
         return (

@@ -60,7 +60,7 @@ def refine_given(
         described_px=_described_px(given, photos),
         run=with_progress(on_pass),
     )
-    if not any(done.accepted for done in figures.passes):
+    if figures.taken_back or not figures.passes:
         return None
     colour_points(refined, photos.rgb)
     model = updated(given, refined)

@@ -26,6 +26,7 @@ from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.check.check_model import CHECKED_BY
+from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
 from jaxsfm.sfm.refine.passes import RefinementFigures
@@ -224,6 +225,12 @@ def map_matches(
     return MappedStage(verification, stage_files.read_mapping(mapped), mapped, key)
 
 
+def check_refined(check: ModelCheck | None, done: RefinementFigures | None) -> ModelCheck | None:
+    """The check of a model, with what its refinement found; None if it was not checked."""
+    taken_back = done is not None and done.taken_back
+    return check and dataclasses.replace(check, unconfirmed=taken_back)
+
+
 def refine_mapped(
     given: MatchedPhotos,
     mapped: MappedStage,
@@ -275,7 +282,10 @@ def refine_mapped(
     models = read_models(refined / SPARSE, database)
     if config.refinement is not None and None in refinement:
         kept.folder.forget_stage("refined")  # a photo could not be read; perhaps it can next time
-    checks = [mapped.figures.checks[k] for k in order]
+    checks = [
+        check_refined(mapped.figures.checks[k], done)
+        for k, done in zip(order, refinement, strict=True)
+    ]
     return Reconstructed(
         verification=mapped.verification,
         mapping=dataclasses.replace(mapped.figures, checks=checks),

@@ -173,26 +173,11 @@ def test_the_order_of_photos_has_no_effect():
     assert groups(model, truth) == groups(backwards, dict(reversed(truth.items())))
 
 
-def test_a_run_doubts_its_model_when_its_refinement_was_taken_back():
-    def report(*accepted):
-        passes = [SimpleNamespace(accepted=each) for each in accepted]
-        figures = [SimpleNamespace(passes=passes)] if accepted else []
-        return cast(RunReport, SimpleNamespace(refinement=figures, verdict=None))
-
-    assert doubt(report(False)) == "too few patches agreed"
-    for fine in (None, report(), report(True, True), report(True, False)):
-        assert doubt(fine) == ""
-
-
 def test_a_run_doubts_its_model_when_its_verdict_is_amber_or_red():
-    def report(verdict, accepted=True):
-        figures = [SimpleNamespace(passes=[SimpleNamespace(accepted=accepted)])]
-        return cast(RunReport, SimpleNamespace(refinement=figures, verdict=verdict))
+    def report(verdict):
+        return cast(RunReport, SimpleNamespace(verdict=verdict))
 
-    assert doubt(report("green")) == ""
+    for fine in (None, report(None), report("green")):
+        assert doubt(fine) == ""
     for colour, words in (("amber", "two models may explain"), ("red", "contradict each other")):
         assert doubt(report(colour)).startswith(f"{colour}: ") and words in doubt(report(colour))
-        assert (
-            doubt(report(colour, accepted=False))
-            == f"{doubt(report(colour))}; too few patches agreed"
-        )

@@ -113,6 +113,16 @@ def test_a_part_that_may_have_shrunk_is_amber_and_its_photos_are_named():
     assert f"{NAMES[0]} sees its points" in alone.scale[0].text
 
 
+def test_a_model_of_which_the_photos_show_few_points_is_amber():
+    verdict = model_verdict(dataclasses.replace(check_of("green"), unconfirmed=True), "sparse/2")
+    head, said, advice = verdict_lines([verdict])
+    assert head == (
+        "verdict          amber: the photos do not show most points of the model (sparse/2)"
+    )
+    assert said.startswith("not confirmed    less than a quarter of the points were found")
+    assert "do not use this model before you have looked at it" in advice
+
+
 def test_the_model_that_was_told_apart_is_shown_as_one_way_to_join_the_groups():
     whole = Alternative(basis="order", images=8, elsewhere=NAMES[3:], contradicted=9, whole=True)
     groups = [NAMES[:3], NAMES[3:]]

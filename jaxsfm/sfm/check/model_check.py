@@ -12,8 +12,9 @@ MIN_VIEWS = 3
 VerdictColour = Literal["green", "amber", "red"]
 """Green: nothing speaks against the model. Amber: another model may explain the photos as well.
 Some fit into the model in a second place, another model was made, photos that follow each other do
-not agree with the model, photos of the run contradicted each other and were told apart, or a part
-of the model has shrunk. Red: groups of its photos contradict each other."""
+not agree with the model, photos of the run contradicted each other and were told apart, a part of
+the model has shrunk, or the photos do not show enough of its points to refine it. Red: groups of
+its photos contradict each other."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -98,6 +99,9 @@ class ModelCheck:
     shrunk: list[str] = dataclasses.field(default_factory=list)
     """Photos that see their points so much nearer than others that a part of the model has shrunk
     (`jaxsfm.sfm.check.scale`). Sorted."""
+    unconfirmed: bool = False
+    """Whether the refinement was taken back, because too few points of the model were found in the
+    photos that should show them. A model that is right fits at once."""
     without_sky: bool = False
     """Whether the sky was masked because something spoke against a model with it. What masked
     pixels show contradicts nothing, so this check is weaker than the one before."""
@@ -107,7 +111,8 @@ class ModelCheck:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        return "amber" if self.apart or self.without_sky or self.doubted() else "green"
+        speaks_against = self.apart or self.unconfirmed or self.without_sky or self.doubted()
+        return "amber" if speaks_against else "green"
 
     def doubted(self) -> bool:
         """Whether more speaks against the model than photos that follow each other (`apart`)."""
