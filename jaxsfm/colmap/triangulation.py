@@ -17,6 +17,11 @@ def with_all_points(
     COLMAP triangulates the points, joins them to tracks, adjusts them, and drops observations that
     are too far off. Poses and cameras stay.
 
+    If COLMAP finds no point at all, the model keeps those that it has. This happens to models of
+    two to four photos with a wrong camera: a model of *statue*, in which one of three photos had a
+    focal length of a million pixels, came back without its 839 points. Then nothing could speak
+    against it.
+
     Args:
       database: with the images and keypoints of the model.
 
@@ -24,7 +29,7 @@ def with_all_points(
       UserError: COLMAP failed.
     """
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
-        return native(
+        whole = native(
             lambda token: pycolmap.triangulate_points(
                 pycolmap.Reconstruction(model),  # it is changed in place
                 database,
@@ -37,3 +42,4 @@ def with_all_points(
             ),
             database,
         )
+    return whole if whole.num_points3D() else pycolmap.Reconstruction(model)
