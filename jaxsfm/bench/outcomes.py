@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 
 from jaxsfm.colmap.poses import Poses
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.report.verdict import in_words
+from jaxsfm.report.verdict import model_verdicts
 from jaxsfm.sfm.check.common_places import MIN_PHOTOS, SAME_SHARE, groups
 from jaxsfm.sfm.evaluation import pair_names
 
@@ -54,7 +54,8 @@ def doubt(report: RunReport | None) -> str:
     """
     if report is None:
         return ""
-    return in_words(report.verdict) if report.verdict in ("amber", "red") else ""
+    verdicts = model_verdicts(report.checked)
+    return next((each.headline for each in verdicts if each.colour in ("red", "amber")), "")
 
 
 def judge(models: Sequence[Poses], truth: Poses, *, noticed: bool) -> Judgement:

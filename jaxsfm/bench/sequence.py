@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.frames import FrameSequence, chosen_frames, linked
-from jaxsfm.bench.lightglue import lightglue_matches
+from jaxsfm.bench.lightglue import lightglue_matches, trained_networks
 from jaxsfm.bench.methods import LIGHTGLUE, ROOTSIFT
 from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.options import whole_numbers
@@ -241,6 +241,8 @@ def bench_sequence(options: SequenceOptions) -> dict[str, Json]:
         raise UserError(
             f"--methods: {methods[0]} needs a preset beside it, which chooses the pairs"
         )
+    if LIGHTGLUE in methods:
+        trained_networks()  # say at once what is missing
     truth = read_poses(options.root)
     rows: list[dict[str, Json]] = []
     for every in whole_numbers(options.every, "--every"):
@@ -267,12 +269,12 @@ def _others(options: SequenceOptions) -> list[str]:
 def table_lines(figures: Mapping[str, Json]) -> list[str]:
     """A line for each method and number of frames, and one for localized frames."""
     rows: Any = figures["rows"]
-    lines = ["frames  camera   method     registered  position  first, last tenth  seconds"]
+    lines = ["frames  camera   method            registered  position  first, last tenth  seconds"]
     for row in rows:
         ends = ", ".join(f"{end:.4f}" for end in row["ends"])
         stages = ", ".join(f"{name} {value:.0f}" for name, value in row["seconds"].items())
         lines.append(
-            f"{row['frames']:<7} {row['camera']:<8} {row['method']:<10} {row['registered']:>10}  "
+            f"{row['frames']:<7} {row['camera']:<8} {row['method']:<17} {row['registered']:>10}  "
             f"{row['position']:>8.4f}  {ends:<17}  {sum(row['seconds'].values()):.0f} ({stages})"
         )
         if found := row.get("localized"):

@@ -8,6 +8,9 @@ import pycolmap
 from jaxsfm.colmap.map_options import MapOptions, incremental_options
 from jaxsfm.colmap.native import native
 
+FEWEST = 10
+"""A model with fewer points can be neither checked nor refined."""
+
 
 def with_all_points(
     model: pycolmap.Reconstruction, database: Path, options: MapOptions
@@ -17,9 +20,9 @@ def with_all_points(
     COLMAP triangulates the points, joins them to tracks, adjusts them, and drops observations that
     are too far off. Poses and cameras stay.
 
-    If COLMAP finds no point at all, the model keeps those that it has. This happens to models of
-    two to four photos with a wrong camera: a model of *statue*, in which one of three photos had a
-    focal length of a million pixels, came back without its 839 points. Then nothing could speak
+    If COLMAP finds fewer than `FEWEST`, the model keeps those that it has. This happens to models
+    of two to four photos with a wrong camera: a model of *statue*, in which one of three photos had
+    a focal length of a million pixels, came back without its 839 points. Then nothing could speak
     against it.
 
     Args:
@@ -42,4 +45,6 @@ def with_all_points(
             ),
             database,
         )
-    return whole if whole.num_points3D() else pycolmap.Reconstruction(model)
+    if whole.num_points3D() < min(FEWEST, model.num_points3D()):
+        return pycolmap.Reconstruction(model)
+    return whole

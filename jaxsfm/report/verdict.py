@@ -28,8 +28,8 @@ FOLLOWS: dict[Basis, str] = {
     "order": "the order of the photos' names",
 }
 _UNCONFIRMED = (
-    "less than a quarter of the points were found where they should be seen, so the refinement was "
-    "taken back"
+    "too few of its points were found in the photos that should show them, so the model is as the "
+    "mapper made it"
 )
 _DECISIVE = "neighbours overlap by more than half and something that occurs only once is in view"
 
@@ -142,7 +142,7 @@ def _model_lines(verdict: ModelVerdict) -> list[str]:
         if more := len(found[MAX_FINDINGS:]):
             lines.append(f"{label}{more} more {'is' if more == 1 else 'are'} in report.json")
     if verdict.unconfirmed:
-        lines.append(f"not confirmed    {verdict.unconfirmed}")
+        lines.append(f"not refined      {verdict.unconfirmed}")
     if verdict.decisive:
         lines.append(f"would decide     {verdict.decisive}")
     if verdict.advice:
@@ -236,8 +236,8 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
         )
     if colour == "amber" and check.unconfirmed:
         return (
-            "do not use this model before you have looked at it; give the camera if it is known, "
-            "add photos that overlap more, and run the same command again"
+            "do not use this model before you have looked at it; add photos that overlap more, and "
+            "--intrinsics if the camera is known, and run the same command again"
         )
     if colour == "amber" and check.shrunk:
         return (

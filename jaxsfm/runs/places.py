@@ -5,26 +5,29 @@ need no second look then. But the models may also be parts of one place that the
 connected. So the strongest pairs between models are matched at full size first.
 """
 
+import dataclasses
+import itertools
 import logging
 from collections.abc import Collection, Mapping, Sequence
 
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairCounts
+from jaxsfm.matching.engines import chosen_engine
+from jaxsfm.options import LOCAL
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.matching_looks import match_pairs
 from jaxsfm.runs.run_stages import MappedRun
 from jaxsfm.sfm.second_look import strongest_first
-from jaxsfm.sfm.two_photos.evidence import total
-from jaxsfm.sfm.two_photos.look import evidence_of_planes
+from jaxsfm.sfm.two_photos.look import evidence_of_photos
 from jaxsfm.sfm.two_photos.matched import confidence
 
 logger = logging.getLogger("jaxsfm")
 
-BRIDGES = 5
-"""Pairs of each smaller model that are matched at full size."""
+BRIDGES = 3
+"""Pairs between two models that are matched at full size."""
 ONE_PLACE = 0.7
-"""Two models show one place if a pair between them is right with at least this probability. The
-surest of 266 pairs of different places has 0.60 (docs/decisions/effort.md)."""
+"""Two models show one place if a pair between them is right with at least this probability. Of 266
+pairs of different places, the 25 with most inliers have at most 0.60 (docs/decisions/effort.md)."""
 
 
 def show_different_places(
@@ -46,7 +49,9 @@ def show_different_places(
     if len(models) < 2 or mapped.doubted() or len(set().union(*models)) < sum(map(len, models)):
         return False
     pairs = bridges(models, counts)
-    match_pairs(job, images, pairs, seconds)
+    # Workers would take longer to start than this takes.
+    few = dataclasses.replace(job, engine=chosen_engine(LOCAL), progress=False)
+    match_pairs(few, images, pairs, seconds)
     strongest = max((_evidence(job, images, pair) for pair in pairs), default=0.0)
     different = confidence(strongest) < ONE_PLACE
     if different:
@@ -55,27 +60,25 @@ def show_different_places(
 
 
 def bridges(models: Sequence[Collection[str]], counts: Mapping[Pair, PairCounts]) -> list[Pair]:
-    """The strongest pairs of each smaller model with photos of other models.
+    """The strongest pairs between each two models, sorted.
 
     Args:
-      models: the photos of each model, the largest model first.
+      models: the photos of each model.
       counts: of all pairs that were tried.
     """
     model_of = {name: k for k, model in enumerate(models) for name in model}
-    placed = [pair for pair in counts if model_of.keys() >= set(pair)]
-    joined = {pair: {model_of[name] for name in pair} for pair in placed}
-    between = strongest_first([pair for pair in placed if len(joined[pair]) == 2], counts)
-    chosen: dict[Pair, None] = {}
-    for smaller in range(1, len(models)):
-        own = [pair for pair in between if smaller in joined[pair]]
-        chosen |= dict.fromkeys(own[:BRIDGES])
-    return list(chosen)
+    between: dict[frozenset[int], list[Pair]] = {}
+    for pair in counts:
+        joined = frozenset(model_of[name] for name in pair if name in model_of)
+        if model_of.keys() >= set(pair) and len(joined) == 2:
+            between.setdefault(joined, []).append(pair)
+    strongest = (strongest_first(pairs, counts)[:BRIDGES] for pairs in between.values())
+    return sorted(itertools.chain.from_iterable(strongest))
 
 
 def _evidence(job: Job, images: Mapping[str, ImageFile], pair: Pair) -> float:
     """The evidence of a pair that was matched; 0 if a photo cannot be decoded."""
     found = job.store.load_matches(pair)
-    features0, features1 = (job.load_features(images[name]) for name in pair)
-    if found is None or features0 is None or features1 is None:
+    if found is None:
         return 0.0
-    return total(evidence_of_planes(found, (features0, features1), config=job.config))
+    return evidence_of_photos(found, (images[pair[0]], images[pair[1]]), config=job.config)

@@ -60,7 +60,7 @@ def refine_given(
         described_px=_described_px(given, photos),
         run=with_progress(on_pass),
     )
-    if figures.taken_back or not figures.passes:
+    if not figures.confirmed:
         return None
     colour_points(refined, photos.rgb)
     model = updated(given, refined)

@@ -227,8 +227,8 @@ def map_matches(
 
 def check_refined(check: ModelCheck | None, done: RefinementFigures | None) -> ModelCheck | None:
     """The check of a model, with what its refinement found; None if it was not checked."""
-    taken_back = done is not None and done.taken_back
-    return check and dataclasses.replace(check, unconfirmed=taken_back)
+    unconfirmed = done is not None and not done.confirmed
+    return check and dataclasses.replace(check, unconfirmed=unconfirmed)
 
 
 def refine_mapped(

@@ -1,10 +1,12 @@
 """Right, split and wrong models, from given poses."""
 
+import dataclasses
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
+from verdicts import check_of
 
 from jaxsfm.bench.outcomes import doubt, judge
 from jaxsfm.bench.synthetic import look_at
@@ -174,10 +176,13 @@ def test_the_order_of_photos_has_no_effect():
 
 
 def test_a_run_doubts_its_model_when_its_verdict_is_amber_or_red():
-    def report(verdict):
-        return cast(RunReport, SimpleNamespace(verdict=verdict))
+    def report(*checks):
+        return cast(RunReport, SimpleNamespace(checked=[*enumerate(checks)]))
 
-    for fine in (None, report(None), report("green")):
+    for fine in (None, report(), report(check_of("green"))):
         assert doubt(fine) == ""
     for colour, words in (("amber", "two models may explain"), ("red", "contradict each other")):
-        assert doubt(report(colour)).startswith(f"{colour}: ") and words in doubt(report(colour))
+        said = doubt(report(check_of("green"), check_of(colour)))
+        assert said.startswith(f"{colour}: ") and words in said
+    unconfirmed = dataclasses.replace(check_of("green"), unconfirmed=True)
+    assert "do not show most points" in doubt(report(unconfirmed))

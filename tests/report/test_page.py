@@ -311,6 +311,19 @@ def test_the_page_names_the_camera_that_the_photos_speak_for(plain):
     assert f"<b>Camera:</b> {camera.in_words()}." in body
 
 
+@pytest.mark.parametrize(
+    ("doubt", "label"), [({"unconfirmed": True}, "Not refined"), ({"shrunk": NAMES[:2]}, "Scale")]
+)
+def test_the_page_says_what_speaks_against_a_model_as_a_whole(plain, doubt, label):
+    run = read_run(plain[0])
+    check = dataclasses.replace(check_of("green"), **doubt)
+    report = dataclasses.replace(run.report, checks=[check])
+    (verdict,) = model_verdicts(report.checked)
+    said = verdict.unconfirmed or verdict.scale[0].text
+    body = without_scripts(page(dataclasses.replace(run, report=report)))
+    assert f"<b>{label}:</b> {said}." in body
+
+
 def test_names_in_a_verdict_are_only_ever_text(plain):
     run = read_run(plain[0])
     check = check_of("amber")

@@ -119,7 +119,7 @@ def test_a_model_of_which_the_photos_show_few_points_is_amber():
     assert head == (
         "verdict          amber: the photos do not show most points of the model (sparse/2)"
     )
-    assert said.startswith("not confirmed    less than a quarter of the points were found")
+    assert said.startswith("not refined      too few of its points were found")
     assert "do not use this model before you have looked at it" in advice
 
 

@@ -1,5 +1,6 @@
 """When the models of a run show different places, and which photos are settled then."""
 
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,16 @@ from jaxsfm.runs import mapping_looks, places
 from jaxsfm.runs.mapping_looks import map_in_looks
 from jaxsfm.runs.places import BRIDGES, ONE_PLACE, bridges, show_different_places
 from jaxsfm.sfm.two_photos.matched import HALF_SURE, POWER
+
+
+@dataclasses.dataclass
+class FakeJob:
+    """What is asked of a job here."""
+
+    config: Any = None
+    engine: Any = None
+    progress: bool = True
+
 
 LIMIT = HALF_SURE * (ONE_PLACE / (1 - ONE_PLACE)) ** (1 / POWER)
 """The evidence of a pair that is right with the probability `ONE_PLACE`."""
@@ -38,9 +49,14 @@ def different(
     """Whether the models show different places, and which pairs were matched to find out."""
     matched: list[Pair] = []
     images = {n: ImageFile(name=n, path=Path(n), size=(4, 3), sha256=n) for n in "abcdef"}
-    monkeypatch.setattr(places, "match_pairs", lambda j, i, pairs, s: matched.extend(pairs))
+
+    def match_pairs(job, images, pairs, seconds):
+        assert not job.progress  # a trial of a few pairs is no news
+        matched.extend(pairs)
+
+    monkeypatch.setattr(places, "match_pairs", match_pairs)
     monkeypatch.setattr(places, "_evidence", lambda job, images, pair: evidence.get(pair, 0.0))
-    job: Any = None
+    job: Any = FakeJob()
     return show_different_places(job, images, mapped, tried, {}), matched
 
 
@@ -50,7 +66,7 @@ def test_models_show_one_place_if_a_pair_between_them_is_probably_right(
 ):
     tried = counts(ab=900, cd=800, ac=30, bd=40)
     found = different(monkeypatch, run("ab", "cd"), tried, {("a", "c"): evidence})
-    assert found == (places_differ, [("b", "d"), ("a", "c")])
+    assert found == (places_differ, [("a", "c"), ("b", "d")])
 
 
 @pytest.mark.parametrize(
@@ -66,16 +82,20 @@ def test_models_without_a_tried_pair_between_them_show_different_places(monkeypa
     assert different(monkeypatch, run("ab", "cd"), counts(ab=900, cd=800), {}) == (True, [])
 
 
-def test_bridges_are_the_strongest_pairs_of_each_smaller_model_and_each_comes_once():
-    assert bridges(["ab", "cd"], counts(ab=9, ac=3, bd=5, xc=99)) == [("b", "d"), ("a", "c")]
-    three = counts(ac=5, ae=4, ce=9)
-    assert bridges(["ab", "cd", "ef"], three) == [("c", "e"), ("a", "c"), ("a", "e")]
+def test_bridges_are_pairs_between_two_models():
+    tried = counts(ab=9, ac=3, bd=5, xc=99, ae=4, ce=9)
+    between = [("a", "c"), ("b", "d")]
+    assert bridges(["ab", "cd"], tried) == between
+    assert bridges(["ab", "cd", "ef"], tried) == [("a", "c"), ("a", "e"), ("b", "d"), ("c", "e")]
 
 
-def test_a_smaller_model_has_a_limited_number_of_bridges():
-    many = {(f"a{k:02}", "z"): PairCounts(k, 1, 100, 0, Status.VERIFIED) for k in range(20)}
-    found = bridges([[a for a, _ in many], ["z"]], many)
-    assert found == [(f"a{k:02}", "z") for k in range(19, 19 - BRIDGES, -1)]
+def test_two_models_have_a_limited_number_of_bridges_whatever_lies_between_others():
+    """Parts of one place are not hidden by stronger pairs with a third one."""
+    many = {(f"a{k:02}", "y"): PairCounts(k, 1, 100, 0, Status.VERIFIED) for k in range(20)}
+    weak = ("y", "z")
+    tried = many | {weak: PairCounts(1, 1, 100, 0, Status.VERIFIED)}
+    found = bridges([[a for a, _ in many], ["y"], ["z"]], tried)
+    assert found == [*((f"a{k:02}", "y") for k in range(20 - BRIDGES, 20)), weak]
 
 
 @pytest.mark.parametrize(
@@ -99,7 +119,7 @@ def test_photos_of_different_places_need_no_second_look(
         Matched, "counts", counts() | {("0a", "1b"): PairCounts(*[30] * 4, Status.VERIFIED)}
     )
     images = {name: image(name) for name in "ab"}
-    photos: Any = Photos(images, SimpleNamespace(config=SimpleNamespace(checked=True)))
+    photos: Any = Photos(images, FakeJob(SimpleNamespace(checked=True)))
     made = {"": found, "again": Mapped(True, 40)}
     stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
     looks = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]

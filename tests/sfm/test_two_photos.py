@@ -21,6 +21,7 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.two_photos import evidence, matched, scale_search
+from jaxsfm.sfm.two_photos import look as look_module
 from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
 from jaxsfm.sfm.two_photos.common_view import (
     Located,
@@ -77,6 +78,26 @@ def test_four_matches_are_no_evidence():
 def test_cells_of_an_enlarged_photo_are_counted_in_larger_cells():
     cells = np.arange(64)  # 8 x 8 fine cells are 4 x 4 coarse ones, and 2 x 2 of twice their size
     assert [evidence._coarse_cells(cells, 8, times) for times in (1.0, 2.0)] == [16, 4]
+
+
+@pytest.mark.parametrize(("enlarge", "max_size"), [(1.0, 96), (2.5, 300)])
+def test_the_evidence_of_whole_photos_needs_their_sizes_only(
+    weights, tmp_path, monkeypatch, enlarge, max_size
+):
+    """Also for a photo that is stored sideways, and for those that are reduced or enlarged."""
+    config = dataclasses.replace(preset("paper"), enlarge=enlarge, max_size=max_size)
+    cv2.imwrite(str(tmp_path / "a.png"), rng_of(1).integers(0, 255, (70, 111, 3), np.uint8))
+    image = inspect_image(tmp_path / "a.png")
+    images = (image, dataclasses.replace(image, orientation=6))
+    both = [image_features(weights, each, config=config) for each in images]
+    rng = rng_of(2)
+    cells = rng.permutation(40)[:, None] * [1, 1]
+    found = result(rng.uniform(0, 60, (40, 2)), np.eye(3)[None], np.zeros(40, int))
+    found = dataclasses.replace(found, cells=cells.astype(np.int32))
+    monkeypatch.setattr(look_module, "match_features", lambda *_, **__: found)
+    expected = look_module.look(both[0], both[1], images, config=config, seed=0).evidence
+    assert expected > 0
+    assert look_module.evidence_of_photos(found, images, config=config) == pytest.approx(expected)
 
 
 def test_confidence_grows_from_none_to_certainty():

@@ -1,4 +1,4 @@
-"""When the verdict is amber because the refinement of a model was taken back."""
+"""When the verdict is amber because a model could not be refined."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -17,20 +17,19 @@ def refined(*accepted: bool) -> RefinementFigures:
 
 
 @pytest.mark.parametrize(
-    ("done", "taken_back"),
+    ("done", "unconfirmed"),
     [
         (refined(False), True),
         (refined(True, False), False),  # only the last pass was taken back
         (refined(True, True), False),
-        (refined(), False),  # too few points for a pass
+        (refined(), True),  # too few points for a pass
         (None, False),  # switched off, or a photo could not be read
     ],
 )
-def test_a_model_is_amber_if_no_pass_of_its_refinement_was_accepted(done, taken_back):
-    assert done is None or done.taken_back == taken_back
+def test_a_model_is_amber_if_no_pass_of_its_refinement_was_accepted(done, unconfirmed):
     check = check_refined(check_of("green"), done)
-    assert check is not None and check.unconfirmed == taken_back
-    assert check.verdict == ("amber" if taken_back else "green")
+    assert check is not None and check.unconfirmed == unconfirmed
+    assert check.verdict == ("amber" if unconfirmed else "green")
     red = check_refined(check_of("red"), done)
     assert red is not None and red.verdict == "red"
 

@@ -22,6 +22,7 @@ def check_from_json(row: dict[str, Any]) -> ModelCheck:
         taken_out=row["taken_out"],
         told_apart=row["told_apart"],
         shrunk=row["shrunk"],
+        unconfirmed=row["unconfirmed"],
         without_sky=row["without_sky"],
     )
 

@@ -100,8 +100,8 @@ class ModelCheck:
     """Photos that see their points so much nearer than others that a part of the model has shrunk
     (`jaxsfm.sfm.check.scale`). Sorted."""
     unconfirmed: bool = False
-    """Whether the refinement was taken back, because too few points of the model were found in the
-    photos that should show them. A model that is right fits at once."""
+    """Whether the model was not refined, because too few of its points were found in the photos
+    that should show them."""
     without_sky: bool = False
     """Whether the sky was masked because something spoke against a model with it. What masked
     pixels show contradicts nothing, so this check is weaker than the one before."""

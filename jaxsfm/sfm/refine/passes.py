@@ -50,9 +50,9 @@ class RefinementFigures:
     """The camera that the photos speak for, if it is not the one that was held."""
 
     @property
-    def taken_back(self) -> bool:
-        """Whether so few points were found in the photos that no pass was accepted."""
-        return bool(self.passes) and not any(done.accepted for done in self.passes)
+    def confirmed(self) -> bool:
+        """Whether enough points were found in the photos: a pass was made, and was accepted."""
+        return any(done.accepted for done in self.passes)
 
 
 def figures_from_json(row: dict[str, Any]) -> RefinementFigures:

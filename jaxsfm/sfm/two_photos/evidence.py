@@ -14,9 +14,10 @@ import math
 import numpy as np
 from scipy.special import gammaln
 
-from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.pairs import PairResult
 
+Grid = tuple[int, int]
+"""The rows and columns of a working photo's fine cells."""
 MINIMAL = 4
 """The number of matches that determine a homography."""
 MATCHES_OF_A_CELL = 4
@@ -60,8 +61,7 @@ def _coarse_cells(cells: np.ndarray, columns: int, times: float) -> int:
 
 def plane_evidence(
     result: PairResult,
-    features0: ImageFeatures,
-    features1: ImageFeatures,
+    grids: tuple[Grid, Grid],
     *,
     threshold_px: float,
     fine_stride: int,
@@ -70,13 +70,12 @@ def plane_evidence(
     """The evidence of each plane of a pair, float64 (p,).
 
     Args:
-      features0, features1: the features that were matched.
+      grids: of the working photos that were matched.
       threshold_px: the largest error of an inlier, working pixels of the second photo.
       fine_stride: the side of a fine cell, working pixels.
       zooms: working pixels per pixel of each photo.
     """
-    rows1, columns1 = (int(n) for n in features1.dense.fine_grid)
-    columns0 = int(features0.dense.fine_grid[1])
+    (_, columns0), (rows1, columns1) = grids
     area = rows1 * columns1 * fine_stride**2
     chance = min(math.pi * threshold_px**2 / area, 0.5)
     larger = [max(zoom / ENLARGED, 1.0) for zoom in zooms]

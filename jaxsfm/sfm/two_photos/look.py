@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsfm.config import Config
 from jaxsfm.io.features import ImageFeatures
-from jaxsfm.io.images import ImageFile
+from jaxsfm.io.images import ImageFile, working_size
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import PhotoView
 from jaxsfm.matching.pair_matching import match_features
@@ -85,32 +85,42 @@ def look(
       images: the photos.
     """
     found = match_features(features0, features1, config=config, seed=seed)
-    evidence = evidence_of_planes(found, (features0, features1), views=views, config=config)
+    both = (features0, features1)
+    grid0, grid1 = ((int(rows), int(cols)) for rows, cols in (f.dense.fine_grid for f in both))
+    zoom0, zoom1 = (
+        1 / float(np.mean(each.scale)) if view is None else view.zoom
+        for each, view in zip(both, views, strict=True)
+    )
+    evidence = plane_evidence(
+        found,
+        (grid0, grid1),
+        threshold_px=config.threshold_px,
+        fine_stride=config.fine_stride,
+        zooms=(zoom0, zoom1),
+    )
     return Look(
         moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views
     )
 
 
-def evidence_of_planes(
-    found: PairResult,
-    features: tuple[ImageFeatures, ImageFeatures],
-    *,
-    views: Views = WHOLE,
-    config: Config,
-) -> np.ndarray:
-    """The evidence of each plane of a pair, float64 (p,).
+def evidence_of_photos(
+    found: PairResult, images: tuple[ImageFile, ImageFile], *, config: Config
+) -> float:
+    """The evidence of the matches of two whole photos, without their features.
 
     Args:
-      features: what was matched, with the same config.
+      found: what `match_features` gave for the photos with this config.
     """
-    zoom0, zoom1 = (
-        1 / float(np.mean(each.scale)) if view is None else view.zoom
-        for each, view in zip(features, views, strict=True)
-    )
-    return plane_evidence(
+    grids, zooms = [], []
+    for image in images:
+        size = working_size(image.upright_size, config.max_size, config.enlarge)
+        grids.append((size[1] // config.fine_stride, size[0] // config.fine_stride))
+        zooms.append(1 / float(np.mean(np.divide(image.upright_size, size))))
+    planes = plane_evidence(
         found,
-        *features,
+        (grids[0], grids[1]),
         threshold_px=config.threshold_px,
         fine_stride=config.fine_stride,
-        zooms=(zoom0, zoom1),
+        zooms=(zooms[0], zooms[1]),
     )
+    return total(planes)
