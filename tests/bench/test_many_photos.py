@@ -3,6 +3,7 @@ frames of a sequence."""
 
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -129,6 +130,7 @@ def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
         seen.append(([image.name for image in images], pairs))
         raise UserError("seen")
 
+    monkeypatch.setattr(sequence, "trained_networks", lambda: None)
     monkeypatch.setattr(sequence, "with_jaxsfm", lambda given, name: ({}, chosen))
     monkeypatch.setattr(sequence, "lightglue_matches", lightglue_matches)
     options = SequenceOptions(
@@ -139,6 +141,18 @@ def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
     ((names, pairs),) = seen
     assert names == [path.name for path in chosen_frames(street_sequence, 2, 0).mapped]
     assert pairs == sorted(chosen)
+
+
+def test_networks_that_are_missing_are_missed_before_anything_is_matched(
+    street_sequence, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setattr(sequence, "with_jaxsfm", lambda *_: pytest.fail("matched"))
+    options = SequenceOptions(
+        root=street_sequence, methods=("default,aliked+lightglue",), out=tmp_path
+    )
+    with pytest.raises(UserError, match="needs torch"):
+        sequence.bench_sequence(options)
 
 
 @pytest.mark.slow
