@@ -9,11 +9,14 @@ Lindenberger, Sarlin and Pollefeys 2023, "LightGlue: Local Feature Matching at L
 
 import importlib
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from jaxsfm.colmap.database import KeypointMatches
+from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.database import KeypointMatches, write_keypoint_matches
+from jaxsfm.colmap.two_views import VerificationOptions, verify
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, read_image
 from jaxsfm.io.pairs import Pair, exhaustive_pairs
@@ -77,3 +80,23 @@ def lightglue_matches(
                 found = matcher({"image0": features[a], "image1": features[b]})
                 matches[a, b] = found["matches"][0].numpy().astype(np.uint32)
     return KeypointMatches(keypoints, matches)
+
+
+def write_lightglue_database(
+    database: Path,
+    images: list[ImageFile],
+    cameras: Cameras,
+    options: VerificationOptions,
+    *,
+    pairs: Sequence[Pair] | None = None,
+    seconds: dict[str, float],
+) -> None:
+    """Write a database with the verified matches of `lightglue_matches`.
+
+    Args:
+      pairs, seconds: as there.
+    """
+    found = lightglue_matches(images, pairs, threads=options.threads, seconds=seconds)
+    with timed(seconds, "matching"):  # RootSIFT's has the verification, too
+        write_keypoint_matches(database, images, found, cameras)
+        verify(database, options)

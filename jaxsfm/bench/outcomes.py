@@ -47,7 +47,7 @@ def doubt(report: RunReport | None) -> str:
     """What a run says against its own models; empty if it presents them as right.
 
     Photos that are missing, and groups of photos that no pair joins, say nothing against the photos
-    that are in a model. COLMAP says nothing.
+    that are in a model. What a run says is the verdict on its worst model. COLMAP says nothing.
 
     Args:
       report: None for a method without a report.
@@ -55,7 +55,10 @@ def doubt(report: RunReport | None) -> str:
     if report is None:
         return ""
     verdicts = model_verdicts(report.checked)
-    return next((each.headline for each in verdicts if each.colour in ("red", "amber")), "")
+    worst_first = (
+        v.headline for colour in ("red", "amber") for v in verdicts if v.colour == colour
+    )
+    return next(worst_first, "")
 
 
 def judge(models: Sequence[Poses], truth: Poses, *, noticed: bool) -> Judgement:

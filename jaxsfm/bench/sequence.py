@@ -16,12 +16,12 @@ import numpy as np
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.frames import FrameSequence, chosen_frames, linked
-from jaxsfm.bench.lightglue import lightglue_matches, trained_networks
+from jaxsfm.bench.lightglue import trained_networks, write_lightglue_database
 from jaxsfm.bench.methods import LIGHTGLUE, ROOTSIFT
 from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.options import whole_numbers
 from jaxsfm.colmap.cameras import Cameras
-from jaxsfm.colmap.database import read_images, write_keypoint_matches
+from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.inliers import read_inliers
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
@@ -29,7 +29,7 @@ from jaxsfm.colmap.mapper import first_models
 from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions, verify
+from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.colmap.view import View
 from jaxsfm.config import PRESETS, preset
 from jaxsfm.errors import UserError
@@ -169,10 +169,9 @@ def _write_matches(
                 database, folder, images, cameras, VerificationOptions(), pairs=pairs
             )
         return
-    found = lightglue_matches(images, pairs, threads=-1, seconds=seconds)
-    with timed(seconds, "matching"):
-        write_keypoint_matches(database, images, found, cameras)
-        verify(database, VerificationOptions())
+    write_lightglue_database(
+        database, images, cameras, VerificationOptions(), pairs=pairs, seconds=seconds
+    )
 
 
 def _placed_by_matches(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.lightglue import lightglue_matches
+from jaxsfm.bench.lightglue import write_lightglue_database
 from jaxsfm.bench.methods import (
     LIGHTGLUE,
     MAPPERS,
@@ -20,14 +20,13 @@ from jaxsfm.bench.methods import (
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.strecha_sets import StrechaSet
 from jaxsfm.colmap.cameras import Cameras
-from jaxsfm.colmap.database import write_keypoint_matches
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import build_models
 from jaxsfm.colmap.model_folders import write_models
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
+from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.errors import writing
 from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.io.pairs import best_pairs, exhaustive_pairs
@@ -186,11 +185,8 @@ def _run_lightglue(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     """The models of a set by ALIKED keypoints and LightGlue's matches."""
     images, database = open_images(each.folder / "images")[0], work / "database.db"
     seconds: dict[str, float] = {}
-    found = lightglue_matches(images, threads=run.threads, seconds=seconds)
-    cameras = run.cameras(each)
-    with timed(seconds, "matching"):  # RootSIFT's has the verification, too
-        write_keypoint_matches(database, images, found, cameras)
-        verify(database, VerificationOptions(seed=run.seed, threads=run.threads))
+    options = VerificationOptions(seed=run.seed, threads=run.threads)
+    write_lightglue_database(database, images, run.cameras(each), options, seconds=seconds)
     return _mapped(database, work, run, seconds)
 
 

@@ -13,9 +13,10 @@ from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights
-from jaxsfm.matching.engines import Engine
+from jaxsfm.matching.engines import Engine, chosen_engine
 from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.extraction import image_features
+from jaxsfm.options import LOCAL
 
 T = TypeVar("T")
 
@@ -39,6 +40,11 @@ class Job:
     seed: int
     progress: bool = False
     """Whether progress bars are shown."""
+
+    def here(self) -> "Job":
+        """The same job in this process, without bars: for so few pairs that workers would take
+        longer to start."""
+        return dataclasses.replace(self, engine=chosen_engine(LOCAL), progress=False)
 
     def load_features(self, image: ImageFile) -> ImageFeatures | None:
         """The features of an image; None if no store has them."""

@@ -5,15 +5,12 @@ need no second look then. But the models may also be parts of one place that the
 connected. So the strongest pairs between models are matched at full size first.
 """
 
-import dataclasses
 import itertools
 import logging
 from collections.abc import Collection, Mapping, Sequence
 
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairCounts
-from jaxsfm.matching.engines import chosen_engine
-from jaxsfm.options import LOCAL
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.matching_looks import match_pairs
 from jaxsfm.runs.run_stages import MappedRun
@@ -49,9 +46,7 @@ def show_different_places(
     if len(models) < 2 or mapped.doubted() or len(set().union(*models)) < sum(map(len, models)):
         return False
     pairs = bridges(models, counts)
-    # Workers would take longer to start than this takes.
-    few = dataclasses.replace(job, engine=chosen_engine(LOCAL), progress=False)
-    match_pairs(few, images, pairs, seconds)
+    match_pairs(job.here(), images, pairs, seconds)
     strongest = max((_evidence(job, images, pair) for pair in pairs), default=0.0)
     different = confidence(strongest) < ONE_PLACE
     if different:
@@ -70,7 +65,7 @@ def bridges(models: Sequence[Collection[str]], counts: Mapping[Pair, PairCounts]
     between: dict[frozenset[int], list[Pair]] = {}
     for pair in counts:
         joined = frozenset(model_of[name] for name in pair if name in model_of)
-        if model_of.keys() >= set(pair) and len(joined) == 2:
+        if len(joined) == 2:
             between.setdefault(joined, []).append(pair)
     strongest = (strongest_first(pairs, counts)[:BRIDGES] for pairs in between.values())
     return sorted(itertools.chain.from_iterable(strongest))

@@ -14,8 +14,6 @@ from jaxsfm.colmap.poses import model_poses
 from jaxsfm.io import orientation
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.pairs import Pair, PairCounts, make_pair
-from jaxsfm.matching.engines import chosen_engine
-from jaxsfm.options import LOCAL
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.matching_looks import job_of_look, match_pairs
@@ -66,10 +64,8 @@ class Trials:
         config = self.job.config
         config = dataclasses.replace(config, max_size=min(TRIAL_SIZE, config.max_size))
         look = job_of_look(self.job, self.identity.with_images([images[name]]), config)
-        # Workers would take longer to start than this takes.
-        trial = dataclasses.replace(look, engine=chosen_engine(LOCAL), progress=False)
         pairs = [make_pair(name, other) for other in partners]
-        counts, _ = match_pairs(trial, images, pairs, self.seconds)
+        counts, _ = match_pairs(look.here(), images, pairs, self.seconds)
         return sum(found.num_inliers for found in counts.values())
 
 

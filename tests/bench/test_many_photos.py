@@ -126,13 +126,13 @@ def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
     chosen = {("photo00000.jpg", "photo00002.jpg"), ("photo00002.jpg", "photo00004.jpg")}
     seen = []
 
-    def lightglue_matches(images, pairs, *, threads, seconds):
+    def write_lightglue_database(database, images, cameras, options, *, pairs, seconds):
         seen.append(([image.name for image in images], pairs))
         raise UserError("seen")
 
     monkeypatch.setattr(sequence, "trained_networks", lambda: None)
     monkeypatch.setattr(sequence, "with_jaxsfm", lambda given, name: ({}, chosen))
-    monkeypatch.setattr(sequence, "lightglue_matches", lightglue_matches)
+    monkeypatch.setattr(sequence, "write_lightglue_database", write_lightglue_database)
     options = SequenceOptions(
         root=street_sequence, every=("2",), methods=("default,aliked+lightglue",), out=tmp_path
     )

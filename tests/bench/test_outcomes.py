@@ -184,5 +184,6 @@ def test_a_run_doubts_its_model_when_its_verdict_is_amber_or_red():
     for colour, words in (("amber", "two models may explain"), ("red", "contradict each other")):
         said = doubt(report(check_of("green"), check_of(colour)))
         assert said.startswith(f"{colour}: ") and words in said
+    assert doubt(report(check_of("amber"), check_of("red"))).startswith("red: ")
     unconfirmed = dataclasses.replace(check_of("green"), unconfirmed=True)
     assert "do not show most points" in doubt(report(unconfirmed))

@@ -284,6 +284,12 @@ def test_an_accelerator_takes_what_fits(monkeypatch, memory):
     assert pairs == execution.MAX_PAIRS or batch > memory / 8
 
 
+def test_at_most_256_pairs_of_small_photos_are_side_by_side(monkeypatch):
+    monkeypatch.setattr(execution, "_device_memory", lambda _: int(80e9))
+    config = preset("default")
+    assert execution.pairs_at_once(Execution(), MESH, 512, 9999, config=config) == 256
+
+
 def test_the_next_batch_is_loaded_while_one_runs():
     log = []
 

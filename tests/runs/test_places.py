@@ -25,6 +25,9 @@ class FakeJob:
     engine: Any = None
     progress: bool = True
 
+    def here(self) -> "FakeJob":
+        return dataclasses.replace(self, progress=False)
+
 
 LIMIT = HALF_SURE * (ONE_PLACE / (1 - ONE_PLACE)) ** (1 / POWER)
 """The evidence of a pair that is right with the probability `ONE_PLACE`."""

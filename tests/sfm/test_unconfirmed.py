@@ -1,12 +1,16 @@
 """When the verdict is amber because a model could not be refined."""
 
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from verdicts import check_of
 
-from jaxsfm.sfm.reconstruction import check_refined
+from jaxsfm.config import preset
+from jaxsfm.sfm import reconstruction
+from jaxsfm.sfm.mapping import MappingFigures
+from jaxsfm.sfm.reconstruction import check_refined, refine_mapped
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 
@@ -36,3 +40,25 @@ def test_a_model_is_amber_if_no_pass_of_its_refinement_was_accepted(done, unconf
 
 def test_a_model_that_was_not_checked_has_no_verdict_after_its_refinement_either():
     assert check_refined(None, refined(False)) is None
+
+
+def test_each_model_of_a_run_has_the_check_that_follows_from_its_own_refinement(
+    tmp_path, monkeypatch
+):
+    """The refinement changes the order of the models if another one has most photos then."""
+    whole, part = check_of("green"), dataclasses.replace(check_of("green"), apart=[["a", "b"]])
+    done = [refined(True), refined(False)]
+    monkeypatch.setattr(reconstruction.stage_files, "read_refinement", lambda _: (done, [1, 0]))
+    monkeypatch.setattr(reconstruction, "read_models", lambda *_: ["part", "whole"])
+    (tmp_path / "mapped.db").touch()
+    mapped: Any = SimpleNamespace(
+        figures=MappingFigures(verdicts={}, attempts=[], checks=[whole, part]),
+        database=tmp_path / "mapped.db",
+        key="",
+        verification=None,
+        models=lambda _: [],
+    )
+    given: Any = SimpleNamespace(config=preset("default"), matches={})
+    kept: Any = SimpleNamespace(folder=SimpleNamespace(stage=lambda *_: tmp_path))
+    made = refine_mapped(given, mapped, tmp_path / "database.db", kept)
+    assert made.mapping.checks == [part, dataclasses.replace(whole, unconfirmed=True)]

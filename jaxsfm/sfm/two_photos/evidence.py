@@ -10,14 +10,24 @@ images and estimate the fundamental matrix"; here for homographies.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
 
 from jaxsfm.io.pairs import PairResult
 
-Grid = tuple[int, int]
-"""The rows and columns of a working photo's fine cells."""
+
+class Described(NamedTuple):
+    """The size at which a photo, or a view of it, was described."""
+
+    rows: int
+    """Of fine cells."""
+    columns: int
+    zoom: float
+    """Working pixels per pixel of the photo."""
+
+
 MINIMAL = 4
 """The number of matches that determine a homography."""
 MATCHES_OF_A_CELL = 4
@@ -61,31 +71,29 @@ def _coarse_cells(cells: np.ndarray, columns: int, times: float) -> int:
 
 def plane_evidence(
     result: PairResult,
-    grids: tuple[Grid, Grid],
+    described: tuple[Described, Described],
     *,
     threshold_px: float,
     fine_stride: int,
-    zooms: tuple[float, float],
 ) -> np.ndarray:
     """The evidence of each plane of a pair, float64 (p,).
 
     Args:
-      grids: of the working photos that were matched.
+      described: how the photos that were matched were described.
       threshold_px: the largest error of an inlier, working pixels of the second photo.
       fine_stride: the side of a fine cell, working pixels.
-      zooms: working pixels per pixel of each photo.
     """
-    (_, columns0), (rows1, columns1) = grids
-    area = rows1 * columns1 * fine_stride**2
+    first, second = described
+    area = second.rows * second.columns * fine_stride**2
     chance = min(math.pi * threshold_px**2 / area, 0.5)
-    larger = [max(zoom / ENLARGED, 1.0) for zoom in zooms]
+    larger = [max(zoom / ENLARGED, 1.0) for zoom in (first.zoom, second.zoom)]
     candidates = max(result.num_tentative / MATCHES_OF_A_CELL / max(larger) ** 2, 10.0)
     evidence = []
     for plane in range(len(result.homographies)):
         cells = result.cells[result.plane == plane]
         members = min(
-            _coarse_cells(cells[:, 0], columns0, larger[0]),
-            _coarse_cells(cells[:, 1], columns1, larger[1]),
+            _coarse_cells(cells[:, 0], first.columns, larger[0]),
+            _coarse_cells(cells[:, 1], second.columns, larger[1]),
             candidates,
         )
         evidence.append(evidence_of_plane(members, candidates, chance))

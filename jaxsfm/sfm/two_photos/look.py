@@ -12,7 +12,7 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import PhotoView
 from jaxsfm.matching.pair_matching import match_features
 from jaxsfm.sfm.two_photos.common_view import Located, mapped, upright
-from jaxsfm.sfm.two_photos.evidence import BY_CHANCE, plane_evidence, total
+from jaxsfm.sfm.two_photos.evidence import BY_CHANCE, Described, plane_evidence, total
 
 Views = tuple[PhotoView | None, PhotoView | None]
 """How both photos were seen; None stands for the whole photo."""
@@ -85,19 +85,15 @@ def look(
       images: the photos.
     """
     found = match_features(features0, features1, config=config, seed=seed)
-    both = (features0, features1)
-    grid0, grid1 = ((int(rows), int(cols)) for rows, cols in (f.dense.fine_grid for f in both))
-    zoom0, zoom1 = (
-        1 / float(np.mean(each.scale)) if view is None else view.zoom
-        for each, view in zip(both, views, strict=True)
+    described0, described1 = (
+        Described(
+            rows=int(features.dense.fine_grid[0]),
+            columns=int(features.dense.fine_grid[1]),
+            zoom=1 / float(np.mean(features.scale)) if view is None else view.zoom,
+        )
+        for features, view in zip((features0, features1), views, strict=True)
     )
-    evidence = plane_evidence(
-        found,
-        (grid0, grid1),
-        threshold_px=config.threshold_px,
-        fine_stride=config.fine_stride,
-        zooms=(zoom0, zoom1),
-    )
+    evidence = _evidence(found, (described0, described1), config)
     return Look(
         moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views
     )
@@ -111,16 +107,19 @@ def evidence_of_photos(
     Args:
       found: what `match_features` gave for the photos with this config.
     """
-    grids, zooms = [], []
-    for image in images:
+
+    def described(image: ImageFile) -> Described:
         size = working_size(image.upright_size, config.max_size, config.enlarge)
-        grids.append((size[1] // config.fine_stride, size[0] // config.fine_stride))
-        zooms.append(1 / float(np.mean(np.divide(image.upright_size, size))))
-    planes = plane_evidence(
-        found,
-        (grids[0], grids[1]),
-        threshold_px=config.threshold_px,
-        fine_stride=config.fine_stride,
-        zooms=(zooms[0], zooms[1]),
+        columns, rows = (side // config.fine_stride for side in size)
+        return Described(rows, columns, 1 / float(np.mean(np.divide(image.upright_size, size))))
+
+    return total(_evidence(found, (described(images[0]), described(images[1])), config))
+
+
+def _evidence(
+    found: PairResult, described: tuple[Described, Described], config: Config
+) -> np.ndarray:
+    """The evidence of each plane, float64 (p,), with the limits of a config."""
+    return plane_evidence(
+        found, described, threshold_px=config.threshold_px, fine_stride=config.fine_stride
     )
-    return total(planes)
