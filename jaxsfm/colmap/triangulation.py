@@ -8,8 +8,8 @@ import pycolmap
 from jaxsfm.colmap.map_options import MapOptions, incremental_options
 from jaxsfm.colmap.native import native
 
-FEWEST = 10
-"""A model with fewer points can be neither checked nor refined."""
+MIN_POINTS = 10
+"""A model with fewer points is not refined."""
 
 
 def with_all_points(
@@ -20,10 +20,10 @@ def with_all_points(
     COLMAP triangulates the points, joins them to tracks, adjusts them, and drops observations that
     are too far off. Poses and cameras stay.
 
-    If COLMAP finds fewer than `FEWEST`, the model keeps those that it has. This happens to models
-    of two to four photos with a wrong camera: a model of *statue*, in which one of three photos had
-    a focal length of a million pixels, came back without its 839 points. Then nothing could speak
-    against it.
+    If COLMAP finds fewer than `MIN_POINTS`, the model keeps those that it has. This happens to
+    models of two to four photos with a wrong camera: a model of *statue*, in which one of three
+    photos had a focal length of a million pixels, came back without its 839 points. Then nothing
+    could speak against it.
 
     Args:
       database: with the images and keypoints of the model.
@@ -45,6 +45,6 @@ def with_all_points(
             ),
             database,
         )
-    if whole.num_points3D() < min(FEWEST, model.num_points3D()):
+    if whole.num_points3D() < min(MIN_POINTS, model.num_points3D()):
         return pycolmap.Reconstruction(model)
     return whole

@@ -8,6 +8,7 @@ import pytest
 from databases import content
 from mapped import verified
 
+from jaxsfm.colmap import triangulation
 from jaxsfm.colmap.database import read_images, read_matches, write_database
 from jaxsfm.colmap.inliers import keep_inliers, read_inliers
 from jaxsfm.colmap.map_options import MapOptions
@@ -170,7 +171,16 @@ def test_a_model_gets_the_points_of_all_matches_and_is_not_changed_itself(synthe
 def test_a_model_without_any_match_keeps_its_points(synthetic):
     model, path = synthetic
     draft = few_points(model, 20)
-    with pycolmap.Database.open(path) as database:
-        database.clear_two_view_geometries()
+    keep_inliers(path, {pair: rows[:0] for pair, rows in read_inliers(path).matches.items()})
     kept = with_all_points(draft, path, MapOptions())
     assert kept is not draft and kept.num_points3D() == 20
+
+
+@pytest.mark.parametrize(("before", "found", "points"), [(20, 9, 20), (20, 10, 10), (5, 6, 6)])
+def test_a_model_keeps_its_points_if_hardly_one_is_found(
+    synthetic, monkeypatch, before, found, points
+):
+    model, path = synthetic
+    monkeypatch.setattr(triangulation, "native", lambda *_: few_points(model, found))
+    kept = with_all_points(few_points(model, before), path, MapOptions())
+    assert kept.num_points3D() == points

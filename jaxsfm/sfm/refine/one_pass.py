@@ -10,6 +10,7 @@ import numpy as np
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Observations, Tracks
+from jaxsfm.colmap.triangulation import MIN_POINTS
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -19,8 +20,6 @@ from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
 if TYPE_CHECKING:
     import pycolmap
 
-MIN_POINTS = 10
-"""A model with fewer points is not refined."""
 MIN_POINT_SHARE = 0.25
 """A pass that keeps less of the points is taken back: the images do not agree well enough."""
 WEAK_COUNT, WEAK_SHARE = 30, 0.25

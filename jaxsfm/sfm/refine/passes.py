@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.colmap.other_camera import OtherCamera
+from jaxsfm.colmap.triangulation import MIN_POINTS
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
 from jaxsfm.sfm.refine.one_pass import (
-    MIN_POINTS,
     PassFigures,
     PassOutcome,
     PassSettings,
