@@ -10,7 +10,9 @@ from strategies import rng_of, seeds
 
 from jaxsfm.colmap.two_views import PairGeometry, spread
 from jaxsfm.sfm.view_graph import (
+    STEEPNESS,
     STRONG,
+    WEAK,
     mean_rotation,
     rotation_angle_deg,
     strengths,
@@ -85,26 +87,32 @@ def test_verdicts_depend_neither_on_the_order_nor_on_the_names_of_images(seed):
         assert moved[x, y].trusted == verdict.trusted
 
 
-def test_groups_meet_where_most_inliers_agree():
-    """Two groups joined by one strong false pair and three true ones that together outweigh it."""
+def two_groups(joining, turned):
+    """Verdicts on two groups of three images. Pairs between them have so many inliers, by pair; the
+    rotations of the `turned` ones are off by half a turn. Pairs within a group have 1000."""
     rng = rng_of(3)
     rotations = [Rotation.from_rotvec(rng.normal(0, 0.3, 3)) for _ in range(6)]
-    names = list("abcdef")
-
-    def relative(i, j, turn=None):
-        move = rotations[j] * rotations[i].inv()
-        return (turn * move if turn is not None else move).as_matrix()
-
-    pairs = {}
-    for group in ((0, 1, 2), (3, 4, 5)):
-        for i, j in itertools.combinations(group, 2):
-            pairs[names[i], names[j]] = PairGeometry(num_inliers=1000, rotation=relative(i, j))
-    for i, j in ((0, 3), (1, 4), (2, 5)):
-        pairs[names[i], names[j]] = PairGeometry(num_inliers=120, rotation=relative(i, j))
     half_turn = Rotation.from_euler("y", 180, degrees=True)
-    pairs["a", "e"] = PairGeometry(num_inliers=200, rotation=relative(0, 4, half_turn))
-    verdicts = trusted_pairs(pairs)
-    assert [p for p, v in verdicts.items() if not v.trusted] == [("a", "e")]
+    inside = [p for group in ("abc", "def") for p in itertools.combinations(group, 2)]
+    pairs = {}
+    for pair, inliers in {**dict.fromkeys(inside, 1000), **joining}.items():
+        i, j = ("abcdef".index(name) for name in pair)
+        relative = rotations[j] * rotations[i].inv()
+        relative = half_turn * relative if pair in turned else relative
+        pairs[pair] = PairGeometry(num_inliers=inliers, rotation=relative.as_matrix())
+    return {pair for pair, verdict in trusted_pairs(pairs).items() if not verdict.trusted}
+
+
+def test_groups_meet_where_most_inliers_agree():
+    """Two groups joined by one strong false pair and three true ones that together outweigh it."""
+    true = dict.fromkeys([("a", "d"), ("b", "e"), ("c", "f")], 300)
+    assert two_groups({**true, ("a", "e"): 380}, {("a", "e")}) == {("a", "e")}
+
+
+def test_one_strong_pair_outweighs_several_weak_ones():
+    """Windows that look the same give many weak pairs that agree with each other."""
+    false = dict.fromkeys([("a", "d"), ("b", "e"), ("c", "f")], 120)
+    assert two_groups({**false, ("a", "e"): 300}, false.keys()) == false.keys()
 
 
 def test_an_image_with_one_weak_pair_keeps_it():
@@ -171,16 +179,28 @@ def test_pairs_without_a_pose_are_not_trusted_and_say_so():
     assert trusted_pairs({}) == {}
 
 
-def test_strength_is_one_for_the_best_pair_of_both_images():
+def test_strength_is_relative_to_the_best_pairs_of_both_images_and_of_all_others():
     pairs = {
         ("a", "b"): PairGeometry(num_inliers=400, rotation=np.eye(3)),
         ("b", "c"): PairGeometry(num_inliers=100, rotation=np.eye(3)),
         ("c", "d"): PairGeometry(num_inliers=100, rotation=np.eye(3), spread=0.25),
     }
     got = strengths(pairs)
-    assert got["a", "b"] == 1.0
-    assert got["b", "c"] == pytest.approx(100 / np.sqrt(400 * 100))
-    assert got["c", "d"] == pytest.approx(50 / np.sqrt(100 * 50))
+    half = WEAK * np.median([400, 400, 100, 50])
+    for pair, (weight, best) in zip(
+        pairs, ((400, 400), (100, 200), (50, 50 * 2**0.5)), strict=True
+    ):
+        assert got[pair] == pytest.approx(weight / best / (1 + (half / weight) ** STEEPNESS))
+    assert strengths({}) == {}
+
+
+def test_the_best_pair_of_an_image_is_weak_if_all_of_its_pairs_are():
+    """An image whose pairs are all false has a best pair, too."""
+    _, _, pairs = ring(rng_of(0))
+    alone = ("0.jpg", "night.jpg")
+    for inliers, strong in ((20, False), (1500, True)):
+        got = strengths(pairs | {alone: PairGeometry(num_inliers=inliers, rotation=np.eye(3))})
+        assert (got[alone] > STRONG) == strong
 
 
 def test_spread_counts_covered_cells():
