@@ -35,7 +35,9 @@ class Mapped:
     few_apart: bool = False
     """Only photos that follow each other speak against it."""
     many_lost: bool = False
-    """More than a third of the photos are in no model."""
+    """More than a third of the photos are not in the best model."""
+    in_no_model: bool = False
+    """A photo is in no model."""
     cut_short: bool = False
     places: int = 1
     """So many models are large enough to be checked."""
@@ -62,7 +64,7 @@ class Mapped:
 
     def unsettled(self, counts: dict, in_any_model: bool = False) -> SecondLook | None:
         if in_any_model:
-            return None
+            return SecondLook(["a"], [("a", "b")], whole=False) if self.in_no_model else None
         return SecondLook(["a"], [("a", "b")], whole=self.many_lost or not self.few_apart)
 
     better_than, largest = MappedRun.better_than, MappedRun.largest

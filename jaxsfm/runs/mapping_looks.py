@@ -97,8 +97,9 @@ class RunPhotos:
 def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) -> MappedLooks:
     """Map the photos; where that leaves photos without a sure place, look again.
 
-    With the sky masked, the verdict is amber at best. If something still speaks against the model,
-    a second look at all pairs could settle nothing, and it takes longer than the first one.
+    With the sky masked, the verdict is amber at best. A second look at all pairs could settle
+    nothing, and it takes longer than the first one. So only photos that are in no model that was
+    checked are looked at again, and none if something still speaks against the model.
 
     Args:
       matched: the photos after the first look.
@@ -128,17 +129,20 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
         return found
     looks = UsedLooks(first_px=matched.described.max_size)
     again = mapped.unsettled(matched.counts)
+    if again and again.whole and masked_sky and mapped.doubted():
+        logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
+        return found._replace(looks=dataclasses.replace(looks, photos=again.photos))
     if (
         again
         and again.whole
-        and show_different_places(photos.job, photos.images, mapped, matched.counts, seconds)
+        and (
+            masked_sky
+            or show_different_places(photos.job, photos.images, mapped, matched.counts, seconds)
+        )
     ):
         again = mapped.unsettled(matched.counts, in_any_model=True)
     if again is None:
         return found._replace(looks=looks)
-    if again.whole and masked_sky and mapped.doubted():
-        logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
-        return found._replace(looks=dataclasses.replace(looks, photos=again.photos))
     logger.info("%s", again.in_words())
     matched_again = match_again(photos.job, photos.images, matched, again, seconds)
     mapped_again = dataclasses.replace(stages, look=stages.look + "-again").map(matched_again)

@@ -33,6 +33,7 @@ from jaxsfm.sfm.reconstruction import (
     matched_photos,
     refine_mapped,
 )
+from jaxsfm.sfm.round import FEWER
 from jaxsfm.sfm.second_look import SecondLook, second_look
 
 
@@ -87,14 +88,29 @@ class MappedRun:
         """Whether there are more photos in the best model, or in the next one if those are equal.
 
         Models that something speaks against are worse than others, and so are models that are too
-        small to be checked, and none.
+        small to be checked, and none. If something speaks against both, and their best models are
+        nearly as large, those are better against which only photos speak that follow each other.
         """
 
-        def rank(run: MappedRun) -> tuple[bool, list[int]]:
-            sizes = [len(photos) for photos in run.photos]
-            return run.green() and run.largest() >= MIN_VIEWS, sorted(sizes, reverse=True)
+        def checked(run: MappedRun) -> bool:
+            return run.largest() >= MIN_VIEWS
 
-        return rank(self) > rank(other)
+        def green(run: MappedRun) -> bool:
+            return checked(run) and run.green()
+
+        def likely(run: MappedRun) -> bool:
+            return checked(run) and not run.doubted()
+
+        def sizes(run: MappedRun) -> list[int]:
+            return sorted(map(len, run.photos), reverse=True)
+
+        if green(self) != green(other):
+            return green(self)
+        ours, theirs = self.largest(), other.largest()
+        nearly = abs(ours - theirs) <= FEWER * max(ours, theirs)
+        if nearly and likely(self) != likely(other):
+            return likely(self)
+        return sizes(self) > sizes(other)
 
     def largest(self) -> int:
         """The number of photos in the best model."""

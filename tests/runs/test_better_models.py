@@ -8,11 +8,14 @@ import pytest
 from jaxsfm.runs.run_stages import MappedRun
 
 
-def run(*sizes: int, green: bool = True) -> Any:
+def run(*sizes: int, green: bool = True, doubted: bool = False) -> Any:
     """Models of so many photos."""
     photos = [set(range(size)) for size in sizes]
     return SimpleNamespace(
-        photos=photos, green=lambda: green, largest=lambda: max(map(len, photos), default=0)
+        photos=photos,
+        green=lambda: green,
+        doubted=lambda: doubted,
+        largest=lambda: max(map(len, photos), default=0),
     )
 
 
@@ -22,6 +25,9 @@ ORDER = [
     [run(24, 10, 7, 6), run(24, 19, 10)],  # four places, of which one fell apart
     [run(10), run(10, 3)],
     [run(24, 19, 10), run(25)],
+    [run(81, 28, green=False, doubted=True), run(80, 18, green=False)],  # only neighbours disagree
+    [run(80, 18, green=False), run(90, green=False, doubted=True)],  # more than a tenth fewer
+    [run(80, green=False), run(10)],
 ]
 
 

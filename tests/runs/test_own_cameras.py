@@ -26,6 +26,9 @@ class Mapped:
     def green(self) -> bool:
         return self.looks_right
 
+    def doubted(self) -> bool:
+        return not self.looks_right
+
     better_than, largest = MappedRun.better_than, MappedRun.largest
 
 

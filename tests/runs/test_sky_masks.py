@@ -76,6 +76,7 @@ def test_masks_of_the_user_are_believed(skies):
         (Mapped(False, 2), Mapped(True, 2), 0),  # too small to be checked
         (Mapped(False, 0), Mapped(True, 0), 0),
         (Mapped(False, 55), Mapped(False, 55), 0),
+        (Mapped(False, 55), Mapped(False, 54, few_apart=True), 2),
         (Mapped(True, 12), Mapped(True, 20), None),
         (Mapped(False, 12, few_apart=True), Mapped(True, 20), None),
     ],
@@ -121,7 +122,7 @@ def test_rounds_that_ended_early_are_made_if_masks_of_the_sky_do_not_help(
     [
         (Mapped(False, 108), False),
         (Mapped(False, 108, few_apart=True), True),
-        (Mapped(True, 60, many_lost=True), True),
+        (Mapped(True, 60, many_lost=True, in_no_model=True), True),
         (Mapped(False, 50), True),  # the sky is not masked, as this gives no better model
     ],
 )
@@ -140,5 +141,19 @@ def test_with_the_sky_masked_not_all_pairs_are_looked_at_again(
     found = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]
     assert found.looks is not None and found.looks.photos == ["a"]
     assert bool(found.looks.again) == looked_again
+    assert found.looks.whole == (looked_again and not found.masked_sky)
     assert found.mapped is (made["again"] if looked_again else masked)
     assert ("no pair was matched again" in found.looks.in_words()) != looked_again
+
+
+def test_with_the_sky_masked_photos_of_every_model_have_a_place(monkeypatch, tmp_path, skies):
+    """Also if most are not in the best one."""
+    skies({"a": 40, "b": 40})
+    monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
+    images = {name: image(name) for name in "ab"}
+    full_size = SimpleNamespace(config=SimpleNamespace(checked=True))
+    made = {"": Mapped(False, 60), "-sky": Mapped(True, 60, many_lost=True)}
+    photos: Any = Photos(images, full_size)
+    stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
+    found = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]
+    assert found.mapped is made["-sky"] and found.looks is not None and not found.looks.photos

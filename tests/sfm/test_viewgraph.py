@@ -88,8 +88,11 @@ def test_verdicts_depend_neither_on_the_order_nor_on_the_names_of_images(seed):
 
 
 def two_groups(joining, turned):
-    """Verdicts on two groups of three images. Pairs between them have so many inliers, by pair; the
-    `turned` ones agree that the second group is turned by half a turn. Pairs within a group have 1000."""
+    """The pairs of two groups of three images that are not trusted.
+
+    Pairs between the groups have so many inliers, by pair, and pairs within a group have 1000. The
+    `turned` ones agree that the second group is turned by half a turn.
+    """
     rng = rng_of(3)
     rotations = [Rotation.from_rotvec(rng.normal(0, 0.3, 3)) for _ in range(6)]
     half_turn = Rotation.from_euler("y", 180, degrees=True)
