@@ -203,6 +203,24 @@ def test_two_views_are_a_model_whatever_holds_them(rendered):
     assert take_out(bare, weak, rendered) == (bare, weak)
 
 
+@pytest.mark.parametrize(("seen", "stays"), [(29, False), (30, True)])
+def test_an_image_that_the_mapper_left_out_needs_observations_that_hold_it(rendered, seen, stays):
+    """What looks alike gives a photo of another place a pose that a few points agree with."""
+    model = lost_view(rendered, turn_deg=0.0, seen=seen)
+    placed = Placement(
+        name=NIGHT_NAME,
+        registered=False,
+        octave_px=1,
+        candidates=974,
+        agreed=30,
+        error_px=1.0,
+    )
+    after, (told,) = take_out(model, [placed], rendered)
+    assert (after is model) == stays == (NIGHT_NAME in model_poses(after))
+    assert told.doubt == ("" if stays else "only 29 points hold it in the model")
+    assert told.held is None
+
+
 def test_refinement_takes_a_photo_of_another_place_out_of_the_model(rendered):
     elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
     after, figures = refine(lost_view(elsewhere, seen=12), elsewhere)
