@@ -36,8 +36,8 @@ class Mapped:
     """Only photos that follow each other speak against it."""
     many_lost: bool = False
     """More than a third of the photos are not in the best model."""
-    in_no_model: bool = False
-    """A photo is in no model."""
+    in_no_model: str = ""
+    """Whether photos are in no model: one, or many, which are more than a third."""
     cut_short: bool = False
     places: int = 1
     """So many models are large enough to be checked."""
@@ -63,8 +63,9 @@ class Mapped:
         return [{f"{k}{n}" for n in "ab"} for k in range(self.places)]
 
     def unsettled(self, counts: dict, in_any_model: bool = False) -> SecondLook | None:
-        if in_any_model:
-            return SecondLook(["a"], [("a", "b")], whole=False) if self.in_no_model else None
+        if in_any_model and not self.doubted():  # otherwise nothing is settled
+            some = SecondLook(["a"], [("a", "b")], whole=self.in_no_model == "many")
+            return some if self.in_no_model else None
         return SecondLook(["a"], [("a", "b")], whole=self.many_lost or not self.few_apart)
 
     better_than, largest = MappedRun.better_than, MappedRun.largest

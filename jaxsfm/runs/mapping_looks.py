@@ -98,8 +98,8 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     """Map the photos; where that leaves photos without a sure place, look again.
 
     With the sky masked, the verdict is amber at best. A second look at all pairs could settle
-    nothing, and it takes longer than the first one. So only photos that are in no model that was
-    checked are looked at again, and none if something still speaks against the model.
+    nothing, and it takes longer than the first one. So the photos of every model that was checked
+    are settled, and nothing is looked at again if more than neighbours speaks against a model.
 
     Args:
       matched: the photos after the first look.
@@ -128,17 +128,15 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     if matched.described == photos.job.config:
         return found
     looks = UsedLooks(first_px=matched.described.max_size)
-    again = mapped.unsettled(matched.counts)
+    again = mapped.unsettled(matched.counts, in_any_model=bool(masked_sky))
     if again and again.whole and masked_sky and mapped.doubted():
         logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
         return found._replace(looks=dataclasses.replace(looks, photos=again.photos))
     if (
         again
         and again.whole
-        and (
-            masked_sky
-            or show_different_places(photos.job, photos.images, mapped, matched.counts, seconds)
-        )
+        and not masked_sky
+        and show_different_places(photos.job, photos.images, mapped, matched.counts, seconds)
     ):
         again = mapped.unsettled(matched.counts, in_any_model=True)
     if again is None:

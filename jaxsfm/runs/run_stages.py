@@ -67,7 +67,8 @@ class MappedRun:
 
         Args:
           in_any_model: whether every model that is large enough to be checked counts, because each
-            shows a place of its own; otherwise only the best one counts.
+            shows a place of its own, or because nothing would join them; otherwise only the best
+            one counts.
         """
         if not self.photos or self.doubted():
             return set()
@@ -88,8 +89,9 @@ class MappedRun:
         """Whether there are more photos in the best model, or in the next one if those are equal.
 
         Models that something speaks against are worse than others, and so are models that are too
-        small to be checked, and none. If something speaks against both, and their best models are
-        nearly as large, those are better against which only photos speak that follow each other.
+        small to be checked, and none. If something speaks against both, and they have nearly as
+        many photos in the best model and in all, the one is better that only neighbours speak
+        against.
         """
 
         def checked(run: MappedRun) -> bool:
@@ -106,9 +108,13 @@ class MappedRun:
 
         if green(self) != green(other):
             return green(self)
-        ours, theirs = self.largest(), other.largest()
-        nearly = abs(ours - theirs) <= FEWER * max(ours, theirs)
-        if nearly and likely(self) != likely(other):
+
+        def alike(ours: int, theirs: int) -> bool:
+            return abs(ours - theirs) <= FEWER * max(ours, theirs)
+
+        largest = self.largest(), other.largest()
+        photos = (len(set().union(*run.photos)) for run in (self, other))
+        if alike(*largest) and alike(*photos) and likely(self) != likely(other):
             return likely(self)
         return sizes(self) > sizes(other)
 

@@ -191,7 +191,7 @@ def _without_doubtful(
     refinement: Refinement,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
     """A refined model without the new photos whose places are doubtful, and what was done to it."""
-    placed = [at for at in done.placed if at.octave_px is not None and not at.registered]
+    placed = [at for at in done.placed if at.octave_px and not (at.registered or at.doubt)]
     new = {at.name: at.rests_on_details() for at in placed}
     if not new:
         return model, done
@@ -200,5 +200,5 @@ def _without_doubtful(
     if not found:
         return model, done
     left = whole.part(set(registered(model)) - found.keys())[0]
-    every = [dataclasses.replace(at, doubt=found.get(at.name, "")) for at in done.placed]
+    every = [dataclasses.replace(at, doubt=found.get(at.name, at.doubt)) for at in done.placed]
     return left.to_colmap(), dataclasses.replace(done, placed=every)

@@ -17,7 +17,8 @@ are compared, the strongest first:
 
 So a false pair is trusted only where no stronger pair contradicts it. The order of images and pairs
 has no effect. On castle-P19 the rotations of false pairs are off by 75-180 deg, and their strength
-is 0.01-0.09 there. Those of true pairs are off by less than 10 deg, with one exception in 90.
+is 0.01-0.09 there, before step 1 makes it less. Those of true pairs are off by less than 10 deg,
+with one exception in 90.
 """
 
 import dataclasses
@@ -29,11 +30,12 @@ from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.io.pairs import Pair
 
 STRONG = 0.3
-"""A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09."""
+"""A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09
+before weak ones lost strength (`WEAK`)."""
 WEAK, STEEPNESS = 0.25, 2.5
 """A pair loses half of its strength if its weight is this share of the median of all images' best
 pairs. The odds of what it keeps grow with this power of the weight. In 30 runs of castle-P19 at
-five sizes, 461 of 2982 false pairs were trusted without this, and 3 are with it
+five sizes, 461 of 2982 false pairs were trusted without this, and 2 are with it
 (docs/decisions/view-graph.md)."""
 TOLERANCE_DEG = 15.0
 """Largest error of a trusted pair's rotation against the averaged ones. Two-view rotations of true
@@ -70,7 +72,8 @@ def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
     for pair, w in weight.items():
         for image in pair:
             best[image] = max(best.get(image, 0.0), w)
-    half = WEAK * float(np.median(list(best.values()))) if best else 0.0
+    known = [w for w in best.values() if w > 0]
+    half = WEAK * float(np.median(known)) if known else 0.0
     return {
         (a, b): float(w / np.sqrt(best[a] * best[b]) / (1 + (half / w) ** STEEPNESS))
         if w > 0

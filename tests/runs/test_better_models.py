@@ -1,5 +1,6 @@
 """Which of two mappings of the same photos is better."""
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,8 @@ from jaxsfm.runs.run_stages import MappedRun
 
 def run(*sizes: int, green: bool = True, doubted: bool = False) -> Any:
     """Models of so many photos."""
-    photos = [set(range(size)) for size in sizes]
+    ends = itertools.accumulate(sizes)
+    photos = [set(range(end - size, end)) for size, end in zip(sizes, ends, strict=True)]
     return SimpleNamespace(
         photos=photos,
         green=lambda: green,
@@ -25,7 +27,8 @@ ORDER = [
     [run(24, 10, 7, 6), run(24, 19, 10)],  # four places, of which one fell apart
     [run(10), run(10, 3)],
     [run(24, 19, 10), run(25)],
-    [run(81, 28, green=False, doubted=True), run(80, 18, green=False)],  # only neighbours disagree
+    [run(81, 28, green=False, doubted=True), run(80, 20, green=False)],  # only neighbours disagree
+    [run(80, 12, green=False), run(81, 28, green=False, doubted=True)],  # fewer photos in all
     [run(80, 18, green=False), run(90, green=False, doubted=True)],  # more than a tenth fewer
     [run(80, green=False), run(10)],
 ]

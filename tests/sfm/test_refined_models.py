@@ -1,5 +1,6 @@
 """Laws of what is done to all models of a run. The refinement of one model is made up."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +24,21 @@ DATABASE, OPTIONS = Path("d.db"), MapOptions()
 
 
 def placement(
-    *, registered: bool = False, octave_px: int | None = 1, candidates: int = 160
+    *,
+    name: str = NEW,
+    registered: bool = False,
+    octave_px: int | None = 1,
+    candidates: int = 160,
+    doubt: str = "",
 ) -> Placement:
     return Placement(
-        name=NEW,
+        name=name,
         registered=registered,
         octave_px=octave_px,
         candidates=candidates,
         agreed=8,
         error_px=0.1,
+        doubt=doubt,
     )
 
 
@@ -62,6 +69,7 @@ def refined(rendered, monkeypatch):
         *,
         checked: bool = True,
         gone: bool = False,
+        also: Sequence[Placement] = (),
         options: MapOptions = OPTIONS,
     ):
         offered, asked = [], []
@@ -73,7 +81,7 @@ def refined(rendered, monkeypatch):
                 raise ImageError("2.png: cannot be read")
             added = placed.octave_px and (placed.registered or offered[-1])
             new = noisy_model(rendered, 0.0) if added else model
-            return new, RefinementFigures(passes=[], placed=[placed] if added else [])
+            return new, RefinementFigures(passes=[], placed=[*also, placed] if added else [])
 
         def whole(model, database, given):
             assert (database, given) == (DATABASE, options)
@@ -119,6 +127,15 @@ def test_a_photo_whose_place_is_doubtful_is_taken_out_and_offered_to_the_next_mo
     assert len(points) > 100 and np.isfinite([point.xyz for point in points]).all()
 
 
+def test_a_photo_that_was_taken_out_before_keeps_its_reason(refined):
+    out = placement(name="other.png", doubt="an earlier reason")
+    made, _, (given, _) = refined(placement(), {NEW: "a reason"}, also=[out])
+    assert given.full_size == {NEW: True}
+    for figures in made.figures:
+        assert figures is not None
+        assert [at.doubt for at in figures.placed] == ["an earlier reason", "a reason"]
+
+
 @pytest.mark.parametrize(("octave_px", "candidates"), [(2, 9), (1, 161)])
 def test_a_dark_photo_is_known_to_be_one(refined, octave_px, candidates):
     """Its pose may come from full size, though fewer than 5 % of the points agree there."""
@@ -132,6 +149,7 @@ def test_a_dark_photo_is_known_to_be_one(refined, octave_px, candidates):
         (placement(), False),
         (placement(registered=True), True),  # the check of the mapper's model has seen it
         (placement(octave_px=None), True),
+        (placement(doubt="only 29 points hold it in the model"), True),  # it was taken out
     ],
 )
 def test_other_photos_are_not_asked_about(refined, placed, checked):

@@ -201,7 +201,7 @@ def test_the_best_pair_of_an_image_is_weak_if_all_of_its_pairs_are():
     """An image whose pairs are all false has a best pair, too."""
     _, _, pairs = ring(rng_of(0))
     alone = ("0.jpg", "night.jpg")
-    for inliers, strong in ((20, False), (1500, True)):
+    for inliers, strong in ((250, False), (1500, True)):
         got = strengths(pairs | {alone: PairGeometry(num_inliers=inliers, rotation=np.eye(3))})
         assert (got[alone] > STRONG) == strong
 

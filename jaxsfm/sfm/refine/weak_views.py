@@ -47,8 +47,8 @@ class Placement:
     error_px: float | None
     """Median distance of where they agree from where the pose puts them, working pixels."""
     held: int | None = None
-    """None: it was not taken out of the model for this reason. A number: it was, because it had no
-    more observations than these."""
+    """A number: it was in the model before, and was taken out because it had no more observations
+    than these. None: it was not. An image that the mapper had left out gets a `doubt` instead."""
     doubt: str = ""
     """What speaks against the place, in words; the image was taken out again. Empty if nothing
     does."""
