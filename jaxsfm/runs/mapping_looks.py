@@ -99,7 +99,8 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
 
     With the sky masked, the verdict is amber at best. A second look at all pairs could settle
     nothing, and it takes longer than the first one. So the photos of every model that was checked
-    are settled, and nothing is looked at again if more than neighbours speaks against a model.
+    are settled. If something other than neighbours still speaks against a model, no photo is looked
+    at again.
 
     Args:
       matched: the photos after the first look.

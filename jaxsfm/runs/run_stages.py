@@ -33,7 +33,7 @@ from jaxsfm.sfm.reconstruction import (
     matched_photos,
     refine_mapped,
 )
-from jaxsfm.sfm.round import FEWER
+from jaxsfm.sfm.round import nearly_equal
 from jaxsfm.sfm.second_look import SecondLook, second_look
 
 
@@ -90,8 +90,8 @@ class MappedRun:
 
         Models that something speaks against are worse than others, and so are models that are too
         small to be checked, and none. If something speaks against both, and they have nearly as
-        many photos in the best model and in all, the one is better that only neighbours speak
-        against.
+        many photos in the best model and in all, models that only neighbours speak against are
+        better.
         """
 
         def checked(run: MappedRun) -> bool:
@@ -108,13 +108,9 @@ class MappedRun:
 
         if green(self) != green(other):
             return green(self)
-
-        def alike(ours: int, theirs: int) -> bool:
-            return abs(ours - theirs) <= FEWER * max(ours, theirs)
-
-        largest = self.largest(), other.largest()
-        photos = (len(set().union(*run.photos)) for run in (self, other))
-        if alike(*largest) and alike(*photos) and likely(self) != likely(other):
+        ours, theirs = (len(set().union(*run.photos)) for run in (self, other))
+        alike = nearly_equal(self.largest(), other.largest()) and nearly_equal(ours, theirs)
+        if alike and likely(self) != likely(other):
             return likely(self)
         return sizes(self) > sizes(other)
 

@@ -22,6 +22,11 @@ FEWER = 0.1
 """A model is smaller than another one if it has fewer photos by more than this share of them."""
 
 
+def nearly_equal(ours: int, theirs: int) -> bool:
+    """Whether neither of two numbers of photos is smaller than the other one (`FEWER`)."""
+    return abs(ours - theirs) <= FEWER * max(ours, theirs)
+
+
 class Hypothesis(NamedTuple):
     """Which pairs are right."""
 
@@ -116,7 +121,7 @@ class Round:
             if ours != theirs:
                 return ours > theirs
         ours, theirs = len(self.checked_photos()), len(other.checked_photos())
-        if abs(ours - theirs) > FEWER * max(ours, theirs):
+        if not nearly_equal(ours, theirs):
             return ours > theirs
         return self.contradicted() <= other.contradicted()
 

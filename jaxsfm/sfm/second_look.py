@@ -3,8 +3,8 @@
 Most photos find their places in a model from small descriptions, at a quarter of the network's work
 and a sixteenth of the products of descriptors. A photo is *settled* if it is in the best model, its
 neighbours by name agree with its place, and nothing else speaks against the models. If the models
-show different places (`jaxsfm.runs.places`), photos of each of them are settled. The others get a
-second look:
+show different places (`jaxsfm.runs.places`), or the sky was masked, photos of each of them are
+settled. The others get a second look:
 
 * If most photos are unsettled, or if something speaks against the model, all pairs are matched
   again. The matches of the first look are not used then.

@@ -30,8 +30,8 @@ from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.io.pairs import Pair
 
 STRONG = 0.3
-"""A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09
-before weak ones lost strength (`WEAK`)."""
+"""A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09 before
+weak ones lost strength (`WEAK`)."""
 WEAK, STEEPNESS = 0.25, 2.5
 """A pair loses half of its strength if its weight is this share of the median of all images' best
 pairs. The odds of what it keeps grow with this power of the weight. In 30 runs of castle-P19 at

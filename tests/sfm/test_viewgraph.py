@@ -195,6 +195,9 @@ def test_strength_is_relative_to_the_best_pairs_of_both_images_and_of_all_others
     ):
         assert got[pair] == pytest.approx(weight / best / (1 + (half / weight) ** STEEPNESS))
     assert strengths({}) == {}
+    nothing = PairGeometry(num_inliers=0, rotation=None)
+    more = strengths({**pairs, ("e", "f"): nothing, ("g", "h"): nothing, ("i", "j"): nothing})
+    assert more == {**got, ("e", "f"): 0.0, ("g", "h"): 0.0, ("i", "j"): 0.0}
 
 
 def test_the_best_pair_of_an_image_is_weak_if_all_of_its_pairs_are():
