@@ -150,6 +150,11 @@ def test_a_draft_is_adjusted_less_often_and_takes_no_image_for_a_single_pair():
     assert colmap.structure_less_registration_fallback
     assert not draft.structure_less_registration_fallback
     assert draft.ba_global_frames_ratio > colmap.ba_global_frames_ratio
+    assert draft.ba_global_max_refinements < colmap.ba_global_max_refinements
+    assert draft.ba_global_function_tolerance > colmap.ba_global_function_tolerance
+    usual = pycolmap.IncrementalPipelineOptions()
+    assert colmap.ba_global_max_refinements == usual.ba_global_max_refinements
+    assert colmap.ba_global_function_tolerance == usual.ba_global_function_tolerance
     assert draft.ba_global_points_ratio > colmap.ba_global_points_ratio
 
 
