@@ -15,11 +15,11 @@ DRAFT_GROWTH = 1.4
 a run takes 138 s instead of 240."""
 
 DRAFT_REFINEMENTS, DRAFT_TOLERANCE = 2, 1e-4
-"""An adjustment of the whole draft filters observations and adjusts again at most so often (COLMAP's
-own: 5), and ends when a step lowers the cost by less than this share (COLMAP's own: 0, so that each
-takes 50 steps). All points and all poses are adjusted afterwards. 500 frames of *kitchen* take 147 s
-instead of 391, with the same error of the cameras, and *statue* takes 66 s instead of 219
-(docs/decisions/view-graph.md)."""
+"""An adjustment of the whole draft filters observations and adjusts again at most so often
+(COLMAP's own: 5). It ends when a step lowers the cost by less than this share (COLMAP's own: 0, so
+that each takes 50 steps). All points and all poses are adjusted afterwards. 500 frames of *kitchen*
+take 147 s instead of 391, with the same error of the cameras, and *statue* takes 66 s instead of
+219 (docs/decisions/view-graph.md)."""
 
 LEAST_PARALLAX = 27.0
 """A draft has only points whose directions from two images differ by so many working pixels.
@@ -46,10 +46,10 @@ class MapOptions:
     """Original pixels per working pixel. COLMAP's pixel thresholds are multiplied by it."""
     draft: bool = False
     """The models are refined afterwards, so the first run of the incremental mapper makes a draft.
-    It adjusts the whole model less often and less exactly, and leaves out images that see too few of
-    its points.
-    COLMAP would register these by single pairs (its structure-less fallback), filter them out after
-    the next adjustment, and try again, which takes more than a quarter of the time on *statue*."""
+    It adjusts the whole model less often and less exactly, and leaves out images that see too few
+    of its points. COLMAP would register these by single pairs (its structure-less fallback), filter
+    them out after the next adjustment, and try again, which takes more than a quarter of the time
+    on *statue*."""
 
     def verification(self, *, relative_poses: bool = True) -> VerificationOptions:
         """The settings of the two-view verification before this mapping."""
