@@ -86,7 +86,9 @@ def mapper_matches(inliers: Inliers) -> dict[Pair, np.ndarray]:
     kept = np.zeros(rows.keypoints, bool)
     kept[rows.ends[chosen]] = True
     whole = kept[rows.ends[:, 0]] & kept[rows.ends[:, 1]]
-    return {pair: inliers.matches[pair][whole[rows.pair == k]] for k, pair in enumerate(rows.pairs)}
+    ends = np.cumsum([len(inliers.matches[pair]) for pair in rows.pairs])
+    of_pairs = np.split(whole, ends)[:-1]
+    return {pair: inliers.matches[pair][own] for pair, own in zip(rows.pairs, of_pairs, strict=True)}
 
 
 def _best_first(rows: _Rows) -> np.ndarray:
