@@ -31,6 +31,7 @@ from jaxsfm.runs.run_stages import MappedRun, RunStages
 from jaxsfm.runs.sky_masks import sky_masks, without_sky
 from jaxsfm.runs.turned_photos import Trials, find_turned
 from jaxsfm.sfm.round import FEWER
+from jaxsfm.sfm.second_look import SecondLook
 
 logger = logging.getLogger("jaxsfm")
 
@@ -97,11 +98,6 @@ class RunPhotos:
 def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) -> MappedLooks:
     """Map the photos; where that leaves photos without a sure place, look again.
 
-    With the sky masked, the verdict is amber at best. A second look at all pairs could settle
-    nothing, and it takes longer than the first one. So the photos of every model that was checked
-    are settled. If something other than neighbours still speaks against a model, no photo is looked
-    at again.
-
     Args:
       matched: the photos after the first look.
     """
@@ -129,19 +125,11 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     if matched.described == photos.job.config:
         return found
     looks = UsedLooks(first_px=matched.described.max_size)
-    again = mapped.unsettled(matched.counts, in_any_model=bool(masked_sky))
-    if again and again.whole and masked_sky and mapped.doubted():
-        logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
-        return found._replace(looks=dataclasses.replace(looks, photos=again.photos))
-    if (
-        again
-        and again.whole
-        and not masked_sky
-        and show_different_places(photos.job, photos.images, mapped, matched.counts, seconds)
-    ):
-        again = mapped.unsettled(matched.counts, in_any_model=True)
+    again = _to_match_again(photos, found, seconds)
     if again is None:
         return found._replace(looks=looks)
+    if not again.pairs:
+        return found._replace(looks=dataclasses.replace(looks, photos=again.photos))
     logger.info("%s", again.in_words())
     matched_again = match_again(photos.job, photos.images, matched, again, seconds)
     mapped_again = dataclasses.replace(stages, look=stages.look + "-again").map(matched_again)
@@ -155,6 +143,33 @@ def map_in_looks(photos: RunPhotos, matched: MatchedPairs, stages: RunStages) ->
     if looks.in_vain:
         return found._replace(looks=looks)
     return found._replace(matched=matched_again, mapped=mapped_again, looks=looks)
+
+
+def _to_match_again(
+    photos: RunPhotos, found: MappedLooks, seconds: dict[str, float]
+) -> SecondLook | None:
+    """What to match again at full size; None if all photos are settled.
+
+    Photos of several places make many models, none of which holds most photos. If the models do
+    show different places, the photos of each of them are settled.
+
+    With the sky masked, the verdict is amber at best. A second look at all pairs could settle
+    nothing, and it takes longer than the first one. So the photos of every model that was checked
+    are settled. If something other than neighbours still speaks against a model, there are no pairs
+    to match again.
+    """
+    mapped, counts = found.mapped, found.matched.counts
+    again = mapped.unsettled(counts, in_any_model=bool(found.masked_sky))
+    if again is None or not again.whole:
+        return again
+    if not found.masked_sky:
+        if show_different_places(photos.job, photos.images, mapped, counts, seconds):
+            return mapped.unsettled(counts, in_any_model=True)
+        return again
+    if not mapped.doubted():
+        return again
+    logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
+    return SecondLook(again.photos, [], whole=False)
 
 
 def _changed(

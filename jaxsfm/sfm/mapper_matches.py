@@ -88,7 +88,9 @@ def mapper_matches(inliers: Inliers) -> dict[Pair, np.ndarray]:
     whole = kept[rows.ends[:, 0]] & kept[rows.ends[:, 1]]
     ends = np.cumsum([len(inliers.matches[pair]) for pair in rows.pairs])
     of_pairs = np.split(whole, ends)[:-1]
-    return {pair: inliers.matches[pair][own] for pair, own in zip(rows.pairs, of_pairs, strict=True)}
+    return {
+        pair: inliers.matches[pair][own] for pair, own in zip(rows.pairs, of_pairs, strict=True)
+    }
 
 
 def _best_first(rows: _Rows) -> np.ndarray:
