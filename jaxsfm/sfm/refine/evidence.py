@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
-from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.refine import plane_geometry
 
 if TYPE_CHECKING:
@@ -55,11 +55,11 @@ def matched_points(
       float64 (n, 2), working pixels of the image; float64 (n, 3), world points.
     """
     xy, points = [np.zeros((0, 2))], [np.zeros((0, 3))]
-    for k, view in enumerate(structure.views):
-        pair = make_pair(image.name, view.name)
-        if pair not in matches:
-            continue
-        result = matches[pair]
+    number = {view.name: k for k, view in enumerate(structure.views)}
+    own = [pair for pair in matches if image.name in pair]
+    others = [(number.get(b if a == image.name else a), (a, b)) for a, b in own]
+    for k, pair in sorted((k, pair) for k, pair in others if k is not None):
+        view, result = structure.views[k], matches[pair]
         sides = (result.keypoints0, result.keypoints1)
         mine, theirs = sides if pair[0] == image.name else sides[::-1]
         at, near = plane_geometry.under_pixels(

@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.tracks import Observations, Tracks
+from jaxsfm.colmap.tracks import Observations, Tracks, grouped
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.core.align import Aligned, Patch, Templates, square_patch
@@ -90,11 +90,13 @@ def _templates(
     reference = patches.reference[wanted]
 
     def started() -> Iterator[list[tuple[np.ndarray, Templates]]]:
-        for k in np.unique(reference):
+        for k, rows in enumerate(grouped(reference, len(views))):
+            if not len(rows):
+                continue
             image = images.take(views[k].name)
             yield [
                 (piece[:count], make_templates(image, patches.xy[piece], patch))
-                for piece, count in chunks(wanted[reference == k])
+                for piece, count in chunks(wanted[rows])
             ]
 
     for of_one_view in overlapped(started()):
@@ -121,9 +123,10 @@ def _align(
     def started() -> Iterator[tuple[np.ndarray, list[tuple[int, Aligned]]]]:
         # Templates were made in ascending order of views. Backwards, the images that were taken
         # last are used first (`DeviceImages`).
-        for k in np.unique(found.view)[::-1]:
-            image, rows = images.take(views[k].name), np.flatnonzero(found.view == k)
-            calls = []
+        for k, rows in reversed(list(enumerate(grouped(found.view, len(views))))):
+            if not len(rows):
+                continue
+            image, calls = images.take(views[k].name), []
             for piece, count in chunks(rows):
                 some = templates.take(found.point[piece])
                 start, affine = found.start[piece], found.affine[piece]
