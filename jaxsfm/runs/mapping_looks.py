@@ -26,7 +26,7 @@ from jaxsfm.runs.matching_looks import (
     match_pairs,
     timed,
 )
-from jaxsfm.runs.places import show_different_places
+from jaxsfm.runs.places import places_of_their_own
 from jaxsfm.runs.run_stages import MappedRun, RunStages
 from jaxsfm.runs.sky_masks import sky_masks, without_sky
 from jaxsfm.runs.turned_photos import Trials, find_turned
@@ -150,26 +150,29 @@ def _to_match_again(
 ) -> SecondLook | None:
     """What to match again at full size; None if all photos are settled.
 
-    Photos of several places make many models, none of which holds most photos. If the models do
-    show different places, the photos of each of them are settled.
+    Photos of several places make many models, none of which holds most photos. The photos of the
+    best model are settled, and those of every model that shows a place of its own. What is left of
+    another place is matched again, however much it is, and settled places are left alone.
 
     With the sky masked, the verdict is amber at best. A second look at all pairs could settle
     nothing, and it takes longer than the first one. So the photos of every model that was checked
-    are settled. If something other than neighbours still speaks against a model, there are no pairs
-    to match again.
+    are settled. If something other than neighbours still speaks against a model, no photo is, and
+    there are no pairs to match again.
     """
     mapped, counts = found.mapped, found.matched.counts
-    again = mapped.unsettled(counts, in_any_model=bool(found.masked_sky))
+    if found.masked_sky:
+        again = mapped.unsettled(counts, mapped.checked_models())
+        if again is None or not (again.whole and mapped.doubted()):
+            return again
+        logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
+        return SecondLook(again.photos, [], whole=False)
+    again = mapped.unsettled(counts)
     if again is None or not again.whole:
         return again
-    if not found.masked_sky:
-        if show_different_places(photos.job, photos.images, mapped, counts, seconds):
-            return mapped.unsettled(counts, in_any_model=True)
+    own = places_of_their_own(photos.job, photos.images, mapped, counts, seconds)
+    if not own:
         return again
-    if not mapped.doubted():
-        return again
-    logger.info("no second look at all pairs: with the sky masked, the model stays in doubt")
-    return SecondLook(again.photos, [], whole=False)
+    return mapped.unsettled(counts, [*own, mapped.checked_models()[0]])
 
 
 def _changed(

@@ -1,8 +1,8 @@
-"""Whether the models of a run show different places.
+"""Which models of a run show places of their own.
 
-Photos of several places in one folder give a model for each place. Photos outside the largest model
-need no second look then. But the models may also be parts of one place that the first look has not
-connected. So the strongest pairs between models are matched at full size first.
+Photos of several places in one folder give a model for each place. Its photos need no second look
+then. But two models may also be parts of one place that the first look has not connected. So the
+strongest pairs between models are matched at full size first.
 """
 
 import itertools
@@ -27,31 +27,35 @@ ONE_PLACE = 0.7
 pairs of different places, the 25 with most inliers have at most 0.60 (docs/decisions/effort.md)."""
 
 
-def show_different_places(
+def places_of_their_own(
     job: Job,
     images: Mapping[str, ImageFile],
     mapped: MappedRun,
     counts: Mapping[Pair, PairCounts],
     seconds: dict[str, float],
-) -> bool:
-    """Whether there are several models, and none of the strongest pairs between them is sure.
+) -> list[set[str]]:
+    """The photos of each model that no sure pair ties to another one.
 
     Args:
       job: that of the run, at full size. What it matches is kept for a second look.
       images: the photos of the run, by name.
       counts: of all pairs that were tried in the first look.
       seconds: the time is added to that of the stages.
+
+    Returns:
+      none if something speaks against a model, if there are fewer than two, or if they share
+      photos.
     """
     models = mapped.checked_models()
     if len(models) < 2 or mapped.doubted() or len(set().union(*models)) < sum(map(len, models)):
-        return False
+        return []
     pairs = bridges(models, counts)
     match_pairs(job.here(), images, pairs, seconds)
-    strongest = max((_evidence(job, images, pair) for pair in pairs), default=0.0)
-    different = confidence(strongest) < ONE_PLACE
-    if different:
-        logger.info("the %d largest models show different places", len(models))
-    return different
+    sure = [p for p in pairs if confidence(_evidence(job, images, p)) >= ONE_PLACE]
+    tied = {name for pair in sure for name in pair}
+    own = [model for model in models if not model & tied]
+    logger.info("of %d models, %d show places of their own", len(models), len(own))
+    return own
 
 
 def bridges(models: Sequence[Collection[str]], counts: Mapping[Pair, PairCounts]) -> list[Pair]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -51,30 +51,30 @@ class MappedRun:
         return self.given.matches.keys()
 
     def unsettled(
-        self, counts: Mapping[Pair, PairCounts], *, in_any_model: bool = False
+        self, counts: Mapping[Pair, PairCounts], models: Sequence[Collection[str]] | None = None
     ) -> SecondLook | None:
         """What to look at again; None if nothing.
 
         Args:
           counts: of all pairs that were tried.
-          in_any_model: as in `settled_photos`.
+          models: as in `settled_photos`.
         """
         names = [image.name for image in self.given.images]
-        return second_look(counts, names, self.settled_photos(in_any_model), self.trusted())
+        settled, places = self.settled_photos(models), models is not None
+        return second_look(counts, names, settled, self.trusted(), places=places)
 
-    def settled_photos(self, in_any_model: bool = False) -> set[str]:
+    def settled_photos(self, models: Sequence[Collection[str]] | None = None) -> set[str]:
         """The photos that have a sure place (`jaxsfm.sfm.second_look`).
 
         Args:
-          in_any_model: whether every model that is large enough to be checked counts, because each
-            shows a place of its own, or because nothing would join them; otherwise only the best
-            one counts.
+          models: the photos of each model that counts, because it shows a place of its own, or
+            because nothing would join it to another one. None: the best model alone.
         """
         if not self.photos or self.doubted():
             return set()
-        models = self.checked_models() if in_any_model else self.photos[:1]
         checks = [check for check in self.stage.figures.checks if check is not None]
-        return set().union(*models).difference(*(pair for c in checks for pair in c.apart))
+        settled = set().union(*(self.photos[:1] if models is None else models))
+        return settled.difference(*(pair for c in checks for pair in c.apart))
 
     def checked_models(self) -> list[set[str]]:
         """The photos of each model that is large enough to be checked, the largest first."""

@@ -2,15 +2,16 @@
 
 Most photos find their places in a model from small descriptions, at a quarter of the network's work
 and a sixteenth of the products of descriptors. A photo is *settled* if it is in the best model, its
-neighbours by name agree with its place, and nothing else speaks against the models. If the models
-show different places (`jaxsfm.runs.places`), or the sky was masked, photos of each of them are
-settled. The others get a second look:
+neighbours by name agree with its place, and nothing else speaks against the models. If a model
+shows a place of its own (`jaxsfm.runs.places`), or the sky was masked, its photos are settled, too.
+The others get a second look:
 
-* If most photos are unsettled, or if something speaks against the model, all pairs are matched
-  again. The matches of the first look are not used then.
-* Otherwise each unsettled photo is matched again with the photos that it came closest to. To get a
-  pose, it must see points of the model, and these come from keypoints of the second look, too. So
-  trusted pairs between these photos are also matched again. Their matches of the first look stay.
+* If no photo is settled, or if many are unsettled and only the best model counts, all pairs are
+  matched again. The matches of the first look are not used then.
+* Otherwise each unsettled photo is matched again with the photos that it came closest to, or if
+  many are unsettled, with all that it was matched with. To get a pose, it must see points of the
+  model, and these come from keypoints of the second look, too. So trusted pairs between the closest
+  photos are also matched again. The matches of the first look stay.
 """
 
 from collections.abc import Collection, Mapping
@@ -23,7 +24,7 @@ CLOSEST = 10
 """Pairs of an unsettled photo that are matched again: those with most inliers, then with most
 tentative matches."""
 MOST_UNSETTLED = 1 / 3
-"""If a larger share of the photos is unsettled, all pairs are matched again."""
+"""If a larger share of the photos is unsettled, these are many."""
 
 
 class SecondLook(NamedTuple):
@@ -47,6 +48,8 @@ def second_look(
     photos: Collection[str],
     settled: Collection[str],
     trusted: Collection[Pair],
+    *,
+    places: bool = False,
 ) -> SecondLook | None:
     """What to look at again; None if all photos are settled.
 
@@ -55,16 +58,17 @@ def second_look(
       photos: the names of all photos.
       settled: those of them that are settled.
       trusted: the verified pairs that the models were made from.
+      places: whether the settled photos may be those of several models.
     """
     unsettled = sorted(set(photos).difference(settled))
     if not unsettled:
         return None
-    if len(unsettled) > MOST_UNSETTLED * len(photos):
+    many = len(unsettled) > MOST_UNSETTLED * len(photos)
+    if many and not (places and settled):
         return SecondLook(unsettled, sorted(counts), whole=True)
-    pairs: set[Pair] = set()
-    for name in unsettled:
-        pairs.update(closest_pairs(name, counts)[:CLOSEST])
-    near = {name for pair in pairs for name in pair}
+    own = [closest_pairs(name, counts) for name in unsettled]
+    near = {name for pairs in own for pair in pairs[:CLOSEST] for name in pair}
+    pairs = {pair for pairs in own for pair in (pairs if many else pairs[:CLOSEST])}
     pairs |= {pair for pair in trusted if near >= set(pair)}
     return SecondLook(unsettled, sorted(pairs), whole=False)
 

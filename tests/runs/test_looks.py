@@ -86,7 +86,7 @@ def test_a_second_look_at_everything_gives_what_one_look_gives(
     """The first look leaves nothing behind."""
     out = Path(shutil.copytree(looked[0], tmp_path / "out"))
 
-    def everything(counts, photos, settled, trusted):
+    def everything(counts, photos, settled, trusted, **_):
         return SecondLook(sorted(photos), sorted(counts), whole=True)
 
     monkeypatch.setattr(run_stages, "second_look", everything)
@@ -104,7 +104,7 @@ def test_a_second_look_at_one_pair_adds_its_matches_to_those_of_the_first_one(
     out = Path(shutil.copytree(looked[0], tmp_path / "out"))
     first, second, third = sorted(plain[1]["identity"]["images"])
 
-    def one_pair(counts, photos, settled, trusted):
+    def one_pair(counts, photos, settled, trusted, **_):
         return SecondLook([third], [(second, third)], whole=False)
 
     monkeypatch.setattr(run_stages, "second_look", one_pair)
@@ -135,7 +135,7 @@ def test_the_model_of_the_first_look_stays_if_the_second_one_gives_no_better_one
     out = Path(shutil.copytree(looked[0], tmp_path / "out"))
     third = sorted(looked[1]["identity"]["images"])[2]
 
-    def everything(counts, photos, settled, trusted):
+    def everything(counts, photos, settled, trusted, **_):
         return SecondLook([third], sorted(counts), whole=True)
 
     monkeypatch.setattr(run_stages, "second_look", everything)

@@ -1,4 +1,4 @@
-"""When the models of a run show different places, and which photos are settled then."""
+"""Which models of a run show places of their own, and which photos are settled then."""
 
 import dataclasses
 from pathlib import Path
@@ -13,7 +13,7 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairCounts
 from jaxsfm.runs import mapping_looks, places
 from jaxsfm.runs.mapping_looks import map_in_looks
-from jaxsfm.runs.places import BRIDGES, ONE_PLACE, bridges, show_different_places
+from jaxsfm.runs.places import BRIDGES, ONE_PLACE, bridges, places_of_their_own
 from jaxsfm.sfm.two_photos.matched import HALF_SURE, POWER
 
 
@@ -46,10 +46,10 @@ def run(*models: str, doubted: bool = False) -> Any:
     return SimpleNamespace(checked_models=lambda: own, doubted=lambda: doubted)
 
 
-def different(
+def apart(
     monkeypatch, mapped: Any, tried: dict[Pair, PairCounts], evidence: dict[Pair, float]
-) -> tuple[bool, list[Pair]]:
-    """Whether the models show different places, and which pairs were matched to find out."""
+) -> tuple[list[str], list[Pair]]:
+    """The models with places of their own, and which pairs were matched to find out."""
     matched: list[Pair] = []
     images = {n: ImageFile(name=n, path=Path(n), size=(4, 3), sha256=n) for n in "abcdef"}
 
@@ -60,16 +60,20 @@ def different(
     monkeypatch.setattr(places, "match_pairs", match_pairs)
     monkeypatch.setattr(places, "_evidence", lambda job, images, pair: evidence.get(pair, 0.0))
     job: Any = FakeJob()
-    return show_different_places(job, images, mapped, tried, {}), matched
+    own = places_of_their_own(job, images, mapped, tried, {})
+    return ["".join(sorted(model)) for model in own], matched
 
 
-@pytest.mark.parametrize(("evidence", "places_differ"), [(LIMIT - 1, True), (LIMIT + 1, False)])
-def test_models_show_one_place_if_a_pair_between_them_is_probably_right(
-    monkeypatch, evidence, places_differ
+@pytest.mark.parametrize(
+    ("evidence", "own"), [(LIMIT - 1, ["ab", "cd", "ef"]), (LIMIT + 1, ["ef"])]
+)
+def test_two_models_show_one_place_if_a_pair_between_them_is_probably_right(
+    monkeypatch, evidence, own
 ):
-    tried = counts(ab=900, cd=800, ac=30, bd=40)
-    found = different(monkeypatch, run("ab", "cd"), tried, {("a", "c"): evidence})
-    assert found == (places_differ, [("a", "c"), ("b", "d")])
+    tried = counts(ab=900, cd=800, ac=30, bd=40, be=20, cf=20)
+    pairs = [("a", "c"), ("b", "d"), ("b", "e"), ("c", "f")]
+    found = apart(monkeypatch, run("ab", "cd", "ef"), tried, {("a", "c"): evidence})
+    assert found == (own, pairs)
 
 
 @pytest.mark.parametrize(
@@ -78,11 +82,11 @@ def test_models_show_one_place_if_a_pair_between_them_is_probably_right(
     ids=["no model", "one", "in doubt", "a photo in both"],
 )
 def test_without_two_sure_models_apart_nothing_is_matched_and_nothing_is_said(monkeypatch, mapped):
-    assert different(monkeypatch, mapped, counts(ac=30), {}) == (False, [])
+    assert apart(monkeypatch, mapped, counts(ac=30), {}) == ([], [])
 
 
 def test_models_without_a_tried_pair_between_them_show_different_places(monkeypatch):
-    assert different(monkeypatch, run("ab", "cd"), counts(ab=900, cd=800), {}) == (True, [])
+    assert apart(monkeypatch, run("ab", "cd"), counts(ab=900, cd=800), {}) == (["ab", "cd"], [])
 
 
 def test_bridges_are_pairs_between_two_models():
@@ -102,16 +106,18 @@ def test_two_models_have_a_limited_number_of_bridges_whatever_lies_between_other
 
 
 @pytest.mark.parametrize(
-    ("found", "evidence", "looked_again"),
+    ("found", "evidence", "whole"),
     [
-        (Mapped(True, 20, many_lost=True, places=2), 0.0, False),
+        (Mapped(True, 20, many_lost=True, places=2), 0.0, None),
         (Mapped(True, 20, many_lost=True, places=2), LIMIT + 1, True),
+        (Mapped(True, 20, many_lost=True, places=3), LIMIT + 1, False),  # 0 and 1 are one place
+        (Mapped(True, 20, many_lost=True, in_no_model=True, places=2), 0.0, False),
         (Mapped(True, 20, many_lost=True), 0.0, True),
-        (Mapped(True, 20, few_apart=True, places=2), 0.0, True),  # few photos are unsettled
+        (Mapped(True, 20, few_apart=True, places=2), 0.0, False),  # few photos are unsettled
     ],
 )
-def test_photos_of_different_places_need_no_second_look(
-    monkeypatch, tmp_path, found, evidence, looked_again
+def test_photos_of_places_of_their_own_need_no_second_look(
+    monkeypatch, tmp_path, found, evidence, whole
 ):
     monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
     monkeypatch.setattr(mapping_looks, "match_again", lambda *_: Matched("again"))
@@ -126,4 +132,5 @@ def test_photos_of_different_places_need_no_second_look(
     made = {"": found, "again": Mapped(True, 40)}
     stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
     looks = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]
-    assert looks.mapped is (made["again"] if looked_again else found)
+    assert looks.looks is not None and looks.looks.whole == bool(whole)
+    assert looks.mapped is (found if whole is None else made["again"])

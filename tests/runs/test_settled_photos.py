@@ -15,13 +15,14 @@ SURE = ModelCheck(groups=[["a", "b", "c", "d"]], contradictions=[], other_places
 def settled(
     *checks: ModelCheck | None,
     models: tuple[str, ...] = ("abcd", "ef"),
-    in_any_model: bool = False,
+    of: tuple[str, ...] | None = None,
 ) -> set[str]:
+    """The settled photos, if these models count."""
     stage: Any = SimpleNamespace(figures=SimpleNamespace(checks=[*checks]))
     nothing: Any = None
     run = MappedRun(nothing, stage, nothing)
     run.__dict__["photos"] = [set(names) for names in models]  # it would read the models
-    return run.settled_photos(in_any_model)
+    return run.settled_photos(None if of is None else [set(names) for names in of])
 
 
 def test_photos_of_the_best_model_are_settled_but_those_of_which_neighbours_disagree():
@@ -32,14 +33,14 @@ def test_photos_of_the_best_model_are_settled_but_those_of_which_neighbours_disa
     assert settled(models=()) == set()
 
 
-def test_if_models_show_different_places_photos_of_each_that_can_be_checked_are_settled():
-    assert settled(SURE, SURE, in_any_model=True) == set("abcdef")
-    assert settled(SURE, None, in_any_model=True) == set("abcd")
+def test_if_models_show_places_of_their_own_the_photos_of_each_are_settled():
+    assert settled(SURE, SURE, of=("abcd", "ef")) == set("abcdef")
+    assert settled(SURE, SURE, of=("ef",)) == set("ef")
     apart = dataclasses.replace(SURE, apart=[["e", "x"]])
-    assert settled(SURE, apart, in_any_model=True) == set("abcdf")
+    assert settled(SURE, apart, of=("abcd", "ef")) == set("abcdf")
 
 
-@pytest.mark.parametrize("in_any_model", [False, True])
+@pytest.mark.parametrize("of", [None, ("abcd", "ef")])
 @pytest.mark.parametrize(
     "doubt",
     [
@@ -54,9 +55,9 @@ def test_if_models_show_different_places_photos_of_each_that_can_be_checked_are_
     ],
 )
 @pytest.mark.parametrize("which", [0, 1])
-def test_no_photo_is_settled_if_anything_else_speaks_against_a_model(doubt, which, in_any_model):
+def test_no_photo_is_settled_if_anything_else_speaks_against_a_model(doubt, which, of):
     """Also if it is a smaller model."""
     checks = [SURE, SURE]
     checks[which] = dataclasses.replace(SURE, **doubt)
     assert checks[which].doubted() and checks[which].verdict != "green"
-    assert settled(*checks, in_any_model=in_any_model) == set()
+    assert settled(*checks, of=of) == set()

@@ -40,6 +40,15 @@ def test_everything_is_looked_at_again_where_more_than_a_third_of_the_photos_hav
         assert again is not None and again.whole == whole and again.photos == NAMES[:count]
 
 
+def test_settled_places_are_left_alone_however_many_photos_have_none():
+    settled = NAMES[:6]
+    again = second_look(counted(), NAMES, settled, [], places=True)
+    assert again is not None and again.photos == NAMES[6:] and not again.whole
+    assert again.pairs == [pair for pair in PAIRS if not set(settled) >= set(pair)]
+    everything = second_look(counted(), NAMES, [], [], places=True)
+    assert everything is not None and everything.whole
+
+
 def test_few_unsettled_photos_are_looked_at_again():
     again = second_look(counted(), NAMES, NAMES[:17], [])
     assert again is not None and again.photos == NAMES[17:] and not again.whole
