@@ -36,8 +36,8 @@ class Mapped:
     """Only photos that follow each other speak against it."""
     many_lost: bool = False
     """More than a third of the photos are not in the best model."""
-    in_no_model: bool = False
-    """Whether a photo is in no model."""
+    in_no_model: str = ""
+    """Whether photos are in no model: one, or many, which are more than a third."""
     cut_short: bool = False
     places: int = 1
     """So many models are large enough to be checked."""
@@ -62,12 +62,16 @@ class Mapped:
     def checked_models(self) -> list[set[str]]:
         return [{f"{k}{n}" for n in "ab"} for k in range(self.places)]
 
-    def unsettled(self, counts: dict, models: list | None = None) -> SecondLook | None:
+    def unsettled(
+        self, counts: dict, models: list | None = None, *, places: bool = False
+    ) -> SecondLook | None:
         whole = self.many_lost or not self.few_apart
         if models and not self.doubted():  # otherwise nothing is settled
-            if set().union(*models) == set().union(*self.checked_models()) and not self.in_no_model:
+            lost = set().union(*self.checked_models()).difference(*models)
+            if not lost and not self.in_no_model:
                 return None
-            whole = False
+            photos, whole = sorted(lost) or ["a"], self.in_no_model == "many"
+            return SecondLook(photos, [("a", "b")], whole=whole and not places)
         return SecondLook(["a"], [("a", "b")], whole=whole)
 
     better_than, largest = MappedRun.better_than, MappedRun.largest

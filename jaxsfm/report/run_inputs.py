@@ -116,7 +116,7 @@ class UsedLooks:
     """The photos that had no sure place in the model after it."""
     again: list[tuple[str, str]] = field(default_factory=list)
     """The pairs that were matched again, at the size of the config. Empty if the sky is masked and
-    something still speaks against the model."""
+    something still speaks against the model, or if the photos are in no pair that was tried."""
     whole: bool = False
     """Whether these are all pairs; then nothing of the first look was used."""
     in_vain: bool = False

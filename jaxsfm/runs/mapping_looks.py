@@ -151,8 +151,8 @@ def _to_match_again(
     """What to match again at full size; None if all photos are settled.
 
     Photos of several places make many models, none of which holds most photos. The photos of the
-    best model are settled, and those of every model that shows a place of its own. What is left of
-    another place is matched again, however much it is, and settled places are left alone.
+    best model are settled, and those of every model that shows a place of its own. If these are at
+    least half of all photos, only the others are matched again.
 
     With the sky masked, the verdict is amber at best. A second look at all pairs could settle
     nothing, and it takes longer than the first one. So the photos of every model that was checked
@@ -172,7 +172,7 @@ def _to_match_again(
     own = places_of_their_own(photos.job, photos.images, mapped, counts, seconds)
     if not own:
         return again
-    return mapped.unsettled(counts, [*own, mapped.checked_models()[0]])
+    return mapped.unsettled(counts, [*own, mapped.checked_models()[0]], places=True)
 
 
 def _changed(

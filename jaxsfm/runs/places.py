@@ -54,7 +54,8 @@ def places_of_their_own(
     sure = [p for p in pairs if confidence(_evidence(job, images, p)) >= ONE_PLACE]
     tied = {name for pair in sure for name in pair}
     own = [model for model in models if not model & tied]
-    logger.info("of %d models, %d show places of their own", len(models), len(own))
+    if own:
+        logger.info("%d of %d models show places of their own", len(own), len(models))
     return own
 
 

@@ -51,16 +51,20 @@ class MappedRun:
         return self.given.matches.keys()
 
     def unsettled(
-        self, counts: Mapping[Pair, PairCounts], models: Sequence[Collection[str]] | None = None
+        self,
+        counts: Mapping[Pair, PairCounts],
+        models: Sequence[Collection[str]] | None = None,
+        *,
+        places: bool = False,
     ) -> SecondLook | None:
         """What to look at again; None if nothing.
 
         Args:
           counts: of all pairs that were tried.
           models: as in `settled_photos`.
+          places: whether these models show several places.
         """
-        names = [image.name for image in self.given.images]
-        settled, places = self.settled_photos(models), models is not None
+        names, settled = [image.name for image in self.given.images], self.settled_photos(models)
         return second_look(counts, names, settled, self.trusted(), places=places)
 
     def settled_photos(self, models: Sequence[Collection[str]] | None = None) -> set[str]:

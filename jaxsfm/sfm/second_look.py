@@ -6,12 +6,14 @@ neighbours by name agree with its place, and nothing else speaks against the mod
 shows a place of its own (`jaxsfm.runs.places`), or the sky was masked, its photos are settled, too.
 The others get a second look:
 
-* If no photo is settled, or if many are unsettled and only the best model counts, all pairs are
-  matched again. The matches of the first look are not used then.
-* Otherwise each unsettled photo is matched again with the photos that it came closest to, or if
-  many are unsettled, with all that it was matched with. To get a pose, it must see points of the
-  model, and these come from keypoints of the second look, too. So trusted pairs between the closest
-  photos are also matched again. The matches of the first look stay.
+* If more than a third of the photos are unsettled, or if something speaks against the model, all
+  pairs are matched again. The matches of the first look are not used then.
+* Otherwise each unsettled photo is matched again with the photos that it came closest to. To get a
+  pose, it must see points of the model, and these come from keypoints of the second look, too. So
+  trusted pairs between these photos are also matched again. Their matches of the first look stay.
+* If models show places of their own, and at least half of the photos are settled, the other half
+  may be unsettled. Their pairs are then matched again, and trusted pairs between the photos that
+  one of them came closest to.
 """
 
 from collections.abc import Collection, Mapping
@@ -24,7 +26,9 @@ CLOSEST = 10
 """Pairs of an unsettled photo that are matched again: those with most inliers, then with most
 tentative matches."""
 MOST_UNSETTLED = 1 / 3
-"""If a larger share of the photos is unsettled, these are many."""
+"""If a larger share of the photos is unsettled, all pairs are matched again."""
+MOST_OUTSIDE = 1 / 2
+"""The same if the settled photos are those of several places."""
 
 
 class SecondLook(NamedTuple):
@@ -58,18 +62,23 @@ def second_look(
       photos: the names of all photos.
       settled: those of them that are settled.
       trusted: the verified pairs that the models were made from.
-      places: whether the settled photos may be those of several models.
+      places: whether the settled photos are those of several places.
     """
     unsettled = sorted(set(photos).difference(settled))
     if not unsettled:
         return None
-    many = len(unsettled) > MOST_UNSETTLED * len(photos)
-    if many and not (places and settled):
+    share = len(unsettled) / len(photos)
+    if share > (MOST_OUTSIDE if places else MOST_UNSETTLED):
         return SecondLook(unsettled, sorted(counts), whole=True)
     own = [closest_pairs(name, counts) for name in unsettled]
-    near = {name for pairs in own for pair in pairs[:CLOSEST] for name in pair}
-    pairs = {pair for pairs in own for pair in (pairs if many else pairs[:CLOSEST])}
-    pairs |= {pair for pair in trusted if near >= set(pair)}
+    closest = [{name for pair in pairs[:CLOSEST] for name in pair} for pairs in own]
+    if share > MOST_UNSETTLED:
+        around = closest
+    else:
+        own = [pairs[:CLOSEST] for pairs in own]
+        around = [set().union(*closest)]
+    pairs = {pair for pairs in own for pair in pairs}
+    pairs |= {pair for pair in trusted if any(near >= set(pair) for near in around)}
     return SecondLook(unsettled, sorted(pairs), whole=False)
 
 

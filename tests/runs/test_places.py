@@ -106,18 +106,19 @@ def test_two_models_have_a_limited_number_of_bridges_whatever_lies_between_other
 
 
 @pytest.mark.parametrize(
-    ("found", "evidence", "whole"),
+    ("found", "evidence", "whole", "unsettled"),
     [
-        (Mapped(True, 20, many_lost=True, places=2), 0.0, None),
-        (Mapped(True, 20, many_lost=True, places=2), LIMIT + 1, True),
-        (Mapped(True, 20, many_lost=True, places=3), LIMIT + 1, False),  # 0 and 1 are one place
-        (Mapped(True, 20, many_lost=True, in_no_model=True, places=2), 0.0, False),
-        (Mapped(True, 20, many_lost=True), 0.0, True),
-        (Mapped(True, 20, few_apart=True, places=2), 0.0, False),  # few photos are unsettled
+        (Mapped(True, 20, many_lost=True, places=2), 0.0, None, ""),
+        (Mapped(True, 20, many_lost=True, places=2), LIMIT + 1, True, "a"),
+        # Models 0 and 1 show one place. The best one is settled.
+        (Mapped(True, 20, many_lost=True, places=3), LIMIT + 1, False, "1a 1b"),
+        (Mapped(True, 20, many_lost=True, in_no_model="many", places=2), 0.0, False, "a"),
+        (Mapped(True, 20, many_lost=True), 0.0, True, "a"),
+        (Mapped(True, 20, few_apart=True, places=2), 0.0, False, "a"),  # few are unsettled
     ],
 )
 def test_photos_of_places_of_their_own_need_no_second_look(
-    monkeypatch, tmp_path, found, evidence, whole
+    monkeypatch, tmp_path, found, evidence, whole, unsettled
 ):
     monkeypatch.setattr(mapping_looks, "find_turned", lambda *_: {})
     monkeypatch.setattr(mapping_looks, "match_again", lambda *_: Matched("again"))
@@ -133,4 +134,5 @@ def test_photos_of_places_of_their_own_need_no_second_look(
     stages: Any = Stages(made, [*images.values()], SimpleNamespace(path=tmp_path))
     looks = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]
     assert looks.looks is not None and looks.looks.whole == bool(whole)
+    assert list(looks.looks.photos) == unsettled.split()
     assert looks.mapped is (found if whole is None else made["again"])

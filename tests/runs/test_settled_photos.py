@@ -5,7 +5,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fake_runs import image
 
+from jaxsfm.core.types import Status
+from jaxsfm.io.pairs import PairCounts
 from jaxsfm.runs.run_stages import MappedRun
 from jaxsfm.sfm.check.model_check import Alternative, Contradiction, ModelCheck, OtherPlace
 
@@ -38,6 +41,22 @@ def test_if_models_show_places_of_their_own_the_photos_of_each_are_settled():
     assert settled(SURE, SURE, of=("ef",)) == set("ef")
     apart = dataclasses.replace(SURE, apart=[["e", "x"]])
     assert settled(SURE, apart, of=("abcd", "ef")) == set("abcdf")
+
+
+@pytest.mark.parametrize(("places", "whole"), [(False, True), (True, False)])
+def test_half_of_the_photos_may_be_unsettled_only_if_the_models_show_places(places, whole):
+    """Otherwise a third."""
+    figures = SimpleNamespace(checks=[SURE], verdicts={})
+    stage: Any = SimpleNamespace(figures=figures, verification=SimpleNamespace(verified={}))
+    given: Any = SimpleNamespace(images=[image(name) for name in "abcdef"])
+    nothing: Any = None
+    run = MappedRun(given, stage, nothing)
+    run.__dict__["photos"] = [set("abc")]
+    pairs = [("a", "b"), ("a", "d"), ("d", "e")]
+    counts = dict.fromkeys(pairs, PairCounts(30, 1, 100, 0, Status.VERIFIED))
+    again = run.unsettled(counts, [set("abc")], places=places)
+    assert again is not None and again.photos == ["d", "e", "f"]
+    assert (again.whole, again.pairs) == (whole, pairs if whole else pairs[1:])
 
 
 @pytest.mark.parametrize("of", [None, ("abcd", "ef")])

@@ -121,8 +121,9 @@ def test_rounds_that_ended_early_are_made_if_masks_of_the_sky_do_not_help(
     ("masked", "looked_again"),
     [
         (Mapped(False, 108), False),
-        (Mapped(False, 108, few_apart=True, in_no_model=True), True),
-        (Mapped(True, 60, many_lost=True, in_no_model=True), True),
+        (Mapped(False, 108, few_apart=True, in_no_model="one"), True),
+        (Mapped(True, 60, many_lost=True, in_no_model="one"), True),
+        (Mapped(True, 60, many_lost=True, in_no_model="many"), True),
         (Mapped(False, 50), True),  # the sky is not masked, as this gives no better model
     ],
 )
@@ -141,7 +142,8 @@ def test_with_the_sky_masked_not_all_pairs_are_looked_at_again(
     found = map_in_looks(photos, Matched(""), stages)  # pyright: ignore[reportArgumentType]
     assert found.looks is not None and found.looks.photos == ["a"]
     assert bool(found.looks.again) == looked_again
-    assert found.looks.whole == (looked_again and not found.masked_sky)
+    few = masked.in_no_model != "many" and found.masked_sky
+    assert found.looks.whole == (looked_again and not few)
     assert found.mapped is (made["again"] if looked_again else masked)
     assert ("no pair was matched again" in found.looks.in_words()) != looked_again
 

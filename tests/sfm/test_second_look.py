@@ -40,12 +40,19 @@ def test_everything_is_looked_at_again_where_more_than_a_third_of_the_photos_hav
         assert again is not None and again.whole == whole and again.photos == NAMES[:count]
 
 
-def test_settled_places_are_left_alone_however_many_photos_have_none():
-    settled = NAMES[:6]
-    again = second_look(counted(), NAMES, settled, [], places=True)
-    assert again is not None and again.photos == NAMES[6:] and not again.whole
-    assert again.pairs == [pair for pair in PAIRS if not set(settled) >= set(pair)]
-    everything = second_look(counted(), NAMES, [], [], places=True)
+def test_of_several_places_only_the_pairs_of_unsettled_photos_are_looked_at_again():
+    """If at least half of the photos are settled. A trusted pair between settled photos is looked
+    at again if both came closest to the same unsettled one."""
+    lost, settled = NAMES[10:], NAMES[:10]
+    inliers = {(a, b): 9 for a, b in PAIRS if a in lost}  # they came closest to each other
+    first, second, third = NAMES[:3]
+    inliers |= {(first, lost[0]): 10, (second, lost[0]): 10, (third, lost[1]): 10}
+    trusted = [(first, second), (first, third), (second, third)]
+    own = [pair for pair in PAIRS if not set(settled) >= set(pair)]
+    again = second_look(counted(inliers), NAMES, settled, trusted, places=True)
+    assert again is not None and again.photos == lost and not again.whole
+    assert again.pairs == sorted([(first, second), *own])
+    everything = second_look(counted(inliers), NAMES, settled[1:], trusted, places=True)
     assert everything is not None and everything.whole
 
 
