@@ -16,6 +16,17 @@ def grouped(of: np.ndarray, count: int) -> list[np.ndarray]:
     return np.split(order, np.searchsorted(of[order], np.arange(1, count)))
 
 
+def present_groups(of: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """The groups that have entries, ascending, each with the indices of its entries, ascending.
+
+    Args:
+      of: int (m,), the group of each entry.
+    """
+    order = np.argsort(of, kind="stable")
+    found, starts = np.unique(of[order], return_index=True)
+    return list(zip(found.tolist(), np.split(order, starts)[1:], strict=True))
+
+
 class Observations(NamedTuple):
     """Where views see points: observation k is of point `point[k]`, in view `view[k]`."""
 

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.tracks import grouped
+from jaxsfm.colmap.tracks import present_groups
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -181,10 +181,9 @@ def _tested(
     # A point that only one view shows may be a wrong match: it tests nothing.
     missing = (outcome == CONTRADICTS) | (outcome == UNDECIDED)
     missing &= (shown.sum(1) >= 2)[point]
-    for k, rows in enumerate(grouped(view, len(views))):
-        rows = rows[missing[rows]]
-        if not len(rows):
-            continue
+    tested = np.flatnonzero(missing)
+    for k, own in present_groups(view[tested]):
+        rows = tested[own]
         # A view itself says at which depth it shows surfaces. A target does not, because its own
         # points have been left out; there the surfaces are those of the other views.
         around = np.ones(len(points), bool) if targets is not None else shown[:, k]
@@ -222,9 +221,7 @@ def _compare(views: Sequence[View], seen: _Seen, tests: _Tests) -> Agreement:
     count = len(views)
     found = Agreement(*(np.zeros((count, count), int) for _ in Agreement._fields))
     centres = np.asarray([view.centre for view in views])
-    for b, own in enumerate(grouped(tests.view, count)):
-        if not len(own):
-            continue
+    for b, own in present_groups(tests.view):
         rays = views[b].centre - seen.points[tests.point[own]]
         far = np.linalg.norm(rays, axis=1)
         shown = seen.shown[tests.point[own]]

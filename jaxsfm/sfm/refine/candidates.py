@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.tracks import grouped
+from jaxsfm.colmap.tracks import present_groups
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine.plane_geometry import ReferencePatches, Visibility
@@ -99,22 +99,19 @@ def plane_affines(
     """
     points, normal, reference, xy = patches
     # To compare all rows with each view again took a seventh of a check of 500 frames of kitchen.
-    of_reference, of_view = grouped(reference, len(views)), grouped(view, len(views))
+    of_reference, of_view = present_groups(reference), present_groups(view)
 
     def through(offset: tuple[float, float]) -> np.ndarray:
         target = np.empty_like(points)
-        for k, rows in enumerate(of_reference):
-            if not len(rows):
-                continue
+        for k, rows in of_reference:
             ray = views[k].rays(xy[rows] + offset)
             along = np.einsum("ni,ni->n", ray, normal[rows])
             along = np.where(np.abs(along) < 1e-9, np.nan, along)
             hit = np.einsum("ni,ni->n", points[rows] - views[k].centre, normal[rows]) / along
             target[rows] = views[k].centre + hit[:, None] * ray
         at = np.empty((len(points), 2))
-        for k, rows in enumerate(of_view):
-            if len(rows):
-                at[rows] = views[k].project(target[rows])[0]
+        for k, rows in of_view:
+            at[rows] = views[k].project(target[rows])[0]
         return at
 
     columns = [

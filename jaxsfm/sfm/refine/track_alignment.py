@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.tracks import Observations, Tracks, grouped
+from jaxsfm.colmap.tracks import Observations, Tracks, present_groups
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.core.align import Aligned, Patch, Templates, square_patch
@@ -90,9 +90,7 @@ def _templates(
     reference = patches.reference[wanted]
 
     def started() -> Iterator[list[tuple[np.ndarray, Templates]]]:
-        for k, rows in enumerate(grouped(reference, len(views))):
-            if not len(rows):
-                continue
+        for k, rows in present_groups(reference):
             image = images.take(views[k].name)
             yield [
                 (piece[:count], make_templates(image, patches.xy[piece], patch))
@@ -123,9 +121,7 @@ def _align(
     def started() -> Iterator[tuple[np.ndarray, list[tuple[int, Aligned]]]]:
         # Templates were made in ascending order of views. Backwards, the images that were taken
         # last are used first (`DeviceImages`).
-        for k, rows in reversed(list(enumerate(grouped(found.view, len(views))))):
-            if not len(rows):
-                continue
+        for k, rows in reversed(present_groups(found.view)):
             image, calls = images.take(views[k].name), []
             for piece, count in chunks(rows):
                 some = templates.take(found.point[piece])
