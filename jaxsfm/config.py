@@ -158,8 +158,8 @@ class Config:
     aligned to a fraction of a pixel (`jaxsfm.sfm.refine.pair_alignment`). With 0 they stay as they
     were verified. In models the tracks are aligned instead."""
     closer_looks: int = 0
-    """How often the photos of a single pair are looked at as seen from one place, at most, if the
-    first look leaves the pair weak (`jaxsfm.sfm.two_photos`). With 0 there is one look only."""
+    """How many planes of a single pair are looked at as seen from one place, at most, if the first
+    look leaves the pair weak (`jaxsfm.sfm.two_photos`). With 0 there is one look only."""
     view_graph: bool = False
     """Whether only pairs that the view graph trusts are given to the mapper
     (`jaxsfm.sfm.view_graph`)."""
@@ -263,7 +263,7 @@ _DEFAULT = Config(
     centred=True,
     pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
     aligned_octaves=4,
-    closer_looks=2,
+    closer_looks=4,
     view_graph=True,
     checked=True,
     refinement=Refinement(),

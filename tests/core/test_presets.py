@@ -71,7 +71,7 @@ DEFAULT = PAPER | {
     "octaves": 4,
     "centred": True,
     "aligned_octaves": 4,
-    "closer_looks": 2,
+    "closer_looks": 4,
     "view_graph": True,
     "checked": True,
     "refinement": REFINEMENT,

@@ -68,7 +68,7 @@ def test_photos_in_no_model_are_looked_at_with_photos_that_are_in_one(asked):
     ((_, _, pairs, _),) = asked({"a", "b"})
     assert pairs == [("a", "c"), ("b", "c"), ("a", "d"), ("b", "d")]
     assert job.config == preset("default")  # at full size
-    assert store.identity["config"]["closer_looks"] == 2
+    assert store.identity["config"]["closer_looks"] == 4
     assert job.store.identity["config"] == preset("default").matching()
 
 

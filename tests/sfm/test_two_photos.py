@@ -20,6 +20,7 @@ from jaxsfm.io.orientation import CODES, to_stored
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
+from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
 from jaxsfm.sfm.two_photos import evidence, matched, scale_search
 from jaxsfm.sfm.two_photos import look as look_module
 from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
@@ -320,7 +321,9 @@ def test_if_a_pair_must_be_worth_it_closer_looks_follow_a_sign_at_some_scale(
     monkeypatch.setattr(matched, "look", lambda *_, **__: weak)
     monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [found])
     monkeypatch.setattr(matched, "_look_closer", lambda *given, **__: [*given[2], asked])
-    monkeypatch.setattr(matched, "_aligned", lambda *_: None)
+    monkeypatch.setattr(matched, "looks_at_planes", lambda *_, **__: [])
+    nothing = AlignedMatches(np.empty((0, 2)), np.empty(0, bool))
+    monkeypatch.setattr(matched, "_aligned", lambda *_: nothing)
     given: Any = (None, features, features)
     config = preset("default")
     least = match_photos(*given, config=config, worth_closer=matched.HOPELESS)

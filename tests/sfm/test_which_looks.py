@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from jaxsfm.config import preset
+from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
 from jaxsfm.sfm.two_photos import matched
 from jaxsfm.sfm.two_photos.common_view import Located
+
+
+def aligned(each: Any) -> AlignedMatches:
+    """One match of a look, where its evidence is."""
+    return AlignedMatches(np.asarray([[each.evidence, 0.0]]), np.asarray([True]))
+
 
 FEATURES: Any = SimpleNamespace(image="photo")
 
@@ -82,7 +89,8 @@ def test_a_strong_pair_is_looked_at_once_more_if_its_photos_show_it_differently(
     weights: Any = None
     monkeypatch.setattr(matched, "look", lambda *_, **__: seen_as(matrix))
     monkeypatch.setattr(matched, "closer_look", closer)
-    monkeypatch.setattr(matched, "_aligned", lambda *_: None)
+    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(matched, "as_one", lambda results: results)
     found = matched.match_photos(weights, features, features, config=preset("default"))
     assert asked == [matched.SIZE] * unlike  # at most once, however much it brings
     assert found.evidence == (2000.0 if unlike else 900.0)
@@ -97,7 +105,8 @@ def test_a_view_from_one_place_counts_if_it_confirms_the_first_look(monkeypatch,
     seen = SimpleNamespace(evidence=share * 900.0, result=None)
     monkeypatch.setattr(matched, "look", lambda *_, **__: seen_as(turn(90)))
     monkeypatch.setattr(matched, "closer_look", lambda *_, **__: seen)
-    monkeypatch.setattr(matched, "_aligned", lambda *_: None)
+    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(matched, "as_one", lambda results: results)
     found = matched.match_photos(weights, features, features, config=preset("default"))
     assert found.evidence == (seen.evidence if counts else 900.0)
 
@@ -105,6 +114,40 @@ def test_a_view_from_one_place_counts_if_it_confirms_the_first_look(monkeypatch,
 def test_photos_whose_matches_show_no_view_are_not_looked_at_once_more():
     photos: Any = ("photo", "photo")
     assert matched.seen_alike(seen_as([[-1, 0], [0, 1]]), photos)  # a mirrored photo
+
+
+@pytest.mark.parametrize(
+    ("best", "planes", "expected"),
+    [
+        (14.0, [99.0], (14.0, 2, False)),  # without hope, nothing is looked at
+        (16.0, [], (16.0, 2, False)),
+        (300.0, [150.0, 200.0], (200.0, 4, True)),
+    ],
+)
+def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
+    monkeypatch, best, planes, expected
+):
+    features: Any = SimpleNamespace(image="photo")
+    weights: Any = None
+    asked: list[float] = []
+
+    def looks_at_planes(_, __, whole: Any, **___: object) -> list[Any]:
+        asked.append(whole.evidence)
+        return [fake(each) for each in planes]
+
+    monkeypatch.setattr(matched, "look", lambda *_, **__: fake(1.0))
+    monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [])
+    monkeypatch.setattr(matched, "_look_closer", lambda *given, **__: [*given[2], fake(best)])
+    monkeypatch.setattr(matched, "looks_at_planes", looks_at_planes)
+    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(matched, "as_one", lambda results: len(results))
+    found = matched.match_photos(weights, features, features, config=preset("default"))
+    evidence, looks, confirmed = expected
+    assert (found.evidence, found.looks) == (evidence, looks)
+    assert found.result == (len(planes) if confirmed else 1)
+    shown = planes if confirmed else [best]
+    assert found.aligned.keypoints1[:, 0].tolist() == shown
+    assert asked == [best] * (best > matched.HOPELESS)
 
 
 @pytest.fixture
@@ -121,8 +164,8 @@ def steps(monkeypatch):
         return (taken(name) or [fake(0.0)])[0]
 
     def closer(_, __, located: object, *, size: int, **___: object) -> Any:
-        name = "proposed" if size == matched.SMALL_SIZE else "closer"
-        return (taken(name) or [None])[0]
+        assert size == matched.SMALL_SIZE
+        return (taken("proposed") or [None])[0]
 
     monkeypatch.setattr(matched, "image_features", lambda *_, **__: FEATURES)
     monkeypatch.setattr(matched, "look", lambda *_, **__: one("enlarged"))
@@ -144,13 +187,13 @@ def steps(monkeypatch):
     return looks
 
 
-def test_a_strong_look_is_followed_by_closer_ones_at_once(steps):
-    assert steps(151, closer=[200]) == ["closer", "closer"]
+def test_a_look_that_is_sure_ends_the_search_at_once(steps):
+    assert steps(151) == []
     assert steps(149)[:3] == ["enlarged", "scales", "proposed"]
 
 
 def test_what_makes_a_pair_sure_ends_the_search(steps):
-    assert steps(60, enlarged=[151]) == ["enlarged", "scales", "closer"]
+    assert steps(60, enlarged=[151]) == ["enlarged", "scales"]
     assert "proposed" in steps(60, enlarged=[149])
 
 
@@ -161,19 +204,6 @@ def test_photos_that_are_enlarged_already_are_not_enlarged_again(steps):
 def test_photos_are_turned_only_if_nothing_was_found(steps):
     assert "turned" in steps(20, proposed=[49])
     assert "turned" not in steps(20, proposed=[51])
-
-
-def test_no_closer_look_follows_a_look_without_hope(steps):
-    assert "closer" in steps(16)
-    assert "closer" not in steps(14)
-    assert "closer" in steps(2, turned=[16])
-
-
-def test_closer_looks_end_when_one_is_not_stronger(steps):
-    assert preset("default").closer_looks == 2
-    assert steps(200, closer=[300, 400, 500]) == ["closer", "closer"]
-    assert steps(200, closer=[200, 400]) == ["closer"]
-    assert steps(200) == ["closer"]
 
 
 def test_confidence_is_half_at_the_evidence_of_a_pair_that_may_be_right_or_wrong():

@@ -2,8 +2,8 @@
 
 Most pairs are matched at the first look. A strong pair whose photos show the same differently is
 looked at once more, as seen from one place. A weak pair is looked at again at other scales, then
-enlarged, then as seen from one place, and turned if that did not help. For a weak pair, a closer
-look counts only if it is stronger than the look that led to it.
+enlarged, as seen from one place, and turned if that did not help. Then each plane of the strongest
+look is looked at by itself, and counts if it is confirmed.
 """
 
 import dataclasses
@@ -30,6 +30,7 @@ from jaxsfm.sfm.two_photos.common_view import (
     view_change,
 )
 from jaxsfm.sfm.two_photos.look import Look, look, moved, to_stored
+from jaxsfm.sfm.two_photos.plane_looks import as_one, looks_at_planes
 from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
 
 ENOUGH = 400.0
@@ -43,10 +44,10 @@ does so at the first look."""
 TURNED_BELOW = 50.0
 """Photos are turned only if no look has this much evidence: three more descriptions of a photo."""
 HOPELESS = 15.0
-"""A look with less evidence is not followed by a closer one: nothing is likely to come of it."""
+"""The planes of a look with less evidence are not looked at: nothing is likely to come of it."""
 SURE = 150.0
-"""A look with so much evidence is followed by a closer one at once. Below, the planes of all looks
-are tried one after the other."""
+"""The planes of a look with so much evidence are looked at, at once. Below, the planes of all looks
+are tried one after the other first, to find the true look."""
 MOST_SCALED, MOST_TURNED = 1.5, 15.0
 """A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
 a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
@@ -68,7 +69,7 @@ class TwoPhotos(NamedTuple):
     evidence: float
     """`jaxsfm.sfm.two_photos.evidence`."""
     looks: int
-    """How many looks were taken, the first one included."""
+    """How many looks gave the result or were compared with it, the first one included."""
 
     @property
     def confidence(self) -> float:
@@ -100,22 +101,32 @@ def match_photos(
     Raises:
       ImageError: a photo cannot be decoded again.
     """
+    both = (features0, features1)
     images = (features0.image, features1.image)
     first = look(features0, features1, images, config=config, seed=seed)
-    looks, best = [first], first
+    taken, chosen = [first], [first]
     if config.closer_looks and is_settled(first):
         if not seen_alike(first, images):
             place = first.located(*images)
             nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
             if nearer is not None:
-                looks.append(nearer)
-                best = nearer if nearer.evidence >= CONFIRMED * first.evidence else first
+                taken = [first, nearer]
+                chosen = [nearer if nearer.evidence >= CONFIRMED * first.evidence else first]
     elif config.closer_looks:
-        looks += at_other_scales(features0, features1, config=config, seed=seed)
-        if _best(looks).evidence >= worth_closer:
-            looks = _look_closer(weights, (features0, features1), looks, config=config, seed=seed)
-        best = _best(looks)
-    return TwoPhotos(best.result, _aligned(best, images, config), best.evidence, len(looks))
+        taken += at_other_scales(features0, features1, config=config, seed=seed)
+        if _best(taken).evidence >= worth_closer:
+            taken = _look_closer(weights, both, taken, config=config, seed=seed)
+        best, planes = _best(taken), list[Look]()
+        if best.evidence >= HOPELESS:
+            planes = looks_at_planes(weights, images, best, config=config, seed=seed)
+        taken, chosen = taken + planes, planes or [best]
+    aligned = [_aligned(each, images, config) for each in chosen]
+    return TwoPhotos(
+        as_one([each.result for each in chosen]),
+        AlignedMatches(*map(np.concatenate, zip(*aligned, strict=True))),
+        _best(chosen).evidence,
+        len(taken),
+    )
 
 
 def _look_closer(
@@ -126,7 +137,7 @@ def _look_closer(
     config: Config,
     seed: int,
 ) -> list[Look]:
-    """The looks that were taken, and further ones: enlarged, as seen from one place, and turned."""
+    """The looks that were taken, and further ones: enlarged, at proposals, and turned."""
     looks, images = list(looks), (features[0].image, features[1].image)
     if _best(looks).evidence < SURE and config.enlarge < MOST_ENLARGED:
         config = dataclasses.replace(config, enlarge=MOST_ENLARGED)
@@ -140,16 +151,6 @@ def _look_closer(
         looks += [each for each in tried if each is not None]
     if _best(looks).evidence < TURNED_BELOW:
         looks += turned(weights, features[0], images[1], config=config, seed=seed)
-    for _ in range(config.closer_looks):
-        best = _best(looks)
-        if best.evidence < HOPELESS:
-            break
-        found = closer(best.located(*images), size=SIZE)
-        if found is None:
-            break
-        looks.append(found)
-        if found.evidence <= best.evidence:
-            break
     return looks
 
 

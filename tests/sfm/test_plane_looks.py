@@ -1,0 +1,108 @@
+"""Laws of looks at single planes: which are looked at, and what their matches are as one."""
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from strategies import rng_of
+
+from jaxsfm.config import preset
+from jaxsfm.core.types import Status
+from jaxsfm.io.pairs import PairResult
+from jaxsfm.sfm.two_photos import plane_looks
+from jaxsfm.sfm.two_photos.plane_looks import SIZES, as_one, looks_at_planes
+
+IMAGES: Any = ("photo 0", "photo 1")
+
+
+@pytest.fixture
+def looked_at(monkeypatch):
+    """The planes and sizes that are looked at; each look has the evidence that `seen` says."""
+    log: list[tuple[int, int]] = []  # planes and sizes
+    seen: dict[tuple[int, int], float] = {}
+
+    def closer(_, __, plane: int, *, size: int, **___: object) -> Any:
+        log.append((plane, size))
+        value = seen.get((plane, size))
+        return None if value is None else SimpleNamespace(evidence=value, at=(plane, size))
+
+    monkeypatch.setattr(plane_looks, "closer_look", closer)
+
+    def looks(
+        evidence: list[float], most: int = 4, whole: float = 1.0, **found: float
+    ) -> list[tuple[int, int]]:
+        log.clear()
+        seen.clear()
+        seen.update({tuple(map(int, key[1:].split("_"))): e for key, e in found.items()})  # type: ignore[misc]
+        best: Any = SimpleNamespace(
+            evidence=whole,
+            plane_evidence=np.asarray(evidence),
+            on_planes=lambda planes, *_: int(planes[0]),
+        )
+        config = dataclasses.replace(preset("default"), closer_looks=most)
+        weights: Any = None
+        chosen = looks_at_planes(weights, IMAGES, best, config=config, seed=0)
+        return [each.at for each in chosen]  # type: ignore[attr-defined]
+
+    return SimpleNamespace(looks=looks, log=log)
+
+
+def test_the_strongest_planes_are_looked_at_and_none_that_may_be_chance(looked_at):
+    assert looked_at.looks([20.0, 90.0, 14.9, 40.0]) == []
+    assert looked_at.log == [(1, SIZES[0]), (3, SIZES[0]), (0, SIZES[0])]
+    looked_at.looks([20.0, 90.0, 14.9, 40.0], most=2)
+    assert looked_at.log == [(1, SIZES[0]), (3, SIZES[0])]
+    assert preset("default").closer_looks == preset("robust").closer_looks == 4
+
+
+def test_a_plane_counts_if_it_is_at_least_as_strong_as_seen_from_one_place(looked_at):
+    assert looked_at.looks([30.0, 50.0], p0_600=30.0, p1_600=49.9) == [(0, 600)]
+    assert (1, 1000) not in looked_at.log  # what is not confirmed is not looked at again
+
+
+def test_a_confirmed_plane_is_seen_larger_and_the_stronger_look_counts(looked_at):
+    assert looked_at.looks([30.0], p0_600=80.0, p0_1000=90.0) == [(0, 1000)]
+    assert looked_at.looks([30.0], p0_600=80.0, p0_1000=70.0) == [(0, 600)]
+    assert looked_at.looks([30.0], p0_600=80.0, p0_1000=20.0) == [(0, 600)]
+    assert looked_at.looks([30.0], p0_600=80.0) == [(0, 600)]
+
+
+def test_the_looks_count_if_one_is_as_strong_as_the_look_that_led_to_them(looked_at):
+    both = {"p0_600": 60.0, "p1_600": 80.0}
+    assert looked_at.looks([30.0, 40.0], whole=80.0, **both) == [(1, 600), (0, 600)]
+    assert looked_at.looks([30.0, 40.0], whole=80.1, **both) == []
+
+
+def result(rng: np.random.Generator, planes: int, matches: int) -> PairResult:
+    return PairResult(
+        pair=("a", "b"),
+        cells=np.stack([rng.permutation(900)[:matches] for _ in range(2)], 1).astype(np.int32),
+        keypoints0=rng.uniform(0, 300, (matches, 2)).astype(np.float32),
+        keypoints1=rng.uniform(0, 300, (matches, 2)).astype(np.float32),
+        plane=rng.integers(0, planes, matches).astype(np.int32),
+        homographies=rng.normal(size=(planes, 3, 3)),
+        num_tentative=2 * matches,
+        num_dropped=1,
+        status=Status.VERIFIED,
+    )
+
+
+def test_the_matches_of_several_looks_stay_on_their_planes_and_keep_their_own_cells():
+    rng = rng_of(7)
+    several = [result(rng, planes, 40 + planes) for planes in (2, 1, 3)]
+    whole = as_one(several)
+    np.testing.assert_array_equal(
+        whole.keypoints1, np.concatenate([each.keypoints1 for each in several])
+    )
+    own = np.concatenate([each.homographies[each.plane] for each in several])
+    np.testing.assert_array_equal(whole.homographies[whole.plane], own)
+    assert whole.cells.dtype == np.int32 and whole.num_tentative == 2 * whole.num_inliers
+    for side in whole.cells.T:
+        assert len(np.unique(side)) == whole.num_inliers
+
+
+def test_one_look_is_as_it_was():
+    only = result(rng_of(8), 2, 30)
+    assert as_one([only]) is only
