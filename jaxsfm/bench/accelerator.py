@@ -122,19 +122,21 @@ def measure(
     return rows, programs.found
 
 
-def table_lines(rows: list[Measured]) -> list[str]:
-    """The measured figures as a table in Markdown."""
+def table_head() -> str:
+    """The two lines of Markdown above the measured figures."""
     heads = ("preset", "numbers", "what", "at once", "a second", "products", "memory", "MB each")
     heads = (*heads, "as the CPU")
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for row in rows:
-        same = "" if row.same_as_cpu is None else f"{row.same_as_cpu:.2%}"
-        lines.append(
-            f"| {row.preset} | {row.numbers} | {row.what} | {row.at_once} | "
-            f"{rate_text(row.per_second)} | {row.products:.0%} | {row.memory:.0%} | "
-            f"{row.megabytes:.0f} | {same} |"
-        )
-    return lines
+    return "| " + " | ".join(heads) + " |\n|" + "---|" * len(heads)
+
+
+def table_line(row: Measured) -> str:
+    """The measured figures as a line of the table."""
+    same = "" if row.same_as_cpu is None else f"{row.same_as_cpu:.2%}"
+    return (
+        f"| {row.preset} | {row.numbers} | {row.what} | {row.at_once} | "
+        f"{rate_text(row.per_second)} | {row.products:.0%} | {row.memory:.0%} | "
+        f"{row.megabytes:.0f} | {same} |"
+    )
 
 
 def main(
@@ -160,6 +162,7 @@ def main(
         f"TFLOP/s, memory {rates.bytes / 1e9:.3g} GB/s\n",
         flush=True,
     )
+    print(table_head())
     rows: list[Measured] = []
     found: dict[str, Found] = {}
     for name in presets:
@@ -168,7 +171,9 @@ def main(
             more, counts = measure(weights, name, config, photos, rates)
             found.setdefault(name, counts)
             rows += more
-    print("\n".join([*table_lines(rows), "", *paper_lines(found, size)]))
+            # At once: on an accelerator, the next ones can take minutes to compile.
+            print(*map(table_line, more), sep="\n", flush=True)
+    print("\n".join(["", *paper_lines(found, size)]))
     if json is not None:
         figures = {
             "device": f"{device.device_kind} ({device.platform})",
