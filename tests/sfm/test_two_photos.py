@@ -21,7 +21,7 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
-from jaxsfm.sfm.two_photos import evidence, matched, scale_search
+from jaxsfm.sfm.two_photos import evidence, matched, plane_looks, scale_search
 from jaxsfm.sfm.two_photos import look as look_module
 from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
 from jaxsfm.sfm.two_photos.common_view import (
@@ -275,6 +275,7 @@ def few_sizes(monkeypatch):
     """No enlarging and views of one size: each size of a picture is a program to compile."""
     monkeypatch.setattr(matched, "MOST_ENLARGED", 1.0)
     monkeypatch.setattr(matched, "SIZE", matched.SMALL_SIZE)
+    monkeypatch.setattr(plane_looks, "SIZES", (matched.SMALL_SIZE,))
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def seen_as(matrix: list[list[float]]) -> Any:
     xy0 = np.random.default_rng(0).uniform(0, 400, (50, 2))
     both = Located(xy0, xy0 @ np.asarray(matrix).T)
     counts = SimpleNamespace(num_inliers=500, num_tentative=1000)
-    return SimpleNamespace(evidence=900.0, result=counts, located=lambda *_: both)
+    return SimpleNamespace(evidence=1900.0, result=counts, located=lambda *_: both)
 
 
 def turn(degrees: float) -> list[list[float]]:
@@ -93,7 +93,7 @@ def test_a_strong_pair_is_looked_at_once_more_if_its_photos_show_it_differently(
     monkeypatch.setattr(matched, "as_one", lambda results: results)
     found = matched.match_photos(weights, features, features, config=preset("default"))
     assert asked == [matched.SIZE] * unlike  # at most once, however much it brings
-    assert found.evidence == (2000.0 if unlike else 900.0)
+    assert found.evidence == (2000.0 if unlike else 1900.0)
     once = dataclasses.replace(preset("default"), closer_looks=0)
     assert matched.match_photos(weights, features, features, config=once).looks == 1
 
@@ -102,13 +102,13 @@ def test_a_strong_pair_is_looked_at_once_more_if_its_photos_show_it_differently(
 def test_a_view_from_one_place_counts_if_it_confirms_the_first_look(monkeypatch, share, counts):
     features: Any = SimpleNamespace(image="photo")
     weights: Any = None
-    seen = SimpleNamespace(evidence=share * 900.0, result=None)
+    seen = SimpleNamespace(evidence=share * 1900.0, result=None)
     monkeypatch.setattr(matched, "look", lambda *_, **__: seen_as(turn(90)))
     monkeypatch.setattr(matched, "closer_look", lambda *_, **__: seen)
     monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
     monkeypatch.setattr(matched, "as_one", lambda results: results)
     found = matched.match_photos(weights, features, features, config=preset("default"))
-    assert found.evidence == (seen.evidence if counts else 900.0)
+    assert found.evidence == (seen.evidence if counts else 1900.0)
 
 
 def test_photos_whose_matches_show_no_view_are_not_looked_at_once_more():
@@ -117,15 +117,18 @@ def test_photos_whose_matches_show_no_view_are_not_looked_at_once_more():
 
 
 @pytest.mark.parametrize(
-    ("best", "planes", "expected"),
+    ("first", "best", "planes", "expected"),
     [
-        (14.0, [99.0], (14.0, 2, False)),  # without hope, nothing is looked at
-        (16.0, [], (16.0, 2, False)),
-        (300.0, [150.0, 200.0], (200.0, 4, True)),
+        (1.0, 14.0, [99.0], (14.0, 2, False)),  # without hope, nothing is looked at
+        (1.0, 16.0, [], (16.0, 2, False)),
+        (1.0, 300.0, [150.0, 200.0], (200.0, 4, True)),
+        (1.0, 1300.0, [1400.0], (1400.0, 3, True)),
+        (999.0, 999.0, [1400.0], (1400.0, 2, True)),  # settled, and not searched any further
+        (1000.0, 1000.0, [1400.0], (1000.0, 1, False)),  # matched well as it is
     ],
 )
 def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
-    monkeypatch, best, planes, expected
+    monkeypatch, first, best, planes, expected
 ):
     features: Any = SimpleNamespace(image="photo")
     weights: Any = None
@@ -135,19 +138,20 @@ def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
         asked.append(whole.evidence)
         return [fake(each) for each in planes]
 
-    monkeypatch.setattr(matched, "look", lambda *_, **__: fake(1.0))
+    monkeypatch.setattr(matched, "look", lambda *_, **__: fake(first))
     monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [])
     monkeypatch.setattr(matched, "_look_closer", lambda *given, **__: [*given[2], fake(best)])
     monkeypatch.setattr(matched, "looks_at_planes", looks_at_planes)
     monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
     monkeypatch.setattr(matched, "as_one", lambda results: len(results))
+    monkeypatch.setattr(matched, "seen_alike", lambda *_: True)
     found = matched.match_photos(weights, features, features, config=preset("default"))
     evidence, looks, confirmed = expected
     assert (found.evidence, found.looks) == (evidence, looks)
     assert found.result == (len(planes) if confirmed else 1)
     shown = planes if confirmed else [best]
     assert found.aligned.keypoints1[:, 0].tolist() == shown
-    assert asked == [best] * (best > matched.HOPELESS)
+    assert asked == [best] * (best not in (14.0, 1000.0))
 
 
 @pytest.fixture

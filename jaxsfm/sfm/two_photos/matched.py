@@ -2,12 +2,13 @@
 
 Most pairs are matched at the first look. A strong pair whose photos show the same differently is
 looked at once more, as seen from one place. A weak pair is looked at again at other scales, then
-enlarged, as seen from one place, and turned if that did not help. Then each plane of the strongest
-look is looked at by itself, and counts if it is confirmed.
+enlarged, as seen from one place, and turned if that did not help. Of all but strong pairs, each
+plane of the strongest look is then looked at by itself, and counts if it is confirmed.
 """
 
 import dataclasses
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -34,10 +35,14 @@ from jaxsfm.sfm.two_photos.plane_looks import as_one, looks_at_planes
 from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
 
 ENOUGH = 400.0
-"""A first look with so much evidence is not followed by another (docs/decisions/hard-pairs.md)."""
+"""After a first look with so much evidence, no other one is searched for
+(docs/decisions/hard-pairs.md)."""
 ENOUGH_SHARE, AT_LEAST = 0.2, 60.0
-"""Nor is one in which so large a share of the matches agrees, and which has at least so much
+"""Nor after one in which so large a share of the matches agrees, and which has at least so much
 evidence: small photos have too few cells for more. First looks of hard pairs have 2 to 13 %."""
+PLAIN = 1000.0
+"""The planes of a pair are not looked at if its first look has so much evidence: it is matched well
+as it is."""
 MOST_ENLARGED = 2.0
 """Small photos are described once more, enlarged so much, if no scale is sure. The preset `robust`
 does so at the first look."""
@@ -49,7 +54,7 @@ SURE = 150.0
 """The planes of a look with so much evidence are looked at, at once. Below, the planes of all looks
 are tried one after the other first, to find the true look."""
 MOST_SCALED, MOST_TURNED = 1.5, 15.0
-"""A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
+"""A plain pair is looked at once more, as seen from one place, if one photo shows things larger by
 a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
 CONFIRMED = 0.5
 """It counts if it has so large a share of the evidence of the first one: matches of photos that are
@@ -104,22 +109,22 @@ def match_photos(
     both = (features0, features1)
     images = (features0.image, features1.image)
     first = look(features0, features1, images, config=config, seed=seed)
-    taken, chosen = [first], [first]
-    if config.closer_looks and is_settled(first):
-        if not seen_alike(first, images):
-            place = first.located(*images)
-            nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
-            if nearer is not None:
-                taken = [first, nearer]
-                chosen = [nearer if nearer.evidence >= CONFIRMED * first.evidence else first]
-    elif config.closer_looks:
+    taken, chosen, settled = [first], [first], is_settled(first)
+    if config.closer_looks and not settled:
         taken += at_other_scales(features0, features1, config=config, seed=seed)
         if _best(taken).evidence >= worth_closer:
             taken = _look_closer(weights, both, taken, config=config, seed=seed)
-        best, planes = _best(taken), list[Look]()
-        if best.evidence >= HOPELESS:
-            planes = looks_at_planes(weights, images, best, config=config, seed=seed)
-        taken, chosen = taken + planes, planes or [best]
+        chosen = [_best(taken)]
+    (best,) = chosen
+    if config.closer_looks and HOPELESS <= best.evidence < (PLAIN if settled else math.inf):
+        planes = looks_at_planes(weights, images, best, config=config, seed=seed)
+        taken, chosen = taken + planes, planes or chosen
+    elif config.closer_looks and settled and not seen_alike(first, images):
+        place = first.located(*images)
+        nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
+        if nearer is not None:
+            taken.append(nearer)
+            chosen = [nearer if nearer.evidence >= CONFIRMED * first.evidence else first]
     aligned = [_aligned(each, images, config) for each in chosen]
     return TwoPhotos(
         as_one([each.result for each in chosen]),
