@@ -154,13 +154,14 @@ class MapperRuns:
     def with_all_points(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
         """A model with the points of all matches of the pairs that are in the database now.
 
-        It is kept, because a model that is checked is often asked for again.
+        The points are adjusted as those of a draft, because all are refined later. They are kept,
+        because a model that is checked is often asked for again.
         """
         if not self._share:
             return model
         for one, whole in self._whole:
             if one is model and one.num_reg_images() == whole.num_reg_images():
                 return whole
-        whole = with_all_points(model, self._database, self._options)
+        whole = with_all_points(model, self._database, self._mapping)
         self._whole.append((model, whole))
         return whole
