@@ -10,6 +10,7 @@ import functools
 import logging
 from collections.abc import Collection, Iterable, Mapping
 
+import numpy as np
 from tqdm import tqdm
 
 from jaxsfm.core.types import Status
@@ -25,11 +26,12 @@ from jaxsfm.runs.mapping_looks import MappedLooks
 from jaxsfm.runs.matching_looks import job_of_look, timed
 from jaxsfm.sfm.second_look import closest_pairs
 from jaxsfm.sfm.two_photos.matched import HOPELESS, match_photos
+from jaxsfm.sfm.two_photos.plane_looks import one_match_each
 
 logger = logging.getLogger("jaxsfm")
 
 CLOSER = 3
-"""Pairs of a photo that are looked at closer. Each takes 3 to 60 s on two cores."""
+"""Pairs of a photo that are looked at closer. Each takes up to a minute on two cores."""
 WORTH_A_TRY = 60.0
 """Matches of a pair count if they have at least this evidence. They are more often wrong than right
 then: alignment has to confirm the place that they give."""
@@ -45,7 +47,7 @@ def look_closer(
     Pairs that show no sign of a common part at any scale get no closer look.
 
     Args:
-      job: its config says how many closer looks follow; its stores may have features.
+      job: its config says how many planes are looked at; its stores may have features.
       images: the photos of the pairs, by name.
       store: where the results are kept, so that an interrupted run need not look again.
 
@@ -76,11 +78,14 @@ def look_closer(
 
 
 def _matched(job: Job, features: tuple[ImageFeatures, ImageFeatures]) -> PairResult:
-    """The matches of a pair; none if they are hardly ever right."""
+    """The matches of a pair, one for each fine cell; none if they are hardly ever right."""
     found = match_photos(
         job.weights, *features, config=job.config, seed=job.seed, worth_closer=HOPELESS
     )
-    return found.result if found.evidence >= WORTH_A_TRY else without_matches(found.result)
+    if found.evidence < WORTH_A_TRY:
+        return without_matches(found.result)
+    first, second = (job.config.fine_stride * float(np.mean(each.scale)) for each in features)
+    return one_match_each(found.result, (first, second))
 
 
 def without_matches(result: PairResult) -> PairResult:

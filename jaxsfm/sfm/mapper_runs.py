@@ -151,14 +151,22 @@ class MapperRuns:
         """
         return model if self._share else with_all_points(model, self._database, self._options)
 
-    def with_all_points(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+    def with_all_points(
+        self, model: "pycolmap.Reconstruction", *, final: bool = False
+    ) -> "pycolmap.Reconstruction":
         """A model with the points of all matches of the pairs that are in the database now.
 
-        The points are adjusted as those of a draft, because all are refined later. They are kept,
-        because a model that is checked is often asked for again.
+        The points are adjusted as those of a draft: the check asks only where they are missing, and
+        a model is refined later. They are kept, because a model that is checked is often asked for
+        again.
+
+        Args:
+          final: the model is not refined later, so the points are adjusted to the end.
         """
         if not self._share:
             return model
+        if final:
+            return with_all_points(model, self._database, self._options)
         for one, whole in self._whole:
             if one is model and one.num_reg_images() == whole.num_reg_images():
                 return whole

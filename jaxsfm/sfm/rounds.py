@@ -182,10 +182,10 @@ class Rounds:
             self._last = made
 
     def with_all_points(self, made: Round) -> "list[pycolmap.Reconstruction]":
-        """The models of a round with the points of all matches of its pairs."""
+        """The models of a round with the points of all matches of its pairs, not to be refined."""
         before = self._last
         self.go_back_to(made)
-        whole = [self._mapper.with_all_points(model) for model in made.models]
+        whole = [self._mapper.with_all_points(model, final=True) for model in made.models]
         self.go_back_to(before)
         return whole
 

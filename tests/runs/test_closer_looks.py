@@ -41,11 +41,11 @@ def looked(monkeypatch):
     """The pairs that were matched; the evidence of a pair is looked up."""
     done: list[tuple[str, str]] = []
 
-    def of(evidence: dict[tuple[str, str], float], damaged: str = "") -> list:
+    def of(evidence: dict[tuple[str, str], float], damaged: str = "", scale: float = 0.1) -> list:
         def features(_: object, image: ImageFile, *, config: object) -> SimpleNamespace:
             if image.name == damaged:
                 raise ImageError(f"{image.name}: damaged")
-            return SimpleNamespace(image=image)
+            return SimpleNamespace(image=image, scale=(scale, scale))
 
         def match(_: object, a: Any, b: Any, *, config: object, seed: int, worth_closer: float):
             assert worth_closer == HOPELESS and seed == 7
@@ -67,6 +67,16 @@ def test_only_matches_with_enough_evidence_count_and_none_of_photos_that_cannot_
     found = look_closer(job, images, [*evidence, ("a", "d")])
     assert [*found] == [("a", "b")] and found["a", "b"].num_inliers == 5
     assert done == [*evidence]
+
+
+def test_points_that_several_looks_saw_count_once(looked):
+    """One match for each fine cell, which is 8 working pixels wide; the five lie 2 pixels apart."""
+    job, images = job_and_images()
+    assert job.config.fine_stride == 8
+    looked({("a", "b"): 61.0}, scale=0.5)
+    assert look_closer(job, images, [("a", "b")])["a", "b"].num_inliers == 3
+    looked({("a", "b"): 61.0}, scale=1.0)
+    assert look_closer(job, images, [("a", "b")])["a", "b"].num_inliers == 2
 
 
 def test_what_was_looked_at_closer_is_kept_and_what_was_unlikely_too(looked, tmp_path):

@@ -91,6 +91,9 @@ def test_all_points_of_a_model_are_triangulated_once_until_something_changes(run
     assert mapper.with_all_points(model) is first
     # The points of all matches are refined later, so they are adjusted as those of a draft.
     assert whole == [(model, database, dataclasses.replace(OPTIONS, draft=True))]
+    # Those of a model that is published without refinement are adjusted to the end.
+    mapper.with_all_points(model, final=True)
+    assert whole.pop() == (model, database, OPTIONS)
     model.images = 2  # a photo was taken out of it
     second = mapper.with_all_points(model)
     assert second is not first and second.num_reg_images() == 2

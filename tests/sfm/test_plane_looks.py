@@ -1,6 +1,7 @@
 """Laws of looks at single planes: which are looked at, and what their matches are as one."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,9 +11,12 @@ from strategies import rng_of
 
 from jaxsfm.config import preset
 from jaxsfm.core.types import Status
+from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.sfm.two_photos import plane_looks
-from jaxsfm.sfm.two_photos.plane_looks import SIZES, as_one, looks_at_planes
+from jaxsfm.sfm.two_photos.evidence import BY_CHANCE
+from jaxsfm.sfm.two_photos.look import Look
+from jaxsfm.sfm.two_photos.plane_looks import SIZES, as_one, looks_at_planes, one_match_each
 
 IMAGES: Any = ("photo 0", "photo 1")
 
@@ -44,7 +48,8 @@ def looked_at(monkeypatch):
         config = dataclasses.replace(preset("default"), closer_looks=most)
         weights: Any = None
         chosen = looks_at_planes(weights, IMAGES, best, config=config, seed=0)
-        return [each.at for each in chosen]  # type: ignore[attr-defined]
+        assert chosen.taken == len([at for at in log if at in seen])
+        return [each.at for each in chosen.confirmed]  # type: ignore[attr-defined]
 
     return SimpleNamespace(looks=looks, log=log)
 
@@ -106,3 +111,28 @@ def test_the_matches_of_several_looks_stay_on_their_planes_and_keep_their_own_ce
 def test_one_look_is_as_it_was():
     only = result(rng_of(8), 2, 30)
     assert as_one([only]) is only
+
+
+def test_a_square_of_either_photo_keeps_its_first_match():
+    xy0 = np.float32([[1, 1], [3.9, 3.9], [4.1, 1], [20, 20], [30, 30]])
+    xy1 = np.float32([[1, 1], [90, 90], [50, 50], [7.9, 1], [8.1, 1]])
+    found = dataclasses.replace(result(rng_of(9), 2, 5), keypoints0=xy0, keypoints1=xy1)
+    kept = one_match_each(found, (4.0, 8.0))
+    np.testing.assert_array_equal(kept.keypoints0, xy0[[0, 2, 4]])
+    np.testing.assert_array_equal(kept.keypoints1, xy1[[0, 2, 4]])
+    np.testing.assert_array_equal(kept.cells, found.cells[[0, 2, 4]])
+    np.testing.assert_array_equal(kept.plane, found.plane[[0, 2, 4]])
+    assert len(kept.homographies) == 2 and kept.num_tentative == 10
+
+
+def test_a_plane_must_grow_by_what_is_due_to_chance(monkeypatch):
+    """The evidence of a look is what its planes have beyond chance."""
+    one = result(rng_of(10), 1, 30)
+    best = Look(one, np.asarray([100.0]))
+    weights: Any = None
+    photo = ImageFile(name="a", path=Path("a"), size=(400, 300), sha256="0")
+    for evidence, counts in ((100.0 + BY_CHANCE, 1), (99.9 + BY_CHANCE, 0)):
+        seen = Look(one, np.asarray([evidence]))
+        monkeypatch.setattr(plane_looks, "closer_look", lambda *_, seen=seen, **__: seen)
+        found = looks_at_planes(weights, (photo, photo), best, config=preset("default"), seed=0)
+        assert len(found.confirmed) == counts and found.taken == 1 + counts

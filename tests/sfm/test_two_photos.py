@@ -311,22 +311,36 @@ def test_a_strong_pair_is_looked_at_once(weights, pictures):
     assert found.looks == 1 and found.confidence > 0.99
 
 
+def fake_look(evidence: float) -> SimpleNamespace:
+    counts = SimpleNamespace(num_inliers=0, num_tentative=100)
+    return SimpleNamespace(evidence=evidence, result=counts)
+
+
 @pytest.mark.parametrize(("evidence", "closer"), [(14.9, False), (15.1, True)])
 def test_if_a_pair_must_be_worth_it_closer_looks_follow_a_sign_at_some_scale(
     monkeypatch, evidence, closer
 ):
     """`jaxsfm match` looks closer at any weak pair; runs do not."""
     features = SimpleNamespace(image=photo((8, 8)))
-    weak, found, asked = (SimpleNamespace(evidence=e, result=None) for e in (2.0, evidence, 99.0))
+    weak, found, asked = (fake_look(e) for e in (2.0, evidence, 99.0))
     monkeypatch.setattr(matched, "is_settled", lambda first: False)
     monkeypatch.setattr(matched, "look", lambda *_, **__: weak)
     monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [found])
     monkeypatch.setattr(matched, "_look_closer", lambda *given, **__: [*given[2], asked])
-    monkeypatch.setattr(matched, "looks_at_planes", lambda *_, **__: [])
+    planes: list[float] = []
+
+    def looks_at_planes(_, __, best: Any, **___: object) -> plane_looks.PlaneLooks:
+        planes.append(best.evidence)
+        return plane_looks.PlaneLooks([], 0)
+
+    monkeypatch.setattr(matched, "looks_at_planes", looks_at_planes)
     nothing = AlignedMatches(np.empty((0, 2)), np.empty(0, bool))
     monkeypatch.setattr(matched, "_aligned", lambda *_: nothing)
+    monkeypatch.setattr(matched, "seen_alike", lambda *_: True)
     given: Any = (None, features, features)
     config = preset("default")
     least = match_photos(*given, config=config, worth_closer=matched.HOPELESS)
-    assert (least.looks == 3) == closer
+    assert (least.looks == 3) == closer == bool(planes)
+    planes.clear()
+    assert match_photos(*given, config=config, worth_closer=15.2).looks == 2 and not planes
     assert match_photos(*given, config=config).looks == 3

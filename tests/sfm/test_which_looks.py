@@ -12,6 +12,7 @@ from jaxsfm.config import preset
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
 from jaxsfm.sfm.two_photos import matched
 from jaxsfm.sfm.two_photos.common_view import Located
+from jaxsfm.sfm.two_photos.plane_looks import PlaneLooks
 
 
 def aligned(each: Any) -> AlignedMatches:
@@ -119,11 +120,11 @@ def test_photos_whose_matches_show_no_view_are_not_looked_at_once_more():
 @pytest.mark.parametrize(
     ("first", "best", "planes", "expected"),
     [
-        (1.0, 14.0, [99.0], (14.0, 2, False)),  # without hope, nothing is looked at
-        (1.0, 16.0, [], (16.0, 2, False)),
-        (1.0, 300.0, [150.0, 200.0], (200.0, 4, True)),
-        (1.0, 1300.0, [1400.0], (1400.0, 3, True)),
-        (999.0, 999.0, [1400.0], (1400.0, 2, True)),  # settled, and not searched any further
+        (1.0, 14.9, [99.0], (14.9, 2, False)),  # without hope, nothing is looked at
+        (1.0, 15.0, [], (15.0, 7, False)),
+        (1.0, 300.0, [200.0, 150.0], (200.0, 7, True)),
+        (1.0, 1300.0, [1400.0], (1400.0, 7, True)),
+        (999.0, 999.0, [1400.0], (1400.0, 6, True)),  # settled, and not searched any further
         (1000.0, 1000.0, [1400.0], (1000.0, 1, False)),  # matched well as it is
     ],
 )
@@ -136,7 +137,7 @@ def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
 
     def looks_at_planes(_, __, whole: Any, **___: object) -> list[Any]:
         asked.append(whole.evidence)
-        return [fake(each) for each in planes]
+        return PlaneLooks([fake(each) for each in planes], 5)
 
     monkeypatch.setattr(matched, "look", lambda *_, **__: fake(first))
     monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [])
@@ -151,7 +152,35 @@ def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
     assert found.result == (len(planes) if confirmed else 1)
     shown = planes if confirmed else [best]
     assert found.aligned.keypoints1[:, 0].tolist() == shown
-    assert asked == [best] * (best not in (14.0, 1000.0))
+    assert asked == [best] * (best not in (14.9, 1000.0))
+
+
+@pytest.mark.parametrize(
+    ("evidence", "share", "strong"),
+    [(1000.0, 0.01, True), (999.0, 0.49, False), (61.0, 0.51, True), (59.0, 0.9, False)],
+)
+def test_a_pair_is_strong_by_its_evidence_or_by_most_of_its_matches(evidence, share, strong):
+    """A small photo has too few cells for much evidence."""
+    first = fake(evidence, inliers=round(1000 * share), tentative=1000)
+    assert matched.is_strong(first) == strong
+
+
+@pytest.mark.parametrize("planes", [[], [1400.0]])
+def test_photos_seen_differently_are_seen_from_one_place_if_no_plane_is_confirmed(
+    monkeypatch, planes
+):
+    features: Any = SimpleNamespace(image="photo")
+    weights: Any = None
+    first = seen_as(turn(90))
+    first.evidence, first.result = 600.0, SimpleNamespace(num_inliers=100, num_tentative=1000)
+    found = PlaneLooks([fake(each) for each in planes], 3)
+    monkeypatch.setattr(matched, "look", lambda *_, **__: first)
+    monkeypatch.setattr(matched, "looks_at_planes", lambda *_, **__: found)
+    monkeypatch.setattr(matched, "closer_look", lambda *_, **__: fake(301.0))
+    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(matched, "as_one", lambda results: results)
+    pair = matched.match_photos(weights, features, features, config=preset("default"))
+    assert (pair.evidence, pair.looks) == ((1400.0, 4) if planes else (301.0, 5))
 
 
 @pytest.fixture

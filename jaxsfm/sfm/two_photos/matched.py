@@ -2,13 +2,12 @@
 
 Most pairs are matched at the first look. A strong pair whose photos show the same differently is
 looked at once more, as seen from one place. A weak pair is looked at again at other scales, then
-enlarged, as seen from one place, and turned if that did not help. Of all but strong pairs, each
-plane of the strongest look is then looked at by itself, and counts if it is confirmed.
+enlarged, as seen from one place, and turned if that did not help. Unless a pair is strong or
+hopeless, the planes of its strongest look are then looked at one by one.
 """
 
 import dataclasses
 import functools
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -40,9 +39,9 @@ ENOUGH = 400.0
 ENOUGH_SHARE, AT_LEAST = 0.2, 60.0
 """Nor after one in which so large a share of the matches agrees, and which has at least so much
 evidence: small photos have too few cells for more. First looks of hard pairs have 2 to 13 %."""
-PLAIN = 1000.0
-"""The planes of a pair are not looked at if its first look has so much evidence: it is matched well
-as it is."""
+STRONG, STRONG_SHARE = 1000.0, 0.5
+"""The planes of a pair are not looked at if its first look has so much evidence, or if so large a
+share of its matches agrees: it is matched well as it is."""
 MOST_ENLARGED = 2.0
 """Small photos are described once more, enlarged so much, if no scale is sure. The preset `robust`
 does so at the first look."""
@@ -51,10 +50,10 @@ TURNED_BELOW = 50.0
 HOPELESS = 15.0
 """The planes of a look with less evidence are not looked at: nothing is likely to come of it."""
 SURE = 150.0
-"""The planes of a look with so much evidence are looked at, at once. Below, the planes of all looks
-are tried one after the other first, to find the true look."""
+"""If a look has so much evidence, no other one is searched for. Otherwise the planes of all looks
+are tried one after the other."""
 MOST_SCALED, MOST_TURNED = 1.5, 15.0
-"""A plain pair is looked at once more, as seen from one place, if one photo shows things larger by
+"""A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
 a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
 CONFIRMED = 0.5
 """It counts if it has so large a share of the evidence of the first one: matches of photos that are
@@ -74,7 +73,7 @@ class TwoPhotos(NamedTuple):
     evidence: float
     """`jaxsfm.sfm.two_photos.evidence`."""
     looks: int
-    """How many looks gave the result or were compared with it, the first one included."""
+    """How many looks were taken, the first one included."""
 
     @property
     def confidence(self) -> float:
@@ -115,22 +114,22 @@ def match_photos(
         if _best(taken).evidence >= worth_closer:
             taken = _look_closer(weights, both, taken, config=config, seed=seed)
         chosen = [_best(taken)]
-    (best,) = chosen
-    if config.closer_looks and HOPELESS <= best.evidence < (PLAIN if settled else math.inf):
-        planes = looks_at_planes(weights, images, best, config=config, seed=seed)
-        taken, chosen = taken + planes, planes or chosen
-    elif config.closer_looks and settled and not seen_alike(first, images):
+    looks, worth = len(taken), max(HOPELESS, 0.0 if settled else worth_closer)
+    if config.closer_looks and chosen[0].evidence >= worth and not is_strong(first):
+        planes = looks_at_planes(weights, images, chosen[0], config=config, seed=seed)
+        looks, chosen = looks + planes.taken, planes.confirmed or chosen
+    if config.closer_looks and settled and chosen[0] is first and not seen_alike(first, images):
         place = first.located(*images)
         nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
         if nearer is not None:
-            taken.append(nearer)
+            looks += 1
             chosen = [nearer if nearer.evidence >= CONFIRMED * first.evidence else first]
     aligned = [_aligned(each, images, config) for each in chosen]
     return TwoPhotos(
         as_one([each.result for each in chosen]),
         AlignedMatches(*map(np.concatenate, zip(*aligned, strict=True))),
         _best(chosen).evidence,
-        len(taken),
+        looks,
     )
 
 
@@ -164,6 +163,12 @@ def is_settled(first: Look) -> bool:
     share = first.result.num_inliers / max(first.result.num_tentative, 1)
     likely = first.evidence > AT_LEAST and share >= ENOUGH_SHARE
     return likely or first.evidence >= ENOUGH
+
+
+def is_strong(first: Look) -> bool:
+    """Whether the matches of a first look need nothing more."""
+    share = first.result.num_inliers / max(first.result.num_tentative, 1)
+    return is_settled(first) and (first.evidence >= STRONG or share >= STRONG_SHARE)
 
 
 def seen_alike(first: Look, images: tuple[ImageFile, ImageFile]) -> bool:
