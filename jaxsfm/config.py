@@ -158,8 +158,9 @@ class Config:
     aligned to a fraction of a pixel (`jaxsfm.sfm.refine.pair_alignment`). With 0 they stay as they
     were verified. In models the tracks are aligned instead."""
     closer_looks: int = 0
-    """How many planes of a single pair are looked at as seen from one place, at most, if the first
-    look leaves the pair weak (`jaxsfm.sfm.two_photos`). With 0 there is one look only."""
+    """How many planes of a single pair are looked at as seen from one place, at most, unless its
+    first look is strong (`jaxsfm.sfm.two_photos`). With 0 there is one look only: no other scale
+    or turn is tried either."""
     view_graph: bool = False
     """Whether only pairs that the view graph trusts are given to the mapper
     (`jaxsfm.sfm.view_graph`)."""

@@ -132,8 +132,9 @@ def match(
       out: File.npz to write. keypoints0 and keypoints1 (n x 2) are the matches, in pixels of the
         original images; the centre of the top-left pixel is (0, 0). aligned (n) says whether
         keypoints1 is accurate to a fraction of a pixel. plane (n) is the index of the match's
-        homography. homographies (p x 3 x 3) map the first image to the second. confidence is the
-        probability that the photos show the same and that most matches are right.
+        homography. homographies (p x 3 x 3) map the first image to the second; a surface of a hard
+        pair can have several. confidence is the probability that the photos show the same and that
+        most matches are right.
       plot: File.png or File.jpg to write: a picture of the matches, with one colour for each plane.
       mask0: Image of the size of the first photo, whose black pixels are not used.
       mask1: The same for the second photo.
