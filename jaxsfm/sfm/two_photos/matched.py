@@ -7,7 +7,6 @@ hopeless, the planes of its strongest look are then looked at one by one.
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -105,14 +104,13 @@ def match_photos(
     Raises:
       ImageError: a photo cannot be decoded again.
     """
-    both = (features0, features1)
     images = (features0.image, features1.image)
     first = look(features0, features1, images, config=config, seed=seed)
     taken, chosen, settled = [first], [first], is_settled(first)
     if config.closer_looks and not settled:
         taken += at_other_scales(features0, features1, config=config, seed=seed)
         if _best(taken).evidence >= worth_closer:
-            taken = _look_closer(weights, both, taken, config=config, seed=seed)
+            taken = _look_closer(weights, (features0, features1), taken, config=config, seed=seed)
         chosen = [_best(taken)]
     looks, worth = len(taken), max(HOPELESS, 0.0 if settled else worth_closer)
     if config.closer_looks and chosen[0].evidence >= worth and not is_strong(first):
@@ -149,9 +147,11 @@ def _look_closer(
         looks.append(look(enlarged0, enlarged1, images, config=config, seed=seed))
         looks += at_other_scales(enlarged0, enlarged1, config=config, seed=seed)
         features = (enlarged0, enlarged1)
-    closer = functools.partial(closer_look, weights, images, config=config, seed=seed)
     if _best(looks).evidence < SURE:
-        tried = (closer(each, size=SMALL_SIZE) for each in proposals(looks, images))
+        tried = (
+            closer_look(weights, images, each, size=SMALL_SIZE, config=config, seed=seed)
+            for each in proposals(looks, images)
+        )
         looks += [each for each in tried if each is not None]
     if _best(looks).evidence < TURNED_BELOW:
         looks += turned(weights, features[0], images[1], config=config, seed=seed)
@@ -160,15 +160,18 @@ def _look_closer(
 
 def is_settled(first: Look) -> bool:
     """Whether a first look needs no other."""
-    share = first.result.num_inliers / max(first.result.num_tentative, 1)
-    likely = first.evidence > AT_LEAST and share >= ENOUGH_SHARE
+    likely = first.evidence > AT_LEAST and _agreeing(first) >= ENOUGH_SHARE
     return likely or first.evidence >= ENOUGH
 
 
 def is_strong(first: Look) -> bool:
     """Whether the matches of a first look need nothing more."""
-    share = first.result.num_inliers / max(first.result.num_tentative, 1)
-    return is_settled(first) and (first.evidence >= STRONG or share >= STRONG_SHARE)
+    return is_settled(first) and (first.evidence >= STRONG or _agreeing(first) >= STRONG_SHARE)
+
+
+def _agreeing(found: Look) -> float:
+    """The share of the matches of a look that agree with a plane."""
+    return found.result.num_inliers / max(found.result.num_tentative, 1)
 
 
 def seen_alike(first: Look, images: tuple[ImageFile, ImageFile]) -> bool:

@@ -17,10 +17,11 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult, united
 from jaxsfm.io.weights import Weights
 from jaxsfm.sfm.two_photos.closer_look import closer_look
+from jaxsfm.sfm.two_photos.common_view import SMALL_SIZE
 from jaxsfm.sfm.two_photos.evidence import BY_CHANCE
 from jaxsfm.sfm.two_photos.look import Look
 
-SIZES = (600, 1000)
+SIZES = (SMALL_SIZE, 1000)
 """The longer side of the views of a plane, pixels. A large photo shows more in the larger view, and
 a small one is seen better in the smaller view (docs/decisions/hard-pairs.md)."""
 
