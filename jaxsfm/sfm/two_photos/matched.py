@@ -106,29 +106,59 @@ def match_photos(
     """
     images = (features0.image, features1.image)
     first = look(features0, features1, images, config=config, seed=seed)
-    taken, chosen, settled = [first], [first], is_settled(first)
-    if config.closer_looks and not settled:
-        taken += at_other_scales(features0, features1, config=config, seed=seed)
-        if _best(taken).evidence >= worth_closer:
-            taken = _look_closer(weights, (features0, features1), taken, config=config, seed=seed)
-        chosen = [_best(taken)]
-    looks, worth = len(taken), max(HOPELESS, 0.0 if settled else worth_closer)
-    if config.closer_looks and chosen[0].evidence >= worth and not is_strong(first):
-        planes = looks_at_planes(weights, images, chosen[0], config=config, seed=seed)
-        looks, chosen = looks + planes.taken, planes.confirmed or chosen
-    if config.closer_looks and settled and chosen[0] is first and not seen_alike(first, images):
+    looks = _Looks([first], 1)
+    if config.closer_looks:
+        features = (features0, features1)
+        looks = _further_looks(
+            weights, features, first, config=config, seed=seed, worth_closer=worth_closer
+        )
+    aligned = [_aligned(each, images, config) for each in looks.chosen]
+    return TwoPhotos(
+        as_one([each.result for each in looks.chosen]),
+        AlignedMatches(*map(np.concatenate, zip(*aligned, strict=True))),
+        _best(looks.chosen).evidence,
+        looks.taken,
+    )
+
+
+class _Looks(NamedTuple):
+    """The looks at a pair."""
+
+    chosen: list[Look]
+    """Those whose matches are the result."""
+    taken: int
+    """How many were taken."""
+
+
+def _further_looks(
+    weights: Weights,
+    features: tuple[ImageFeatures, ImageFeatures],
+    first: Look,
+    *,
+    config: Config,
+    seed: int,
+    worth_closer: float,
+) -> _Looks:
+    """The first look and those that follow it, as far as a pair needs them."""
+    images, settled = (features[0].image, features[1].image), is_settled(first)
+    best, taken, least = first, 1, HOPELESS
+    if not settled:
+        searched = [first, *at_other_scales(*features, config=config, seed=seed)]
+        if _best(searched).evidence >= worth_closer:
+            searched = _look_closer(weights, features, searched, config=config, seed=seed)
+        best, taken, least = _best(searched), len(searched), max(HOPELESS, worth_closer)
+    if best.evidence >= least and not is_strong(first):
+        planes = looks_at_planes(weights, images, best, config=config, seed=seed)
+        taken += planes.taken
+        if planes.confirmed:
+            return _Looks(planes.confirmed, taken)
+    if settled and not seen_alike(first, images):
         place = first.located(*images)
         nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
         if nearer is not None:
-            looks += 1
-            chosen = [nearer if nearer.evidence >= CONFIRMED * first.evidence else first]
-    aligned = [_aligned(each, images, config) for each in chosen]
-    return TwoPhotos(
-        as_one([each.result for each in chosen]),
-        AlignedMatches(*map(np.concatenate, zip(*aligned, strict=True))),
-        _best(chosen).evidence,
-        looks,
-    )
+            best = nearer if nearer.evidence >= CONFIRMED * first.evidence else first
+            taken += 1
+    return _Looks([best], taken)
 
 
 def _look_closer(
