@@ -25,7 +25,8 @@ from jaxsfm.runs.job import Job
 from jaxsfm.runs.mapping_looks import MappedLooks
 from jaxsfm.runs.matching_looks import job_of_look, timed
 from jaxsfm.sfm.second_look import closest_pairs
-from jaxsfm.sfm.two_photos.matched import HOPELESS, match_photos
+from jaxsfm.sfm.two_photos.matched import match_photos
+from jaxsfm.sfm.two_photos.pair_looks import HOPELESS
 from jaxsfm.sfm.two_photos.plane_looks import one_match_each
 
 logger = logging.getLogger("jaxsfm")

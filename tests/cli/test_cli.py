@@ -486,7 +486,7 @@ def test_a_model_that_may_be_wrong_ends_with_3(
 def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("jaxsfm.io.features.total_memory", lambda: 920_000_000)
     # Closer looks at photos of 64 pixels compile dozens of programs, which takes minutes.
-    monkeypatch.setattr("jaxsfm.sfm.two_photos.matched.is_settled", lambda first: True)
+    monkeypatch.setattr("jaxsfm.sfm.two_photos.pair_looks.is_settled", lambda first: True)
     images = [scene / "images" / n for n in ("view0.png", "view2.png")]
     refuse(capsys, ["match", *images, "--out", tmp_path / "m.npz"], "view0.png", "--max-size")
     args = ["match", *map(str, images), "--out", str(tmp_path / "m.npz"), "--max-size", "64"]

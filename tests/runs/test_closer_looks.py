@@ -14,7 +14,7 @@ from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches
 from jaxsfm.io.store import Store
 from jaxsfm.runs import closer_looks
 from jaxsfm.runs.closer_looks import CLOSER, look_closer, pairs_to_look_at, without_matches
-from jaxsfm.sfm.two_photos.matched import HOPELESS
+from jaxsfm.sfm.two_photos.pair_looks import HOPELESS
 
 
 def test_the_strongest_pairs_with_placed_photos_are_looked_at():

@@ -21,7 +21,7 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
-from jaxsfm.sfm.two_photos import evidence, matched, plane_looks, scale_search
+from jaxsfm.sfm.two_photos import evidence, matched, pair_looks, plane_looks, scale_search
 from jaxsfm.sfm.two_photos import look as look_module
 from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
 from jaxsfm.sfm.two_photos.common_view import (
@@ -273,9 +273,9 @@ def test_proposals_are_ordered_by_evidence_and_none_is_made_twice():
 @pytest.fixture
 def few_sizes(monkeypatch):
     """No enlarging and views of one size: each size of a picture is a program to compile."""
-    monkeypatch.setattr(matched, "MOST_ENLARGED", 1.0)
-    monkeypatch.setattr(matched, "SIZE", matched.SMALL_SIZE)
-    monkeypatch.setattr(plane_looks, "SIZES", (matched.SMALL_SIZE,))
+    monkeypatch.setattr(pair_looks, "MOST_ENLARGED", 1.0)
+    monkeypatch.setattr(pair_looks, "SIZE", pair_looks.SMALL_SIZE)
+    monkeypatch.setattr(plane_looks, "SIZES", (pair_looks.SMALL_SIZE,))
 
 
 @pytest.mark.slow
@@ -323,23 +323,23 @@ def test_if_a_pair_must_be_worth_it_closer_looks_follow_a_sign_at_some_scale(
     """`jaxsfm match` looks closer at any weak pair; runs do not."""
     features = SimpleNamespace(image=photo((8, 8)))
     weak, found, asked = (fake_look(e) for e in (2.0, evidence, 99.0))
-    monkeypatch.setattr(matched, "is_settled", lambda first: False)
-    monkeypatch.setattr(matched, "look", lambda *_, **__: weak)
-    monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [found])
-    monkeypatch.setattr(matched, "_look_closer", lambda *given, **__: [*given[2], asked])
+    monkeypatch.setattr(pair_looks, "is_settled", lambda first: False)
+    monkeypatch.setattr(pair_looks, "look", lambda *_, **__: weak)
+    monkeypatch.setattr(pair_looks, "at_other_scales", lambda *_, **__: [found])
+    monkeypatch.setattr(pair_looks, "_look_closer", lambda *given, **__: [*given[2], asked])
     planes: list[float] = []
 
     def looks_at_planes(_, __, best: Any, **___: object) -> plane_looks.PlaneLooks:
         planes.append(best.evidence)
         return plane_looks.PlaneLooks([], 0)
 
-    monkeypatch.setattr(matched, "looks_at_planes", looks_at_planes)
+    monkeypatch.setattr(pair_looks, "looks_at_planes", looks_at_planes)
     nothing = AlignedMatches(np.empty((0, 2)), np.empty(0, bool))
     monkeypatch.setattr(matched, "_aligned", lambda *_: nothing)
-    monkeypatch.setattr(matched, "seen_alike", lambda *_: True)
+    monkeypatch.setattr(pair_looks, "seen_alike", lambda *_: True)
     given: Any = (None, features, features)
     config = preset("default")
-    least = match_photos(*given, config=config, worth_closer=matched.HOPELESS)
+    least = match_photos(*given, config=config, worth_closer=pair_looks.HOPELESS)
     assert (least.looks == 3) == closer == bool(planes)
     planes.clear()
     assert match_photos(*given, config=config, worth_closer=15.2).looks == 2 and not planes

@@ -10,7 +10,7 @@ import pytest
 
 from jaxsfm.config import preset
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
-from jaxsfm.sfm.two_photos import matched
+from jaxsfm.sfm.two_photos import matched, pair_looks
 from jaxsfm.sfm.two_photos.common_view import Located
 from jaxsfm.sfm.two_photos.plane_looks import PlaneLooks
 
@@ -43,12 +43,13 @@ def test_a_pair_is_settled_by_evidence_or_by_a_large_share_that_is_likely_right(
     evidence, share, settled
 ):
     assert (
-        matched.is_settled(fake(evidence, inliers=round(1000 * share), tentative=1000)) == settled
+        pair_looks.is_settled(fake(evidence, inliers=round(1000 * share), tentative=1000))
+        == settled
     )
 
 
 def test_a_pair_without_matches_is_not_settled():
-    assert not matched.is_settled(fake(0.0))
+    assert not pair_looks.is_settled(fake(0.0))
 
 
 def seen_as(matrix: list[list[float]]) -> Any:
@@ -88,12 +89,12 @@ def test_a_strong_pair_is_looked_at_once_more_if_its_photos_show_it_differently(
 
     features: Any = SimpleNamespace(image="photo")
     weights: Any = None
-    monkeypatch.setattr(matched, "look", lambda *_, **__: seen_as(matrix))
-    monkeypatch.setattr(matched, "closer_look", closer)
+    monkeypatch.setattr(pair_looks, "look", lambda *_, **__: seen_as(matrix))
+    monkeypatch.setattr(pair_looks, "closer_look", closer)
     monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
     monkeypatch.setattr(matched, "as_one", lambda results: results)
     found = matched.match_photos(weights, features, features, config=preset("default"))
-    assert asked == [matched.SIZE] * unlike  # at most once, however much it brings
+    assert asked == [pair_looks.SIZE] * unlike  # at most once, however much it brings
     assert found.evidence == (2000.0 if unlike else 1900.0)
     once = dataclasses.replace(preset("default"), closer_looks=0)
     assert matched.match_photos(weights, features, features, config=once).looks == 1
@@ -104,8 +105,8 @@ def test_a_view_from_one_place_counts_if_it_confirms_the_first_look(monkeypatch,
     features: Any = SimpleNamespace(image="photo")
     weights: Any = None
     seen = SimpleNamespace(evidence=share * 1900.0, result=None)
-    monkeypatch.setattr(matched, "look", lambda *_, **__: seen_as(turn(90)))
-    monkeypatch.setattr(matched, "closer_look", lambda *_, **__: seen)
+    monkeypatch.setattr(pair_looks, "look", lambda *_, **__: seen_as(turn(90)))
+    monkeypatch.setattr(pair_looks, "closer_look", lambda *_, **__: seen)
     monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
     monkeypatch.setattr(matched, "as_one", lambda results: results)
     found = matched.match_photos(weights, features, features, config=preset("default"))
@@ -114,7 +115,7 @@ def test_a_view_from_one_place_counts_if_it_confirms_the_first_look(monkeypatch,
 
 def test_photos_whose_matches_show_no_view_are_not_looked_at_once_more():
     photos: Any = ("photo", "photo")
-    assert matched.seen_alike(seen_as([[-1, 0], [0, 1]]), photos)  # a mirrored photo
+    assert pair_looks.seen_alike(seen_as([[-1, 0], [0, 1]]), photos)  # a mirrored photo
 
 
 @pytest.mark.parametrize(
@@ -139,13 +140,13 @@ def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
         asked.append(whole.evidence)
         return PlaneLooks([fake(each) for each in planes], 5)
 
-    monkeypatch.setattr(matched, "look", lambda *_, **__: fake(first))
-    monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: [])
-    monkeypatch.setattr(matched, "_look_closer", lambda *given, **__: [*given[2], fake(best)])
-    monkeypatch.setattr(matched, "looks_at_planes", looks_at_planes)
+    monkeypatch.setattr(pair_looks, "look", lambda *_, **__: fake(first))
+    monkeypatch.setattr(pair_looks, "at_other_scales", lambda *_, **__: [])
+    monkeypatch.setattr(pair_looks, "_look_closer", lambda *given, **__: [*given[2], fake(best)])
+    monkeypatch.setattr(pair_looks, "looks_at_planes", looks_at_planes)
     monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
     monkeypatch.setattr(matched, "as_one", lambda results: len(results))
-    monkeypatch.setattr(matched, "seen_alike", lambda *_: True)
+    monkeypatch.setattr(pair_looks, "seen_alike", lambda *_: True)
     found = matched.match_photos(weights, features, features, config=preset("default"))
     evidence, looks, confirmed = expected
     assert (found.evidence, found.looks) == (evidence, looks)
@@ -162,7 +163,7 @@ def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
 def test_a_pair_is_strong_by_its_evidence_or_by_most_of_its_matches(evidence, share, strong):
     """A small photo has too few cells for much evidence."""
     first = fake(evidence, inliers=round(1000 * share), tentative=1000)
-    assert matched.is_strong(first) == strong
+    assert pair_looks.is_strong(first) == strong
 
 
 @pytest.mark.parametrize("planes", [[], [1400.0]])
@@ -174,9 +175,9 @@ def test_photos_seen_differently_are_seen_from_one_place_if_no_plane_is_confirme
     first = seen_as(turn(90))
     first.evidence, first.result = 600.0, SimpleNamespace(num_inliers=100, num_tentative=1000)
     found = PlaneLooks([fake(each) for each in planes], 3)
-    monkeypatch.setattr(matched, "look", lambda *_, **__: first)
-    monkeypatch.setattr(matched, "looks_at_planes", lambda *_, **__: found)
-    monkeypatch.setattr(matched, "closer_look", lambda *_, **__: fake(301.0))
+    monkeypatch.setattr(pair_looks, "look", lambda *_, **__: first)
+    monkeypatch.setattr(pair_looks, "looks_at_planes", lambda *_, **__: found)
+    monkeypatch.setattr(pair_looks, "closer_look", lambda *_, **__: fake(301.0))
     monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
     monkeypatch.setattr(matched, "as_one", lambda results: results)
     pair = matched.match_photos(weights, features, features, config=preset("default"))
@@ -197,22 +198,22 @@ def steps(monkeypatch):
         return (taken(name) or [fake(0.0)])[0]
 
     def closer(_, __, located: object, *, size: int, **___: object) -> Any:
-        assert size == matched.SMALL_SIZE
+        assert size == pair_looks.SMALL_SIZE
         return (taken("proposed") or [None])[0]
 
-    monkeypatch.setattr(matched, "image_features", lambda *_, **__: FEATURES)
-    monkeypatch.setattr(matched, "look", lambda *_, **__: one("enlarged"))
-    monkeypatch.setattr(matched, "at_other_scales", lambda *_, **__: taken("scales"))
-    monkeypatch.setattr(matched, "turned", lambda *_, **__: taken("turned"))
-    monkeypatch.setattr(matched, "proposals", lambda *_: ["a proposal"])
-    monkeypatch.setattr(matched, "closer_look", closer)
+    monkeypatch.setattr(pair_looks, "image_features", lambda *_, **__: FEATURES)
+    monkeypatch.setattr(pair_looks, "look", lambda *_, **__: one("enlarged"))
+    monkeypatch.setattr(pair_looks, "at_other_scales", lambda *_, **__: taken("scales"))
+    monkeypatch.setattr(pair_looks, "turned", lambda *_, **__: taken("turned"))
+    monkeypatch.setattr(pair_looks, "proposals", lambda *_: ["a proposal"])
+    monkeypatch.setattr(pair_looks, "closer_look", closer)
 
     def looks(first: float, name: str = "default", **finds: list[float]) -> list[str]:
         log.clear()
         found.clear()
         found.update(finds)
         weights: Any = None
-        matched._look_closer(
+        pair_looks._look_closer(
             weights, (FEATURES, FEATURES), [fake(first)], config=preset(name), seed=0
         )
         return list(log)
