@@ -22,9 +22,9 @@ logger = logging.getLogger("jaxsfm")
 
 BRIDGES = 3
 """Pairs between two models that are matched at full size."""
-ONE_PLACE = 0.7
+ONE_PLACE = 0.5
 """Two models show one place if a pair between them is right with at least this probability. Of 266
-pairs of different places, the 25 with most inliers have at most 0.60 (docs/decisions/effort.md)."""
+pairs of different places, the 25 with most inliers have at most 0.40 (docs/decisions/effort.md)."""
 
 
 def places_of_their_own(

@@ -235,9 +235,9 @@ def test_photos_that_are_enlarged_already_are_not_enlarged_again(steps):
     assert steps(60, name="robust")[0] == "proposed"
 
 
-def test_photos_are_turned_only_if_nothing_was_found(steps):
-    assert "turned" in steps(20, proposed=[49])
-    assert "turned" not in steps(20, proposed=[51])
+def test_photos_are_turned_unless_a_look_is_sure(steps):
+    assert "turned" in steps(20, proposed=[149])
+    assert "turned" not in steps(20, proposed=[151])
 
 
 def test_confidence_is_half_at_the_evidence_of_a_pair_that_may_be_right_or_wrong():

@@ -17,7 +17,7 @@ from jaxsfm.sfm.two_photos.look import Look, moved, to_stored
 from jaxsfm.sfm.two_photos.pair_looks import looks_at_pair
 from jaxsfm.sfm.two_photos.plane_looks import as_one
 
-HALF_SURE, POWER = 166.0, 2.5
+HALF_SURE, POWER = 233.0, 2.2
 """A pair with the evidence `HALF_SURE` is as probably right as wrong, and the odds grow with this
 power of the evidence. Fitted to drawn pairs with known poses (docs/decisions/hard-pairs.md)."""
 

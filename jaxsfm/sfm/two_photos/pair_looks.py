@@ -32,13 +32,12 @@ share of its matches agrees: it is matched well as it is."""
 MOST_ENLARGED = 2.0
 """Small photos are described once more, enlarged so much, if no scale is sure. The preset `robust`
 does so at the first look."""
-TURNED_BELOW = 50.0
-"""Photos are turned only if no look has this much evidence: three more descriptions of a photo."""
 HOPELESS = 15.0
 """The planes of a look with less evidence are not looked at: nothing is likely to come of it."""
 SURE = 150.0
 """If a look has so much evidence, no other one is searched for. Otherwise the planes of all looks
-are tried one after the other."""
+are tried one after the other, and the photos are turned: rows of windows match upside down with an
+evidence of 100 and more (docs/decisions/hard-pairs.md)."""
 MOST_SCALED, MOST_TURNED = 1.5, 15.0
 """A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
 a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
@@ -125,7 +124,7 @@ def _look_closer(
             for each in proposals(looks, images)
         )
         looks += [each for each in tried if each is not None]
-    if _best(looks).evidence < TURNED_BELOW:
+    if _best(looks).evidence < SURE:
         looks += turned(weights, features[0], images[1], config=config, seed=seed)
     return looks
 
