@@ -300,7 +300,7 @@ def test_a_turned_part_is_matched_by_closer_looks(weights, pictures, few_sizes):
 def test_photos_of_different_things_stay_without_confidence(weights, pictures, few_sizes):
     config = dataclasses.replace(preset("default"), octaves=1)  # as above
     both = [image_features(weights, pictures[name], config=config) for name in ("whole", "other")]
-    assert match_photos(weights, both[0], both[1], config=config).confidence < 0.5
+    assert match_photos(weights, both[0], both[1], config=config).confidence < 0.3
 
 
 @pytest.mark.slow
@@ -308,7 +308,7 @@ def test_a_strong_pair_is_looked_at_once(weights, pictures):
     config = dataclasses.replace(preset("default"), octaves=1)
     features = image_features(weights, pictures["part"], config=config)
     found = match_photos(weights, features, features, config=config)
-    assert found.looks == 1 and found.confidence > 0.99
+    assert found.looks == 1 and found.evidence > pair_looks.STRONG
 
 
 def fake_look(evidence: float) -> SimpleNamespace:

@@ -37,7 +37,7 @@ HOPELESS = 15.0
 SURE = 150.0
 """If a look has so much evidence, no other one is searched for. Otherwise the planes of all looks
 are tried one after the other, and the photos are turned: rows of windows match upside down with an
-evidence of 100 and more (docs/decisions/hard-pairs.md)."""
+evidence above 50 (docs/decisions/hard-pairs.md)."""
 MOST_SCALED, MOST_TURNED = 1.5, 15.0
 """A strong pair is looked at once more, as seen from one place, if one photo shows things larger by
 a greater factor, in any direction, or turned by more degrees (docs/decisions/hard-pairs.md)."""
