@@ -97,8 +97,9 @@ def looks_at_pair(
         place = first.located(*images)
         nearer = closer_look(weights, images, place, size=SIZE, config=config, seed=seed)
         if nearer is not None:
-            best = nearer if nearer.evidence >= CONFIRMED * first.evidence else first
             taken += 1
+            if nearer.evidence >= CONFIRMED * first.evidence:
+                best = nearer
     return PairLooks([best], taken)
 
 
