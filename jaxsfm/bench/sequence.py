@@ -16,10 +16,9 @@ import numpy as np
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.frames import FrameSequence, chosen_frames, linked
-from jaxsfm.bench.lightglue import trained_networks, write_lightglue_database
-from jaxsfm.bench.methods import LIGHTGLUE, ROOTSIFT
 from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.options import whole_numbers
+from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.inliers import read_inliers
@@ -28,16 +27,12 @@ from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import first_models
 from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
-from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.colmap.view import View
-from jaxsfm.config import PRESETS, preset
-from jaxsfm.errors import UserError
+from jaxsfm.config import preset
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.matching.pipeline import open_images
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizedPhoto
 from jaxsfm.runs.matching_looks import timed
@@ -54,8 +49,6 @@ from jaxsfm.sfm.evaluation import (
 if TYPE_CHECKING:
     import pycolmap
 
-OTHERS = (ROOTSIFT, LIGHTGLUE)
-"""The methods that get the pairs of the last preset."""
 END = 0.1
 """The share of the frames at either end whose errors are reported apart."""
 NEAR, NEAR_DEG = 0.05, 5.0
@@ -137,10 +130,10 @@ def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[P
 def with_other_features(given: FrameSequence, method: str, pairs: set[Pair]) -> dict[str, Json]:
     """The same of `OTHERS` on given pairs: a model of COLMAP's incremental mapper, and frames
     localized by the matches with points of the model."""
-    out = given.work / method
-    out.mkdir(parents=True, exist_ok=True)
-    database, seconds = out / "database.db", {}
-    _write_matches(database, given, method, sorted(pairs), seconds)
+    database = given.work / method / "database.db"
+    folder = linked([*given.frames.mapped, *given.frames.localized], given.work / "all")
+    cameras = Cameras(known=parse_intrinsics(given.intrinsics) if given.intrinsics else None)
+    seconds = write_other_matches(database, folder, method, pairs, cameras)
     names = [frame.name for frame in given.frames.mapped]
     options = MapOptions(refine_intrinsics=given.held is None)
     with timed(seconds, "mapping"):
@@ -154,24 +147,6 @@ def with_other_features(given: FrameSequence, method: str, pairs: set[Pair]) -> 
         placed = _placed_by_matches(given, database, models[0])
         row["localized"] = _summary(placed, len(given.frames.localized), time.monotonic() - start)
     return row
-
-
-def _write_matches(
-    database: Path, given: FrameSequence, method: str, pairs: list[Pair], seconds: dict[str, float]
-) -> None:
-    """Describe, match and verify the pairs with other features."""
-    folder = linked([*given.frames.mapped, *given.frames.localized], given.work / "all")
-    images, _ = open_images(folder)
-    cameras = Cameras(known=parse_intrinsics(given.intrinsics) if given.intrinsics else None)
-    if method == ROOTSIFT:
-        with timed(seconds, "matching"):
-            write_rootsift_database(
-                database, folder, images, cameras, VerificationOptions(), pairs=pairs
-            )
-        return
-    write_lightglue_database(
-        database, images, cameras, VerificationOptions(), pairs=pairs, seconds=seconds
-    )
 
 
 def _placed_by_matches(
@@ -235,13 +210,7 @@ def bench_sequence(options: SequenceOptions) -> dict[str, Json]:
     Raises:
       UserError: a frame, a pose or an option cannot be used.
     """
-    methods = options.chosen_methods([*PRESETS, *OTHERS])
-    if methods[0] in OTHERS:
-        raise UserError(
-            f"--methods: {methods[0]} needs a preset beside it, which chooses the pairs"
-        )
-    if LIGHTGLUE in methods:
-        trained_networks()  # say at once what is missing
+    methods = presets_and_others(options)
     truth = read_poses(options.root)
     rows: list[dict[str, Json]] = []
     for every in whole_numbers(options.every, "--every"):

@@ -10,6 +10,7 @@ import tyro
 
 from jaxsfm.cli.bench_commands import (
     ambiguous,
+    collection,
     confidence,
     daynight,
     homography,
@@ -42,6 +43,7 @@ BENCHMARKS = {
     "strecha": strecha,
     "daynight": daynight,
     "ambiguous": ambiguous,
+    "collection": collection,
     "sequence": sequence,
     "recall": recall,
     "wxbs": wxbs,

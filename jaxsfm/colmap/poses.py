@@ -1,4 +1,5 @@
-"""Camera poses from a COLMAP model, or from files of Strecha or 7-Scenes, one for each photo."""
+"""Camera poses from a COLMAP model, from files of Strecha or 7-Scenes, one for each photo, or from
+the table of LLFF."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +9,7 @@ import pycolmap
 
 from jaxsfm.colmap.model_files import DamagedModelError, check_binary
 from jaxsfm.errors import UserError
+from jaxsfm.io.photo_folder import find_images
 
 
 class CameraPose(NamedTuple):
@@ -24,6 +26,10 @@ _SUBFOLDERS = ("", "gt_dense_cameras", "sparse/0", "sparse")
 _MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "sfm")
 """Where models lie in a folder: COLMAP's and ours, nerfstudio's, hloc's."""
 _FILES = ("cameras", "images", "points3D")
+LLFF = "poses_bounds.npy"
+"""The file of LLFF and of many radiance fields: a row of 17 numbers for each photo, in the order of
+the photos' names. The first 15 are a matrix 3 x 5: the axes of the camera (down, right, backwards)
+in the world, its centre, and the photo's height, width and focal length."""
 
 
 def model_poses(model: pycolmap.Reconstruction) -> Poses:
@@ -74,6 +80,26 @@ def _photo_of(file: Path) -> str:
     return f"{stem}.color" if (file.parent / f"{stem}.color.png").is_file() else stem
 
 
+def _read_llff(path: Path) -> Poses:
+    """The poses of the photos in a folder, or in its sub-folder `images`."""
+    photos = path.parent / "images" if (path.parent / "images").is_dir() else path.parent
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path}: not a table of poses ({error})") from error
+    names = find_images(photos)
+    if rows.shape != (len(names), 17) or not np.isfinite(rows[:, :15]).all():
+        raise UserError(
+            f"{path}: not the poses of the photos in {photos} (expected {len(names)} rows of 17 "
+            f"finite numbers, got {' x '.join(map(str, rows.shape))})"
+        )
+    poses = {}
+    for name, row in zip(names, rows.astype(np.float64), strict=True):
+        down, right, back, centre, _ = row[:15].reshape(3, 5).T
+        poses[name] = _pose(path, np.stack([right, down, -back], axis=1), centre)
+    return poses
+
+
 def read_model(path: Path) -> pycolmap.Reconstruction:
     """Read the COLMAP model (binary or text) in a folder. Raises UserError if there is none."""
     suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
@@ -114,7 +140,7 @@ def find_model(path: Path) -> Path:
 
 def read_poses(path: Path, *, option: str = "--reference") -> Poses:
     """Read reference poses, in the folder or below it: Strecha's `.camera` files, the `.pose.txt`
-    files of 7-Scenes, or a COLMAP model.
+    files of 7-Scenes, LLFF's `poses_bounds.npy`, or a COLMAP model.
 
     Args:
       option: the option that names it, for messages.
@@ -130,6 +156,10 @@ def read_poses(path: Path, *, option: str = "--reference") -> Poses:
             return {file.name.removesuffix(".camera"): _read_strecha(file) for file in cameras}
         if matrices := sorted(folder.glob("*.pose.txt")):
             return {_photo_of(file): _read_matrix(file) for file in matrices}
+        if (folder / LLFF).is_file():
+            return _read_llff(folder / LLFF)
         if _has_model(folder):
             return model_poses(read_model(folder))
-    raise UserError(f"{option} {path}: no .camera files, .pose.txt files or COLMAP model in it")
+    raise UserError(
+        f"{option} {path}: no .camera files, .pose.txt files, {LLFF} or COLMAP model in it"
+    )

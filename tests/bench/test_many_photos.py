@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxsfm.bench import driver, sequence
+from jaxsfm.bench import driver, other_features, sequence
 from jaxsfm.bench.frames import chosen_frames
 from jaxsfm.bench.long_street import SIZE, walk, write_street
 from jaxsfm.bench.model_options import SequenceOptions
@@ -130,9 +130,9 @@ def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
         seen.append(([image.name for image in images], pairs))
         raise UserError("seen")
 
-    monkeypatch.setattr(sequence, "trained_networks", lambda: None)
+    monkeypatch.setattr(other_features, "trained_networks", lambda: None)
     monkeypatch.setattr(sequence, "with_jaxsfm", lambda given, name: ({}, chosen))
-    monkeypatch.setattr(sequence, "write_lightglue_database", write_lightglue_database)
+    monkeypatch.setattr(other_features, "write_lightglue_database", write_lightglue_database)
     options = SequenceOptions(
         root=street_sequence, every=("2",), methods=("default,aliked+lightglue",), out=tmp_path
     )

@@ -206,3 +206,35 @@ def test_a_model_with_an_empty_points_file_is_refused_at_once(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=30)
     message, kilobytes = done.stdout.splitlines()
     assert "not a readable COLMAP model" in message and int(kilobytes) < 1 << 19
+
+
+def write_llff(folder, poses, *, photos="images") -> None:
+    """A row of 17 numbers for each photo, in the order of the photos' names."""
+    (folder / photos).mkdir(parents=True, exist_ok=True)
+    rows = []
+    for name, pose in sorted(poses.items()):
+        (folder / photos / name).write_bytes(b"")
+        right, down, forward = pose.rotation
+        matrix = np.stack([down, right, -forward, pose.centre, [480, 640, 500]], axis=1)
+        rows.append(np.append(matrix, [0.1, 9.0]))
+    np.save(folder / "poses_bounds.npy", np.asarray(rows))
+
+
+@pytest.mark.parametrize("photos", ["images", ""])
+def test_poses_of_llff_come_back_in_the_order_of_the_photos_names(tmp_path, photos):
+    truth = {f"{i}.jpg": pose for i, pose in zip("badc", arc(4), strict=True)}
+    write_llff(tmp_path, truth, photos=photos)
+    assert_poses(read_poses(tmp_path), truth)
+
+
+def test_a_table_of_llff_that_does_not_fit_the_photos_is_refused(tmp_path):
+    write_llff(tmp_path, {f"{i}.jpg": pose for i, pose in enumerate(arc(4))})
+    (tmp_path / "images" / "4.jpg").write_bytes(b"")
+    with pytest.raises(UserError, match=r"expected 5 rows of 17 finite numbers, got 4 x 17"):
+        read_poses(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", np.asarray([{}], object), allow_pickle=True)
+    with pytest.raises(UserError, match=r"poses_bounds\.npy: not a table of poses"):
+        read_poses(tmp_path)
+    (tmp_path / "poses_bounds.npy").write_bytes(b"")
+    with pytest.raises(UserError, match=r"poses_bounds\.npy: not a table of poses"):
+        read_poses(tmp_path)

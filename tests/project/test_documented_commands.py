@@ -46,11 +46,11 @@ LONG = (
     "weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
-        for name in ("strecha", "daynight", "ambiguous", "sequence", "recall", "wxbs")
+        for name in ("strecha", "daynight", "ambiguous", "collection", "sequence", "recall")
     ),
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
-        for name in ("homography", "planes", "warps", "turns", "confidence", "poses")
+        for name in ("wxbs", "homography", "planes", "warps", "turns", "confidence", "poses")
     ),
 )
 FENCED = re.compile(r"^```(?:bash|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)

@@ -1,0 +1,210 @@
+"""`bench collection`: photos of a photo site beside reference poses, which may be rough.
+
+Such a reference has errors of its own, and often comes from another program. So positions are not
+compared. A photo of a model is *right* if its rotation is that of the reference, up to the one
+rotation between the two worlds that most of the model's photos agree on. Groups that were joined
+wrongly are turned against each other, and only one of them is right.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, TypedDict
+
+import numpy as np
+
+from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
+from jaxsfm.bench.model_options import CollectionOptions
+from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
+from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import first_models
+from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.config import preset
+from jaxsfm.io.pairs import Pair
+from jaxsfm.report.verdict import VerdictColour
+from jaxsfm.runs.matching_looks import timed
+from jaxsfm.runs.reconstruct import reconstruct_folder
+from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.evaluation import pair_names
+from jaxsfm.sfm.view_graph import rotation_angle_deg
+
+if TYPE_CHECKING:
+    import pycolmap
+
+RIGHT_DEG = 10.0
+"""A photo's rotation may be off by so much: the reference of *statue* has one camera for all photos
+of a photo site, and repeated sides of a building are 90 or 180 degrees apart."""
+NEIGHBOUR_DEG = 5.0
+"""The same for the rotation between a camera and the one next to it."""
+JUDGED = 3
+"""Smaller models are counted and not judged: two photos are nearly always right."""
+LARGE = 10
+"""Models with so many photos count as models of the collection."""
+
+
+class ModelFigures(TypedDict):
+    """The figures of one model."""
+
+    photos: int
+    right: list[str]
+    """The names of the right photos, sorted."""
+    pairs_right: float
+    """The share of the pairs of its cameras whose rotation is right (`RIGHT_DEG`)."""
+    neighbours_right: float
+    """The share of its cameras that are right beside the nearest one (`NEIGHBOUR_DEG`)."""
+    points: int
+    error_px: float
+    """The mean reprojection error, original pixels."""
+
+
+class CollectionRow(TypedDict):
+    """The figures of one method."""
+
+    method: str
+    photos: int
+    registered: int
+    """Photos in any model."""
+    models: list[ModelFigures]
+    """Those with `JUDGED` photos or more, the largest first."""
+    small_models: int
+    right_in_large: int
+    """Different photos that are right in a model of `LARGE` photos or more."""
+    verdict: VerdictColour | None
+    """None: the method gives none."""
+    seconds: dict[str, float]
+
+
+def right_photos(model: Poses, truth: Poses) -> list[str]:
+    """The right photos of a model, sorted; all of them have a reference pose.
+
+    The rotation between the two worlds is that of the photo that most photos agree with; of equal
+    ones, the first by name.
+    """
+    names = pair_names(model, truth)
+    ours = sorted(names)
+    if not ours:
+        return []
+    between = np.stack([model[n].rotation.T @ truth[names[n]].rotation for n in ours])
+    agree = rotation_angle_deg(between[:, None], between[None]) < RIGHT_DEG
+    return [name for name, right in zip(ours, agree[agree.sum(1).argmax()], strict=True) if right]
+
+
+def model_figures(model: "pycolmap.Reconstruction", truth: Poses) -> ModelFigures:
+    """Judge a model of three photos or more."""
+    poses = model_poses(model)
+    names = pair_names(poses, truth)
+    ours = sorted(names)
+    own = np.stack([poses[n].rotation for n in ours])
+    true = np.stack([truth[names[n]].rotation for n in ours])
+    centres = np.stack([poses[n].centre for n in ours])
+    far = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    np.fill_diagonal(far, math.inf)
+    between = own.swapaxes(1, 2) @ true
+    off = rotation_angle_deg(between[:, None], between[None])
+    return {
+        "photos": len(poses),
+        "right": right_photos(poses, truth),
+        "pairs_right": float((off < RIGHT_DEG)[np.triu_indices(len(ours), 1)].mean()),
+        "neighbours_right": float(
+            (off[np.arange(len(ours)), far.argmin(1)] < NEIGHBOUR_DEG).mean()
+        ),
+        "points": len(model.points3D),
+        "error_px": float(model.compute_mean_reprojection_error()),
+    }
+
+
+def _row(
+    method: str,
+    models: "list[pycolmap.Reconstruction]",
+    truth: Poses,
+    seconds: dict[str, float],
+    verdict: VerdictColour | None,
+) -> CollectionRow:
+    poses = [model_poses(model) for model in models]
+    judged = [
+        model_figures(model, truth)
+        for model, placed in zip(models, poses, strict=True)
+        if len(pair_names(placed, truth)) >= JUDGED
+    ]
+    return {
+        "method": method,
+        "photos": len(truth),
+        "registered": len(set().union(*poses)),
+        "models": judged,
+        "small_models": len(models) - len(judged),
+        "right_in_large": len({n for m in judged if m["photos"] >= LARGE for n in m["right"]}),
+        "verdict": verdict,
+        "seconds": seconds,
+    }
+
+
+def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Iterator[CollectionRow]:
+    """A row for each method; presets come first, because they choose the pairs."""
+    pairs: set[Pair] = set()
+    for method in methods:
+        work = options.out / method
+        if method in OTHERS:
+            database = work / "database.db"
+            seconds = write_other_matches(database, options.root, method, pairs, Cameras())
+            with timed(seconds, "mapping"):
+                models = first_models(database, MapOptions(refine_intrinsics=True)).models
+            yield _row(method, models, truth, seconds, None)
+        else:
+            given = RunOptions(pairs=options.pairs, progress=True)
+            report = reconstruct_folder(options.root, work, config=preset(method), options=given)
+            pairs = {each.pair for each in report.pairs.each}
+            models = [read_model(work / "sparse" / str(k)) for k in range(len(report.models))]
+            yield _row(method, models, truth, dict(report.seconds), report.verdict)
+
+
+def bench_collection(options: CollectionOptions) -> BenchFigures[CollectionRow, dict[str, int]]:
+    """Make models of a collection, and judge each of them.
+
+    Raises:
+      UserError: a photo, a pose or an option cannot be used.
+    """
+    methods = presets_and_others(options)
+    truth = read_poses(options.reference or options.root)
+    return collect("collection", _rows(options, methods, truth), summary, cells, options)
+
+
+def summary(rows: list[CollectionRow]) -> dict[str, int]:
+    """How many photos each method has placed rightly in large models."""
+    return {row["method"]: row["right_in_large"] for row in rows}
+
+
+def cells(row: CollectionRow) -> Cells:
+    """A row of the table: all large models, and the figures of the largest."""
+    large = [m for m in row["models"] if m["photos"] >= LARGE]
+    found: Cells = {
+        "method": row["method"],
+        "registered": f"{row['registered']} of {row['photos']}",
+        "right": str(row["right_in_large"]),
+        "models": ", ".join(f"{len(m['right'])} of {m['photos']}" for m in large),
+        "smaller": str(len(row["models"]) - len(large) + row["small_models"]),
+    }
+    if row["models"]:
+        first = row["models"][0]
+        found |= {
+            "pairs": f"{100 * first['pairs_right']:.1f}%",
+            "neighbours": f"{100 * first['neighbours_right']:.1f}%",
+            "points": str(first["points"]),
+            "error px": f"{first['error_px']:.2f}",
+        }
+    return found | {
+        "verdict": row["verdict"] or "",
+        "seconds": f"{sum(row['seconds'].values()):.0f}",
+    }
+
+
+def table_lines(result: BenchFigures[CollectionRow, dict[str, int]]) -> list[str]:
+    """All rows, and what the columns are."""
+    return [
+        *table([cells(row) for row in result["rows"]], names=1),
+        "",
+        f"right: photos of models of {LARGE} and more that are turned as in the reference, within "
+        f"{RIGHT_DEG:g} deg. models: right photos of all, of each such model.",
+        "pairs, neighbours: of the largest model, the pairs of cameras that are turned rightly "
+        f"within {RIGHT_DEG:g} deg, and the cameras that are so beside the nearest one, within "
+        f"{NEIGHBOUR_DEG:g} deg.",
+    ]
