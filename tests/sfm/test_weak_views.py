@@ -387,6 +387,24 @@ def test_only_points_that_a_target_may_show_are_looked_at(rendered):
     assert behind.best is None and behind.agreed == 0
 
 
+def test_views_that_neither_observe_a_point_nor_are_targets_cost_nothing(rendered, monkeypatch):
+    model, looked_at, visibility = exact_model(rendered), [], plane_geometry.visibility
+    idle = [dataclasses.replace(rendered.views[1], image_id=90 + k) for k in range(3)]
+    some = model.with_views([*rendered.views, *idle])
+
+    def counted(part, normal):
+        looked_at.append({view.image_id for view in part.views})
+        return visibility(part, normal)
+
+    monkeypatch.setattr(plane_geometry, "visibility", counted)
+    arguments = (some, images_of(rendered), Refinement(), AlignmentLimits.of(Refinement()))
+    (of_target,) = align_blocks(*arguments, targets=[len(rendered.views)])
+    (of_all,) = align_blocks(*arguments)
+    observing = {some.views[k].image_id for k in np.unique(some.tracks.view)}
+    assert looked_at == [observing | {90}, observing | {90, 91, 92}]
+    assert set(of_target.found.view) == {len(rendered.views)} < set(of_all.found.view)
+
+
 def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendered):
     before = without_night(rendered)
     evidence = night_matches(rendered, right=30, wrong=0)

@@ -214,7 +214,7 @@ def align_blocks(
         normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     patch = square_patch(refinement.radius)
     for rows, tracks in _blocks(model.tracks, model.views, targets):
-        part, number = _of_near_views(model.with_tracks(tracks))
+        part, number = _of_near_views(model.with_tracks(tracks), targets)
         views = part.views
         among = None if targets is None else np.flatnonzero(np.isin(number, targets)).tolist()
         seen = plane_geometry.visibility(part, normal[rows])
@@ -232,15 +232,19 @@ def align_blocks(
         yield AlignedBlock(rows, patches, found, moved, score, agrees, tracked, before)
 
 
-def _of_near_views(part: Model) -> tuple[Model, np.ndarray]:
-    """A block with only those views that may show one of its points; int (v,), their indices.
+def _of_near_views(part: Model, targets: Sequence[int] | None) -> tuple[Model, np.ndarray]:
+    """A block with only those views that matter to it; int (v,), their indices.
 
-    The time of a block then depends on the photos around it, and not on all photos of the model.
+    These are the views that observe one of its points, and those in which it is looked for: the
+    targets, or all that may show one of its points. The time of a block then depends on the photos
+    around it, and not on all photos of the model.
     """
-    seen = np.bincount(part.tracks.view, minlength=len(part.views)) > 0
-    near = np.asarray(
-        [seen[k] or bool(may_show(part.tracks.points, [v]).any()) for k, v in enumerate(part.views)]
-    )
+    near = np.bincount(part.tracks.view, minlength=len(part.views)) > 0
+    if targets is not None:
+        near[list(targets)] = True
+    else:
+        for k in np.flatnonzero(~near):
+            near[k] = may_show(part.tracks.points, [part.views[k]]).any()
     number = np.flatnonzero(near)
     place = np.cumsum(near) - 1
     tracks = part.tracks._replace(view=place[part.tracks.view])
