@@ -26,6 +26,7 @@ from jaxsfm.sfm.check.other_places import (
     MIN_AGREED,
     MIN_INLIERS,
     Refused,
+    Surface,
     other_place,
     other_places,
 )
@@ -39,6 +40,10 @@ PAIR = (NAMES[0], NAMES[1])
 
 def normals(model: Model) -> np.ndarray:
     return plane_geometry.normals(model, neighbours=REFINEMENT.neighbours)
+
+
+def surface(model: Model) -> Surface:
+    return Surface(model, normals(model))
 
 
 # -- pairs -----------------------------------------------------------------------------------------
@@ -166,7 +171,7 @@ def refused(*results: PairResult) -> Refused:
 
 
 def places(seen: Scene, against: Refused):
-    return other_places(seen.model, normals(seen.model), seen.images, REFINEMENT, against)
+    return other_places(surface(seen.model), seen.images, REFINEMENT, against)
 
 
 @pytest.mark.parametrize(("motion", "turned_deg"), [(TURNED, 70.0), (ASIDE, 0.0)])
@@ -211,7 +216,8 @@ def test_few_matches_give_no_second_place(equal, count, found):
     seen = equal
     twins = twin_matches(seen.model, 0, 3, TURNED)
     few = matched(twins.pair, twins.keypoints0[:count], twins.keypoints1[:count])
-    view = (seen.model, normals(seen.model), seen.images, REFINEMENT, refused(few))
+    whole = surface(seen.model)
+    view = (whole, whole.few(), seen.images, REFINEMENT, refused(few))
     assert sum(other_place(*view, k) is not None for k in (0, 3)) == 2 * found
 
 
@@ -221,7 +227,8 @@ def test_a_place_from_which_few_points_are_seen_is_no_second_place(equal, points
     rows = np.flatnonzero((equal.plane == 0) | (np.cumsum(equal.plane == 1) <= points))
     few = equal._replace(model=equal.model.with_tracks(equal.model.tracks.select_points(rows)))
     against = refused(twin_matches(equal.model, 0, 3, TURNED))
-    place = other_place(few.model, normals(few.model), few.images, REFINEMENT, against, 0)
+    whole = surface(few.model)
+    place = other_place(whole, whole.few(), few.images, REFINEMENT, against, 0)
     assert (place is not None) == found
 
 

@@ -14,6 +14,7 @@ from wall_scene import (
 
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.sfm.check import placed_views
+from jaxsfm.sfm.check.other_places import Surface
 from jaxsfm.sfm.check.placed_views import MIN_CONTRADICTED, MOST_CONTRADICTED, Placed, doubts
 from jaxsfm.sfm.refine.plane_geometry import normals
 
@@ -65,9 +66,8 @@ def test_nothing_speaks_against_a_right_place(right):
 def test_a_view_that_shows_something_else_is_doubted_by_its_numbers(wrong):
     (name,), (why,) = zip(*doubted(wrong).items(), strict=True)
     assert name == NAMES[NEW]
-    tested, contradicted = placed_views.shown_by(
-        wrong.model, normals(wrong.model, neighbours=16), wrong.images, REFINEMENT, NEW
-    )
+    surface = Surface(wrong.model, normals(wrong.model, neighbours=16))
+    tested, contradicted = placed_views.shown_by(surface.few(), wrong.images, REFINEMENT, NEW)
     assert f"of {tested} points" in why and why.endswith(f"instead of {contradicted}")
     assert MIN_CONTRADICTED <= contradicted and contradicted > MOST_CONTRADICTED * tested
     assert doubted(wrong, full_size=False) == {}  # noise may hide the poster

@@ -32,6 +32,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import one_pass, plane_geometry, weak_views
+from jaxsfm.sfm.refine.candidates import may_be_candidates
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, matched_points
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.one_pass import run_pass
@@ -403,6 +404,23 @@ def test_views_that_neither_observe_a_point_nor_are_targets_cost_nothing(rendere
     observing = {some.views[k].image_id for k in np.unique(some.tracks.view)}
     assert looked_at == [observing | {90}, observing | {90, 91, 92}]
     assert set(of_target.found.view) == {len(rendered.views)} < set(of_all.found.view)
+
+
+@pytest.mark.parametrize("back", [0.0, 8.0, 40.0])
+def test_points_that_cannot_become_candidates_are_not_looked_at(rendered, back):
+    """A view from farther away has all points in its image, and could align none of them."""
+    model, refinement = exact_model(rendered), Refinement().in_all_views()
+    view = rendered.views[1]
+    away = dataclasses.replace(view, image_id=99, centre=view.centre - back * view.rotation[2])
+    some, k = model.with_views([*rendered.views, away]), len(rendered.views)
+    normal = plane_geometry.normals(some, neighbours=refinement.neighbours)
+    wanted = may_be_candidates(some, normal, refinement, [k])
+    limits = AlignmentLimits.of(refinement)
+    (every,) = align_blocks(some, images_of(rendered), refinement, limits, normal=normal)
+    found = every.rows[every.found.point[every.found.view == k]]
+    assert set(found) <= set(np.flatnonzero(wanted))
+    share = wanted.sum() / len(wanted)
+    assert {0.0: share > 0.4, 8.0: 0.1 < share < 0.6, 40.0: share == 0}[back]
 
 
 def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendered):

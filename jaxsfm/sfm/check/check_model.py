@@ -12,7 +12,7 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import Agreement, agreement
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, parts, share
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck, OtherPlace
-from jaxsfm.sfm.check.other_places import Refused, other_places
+from jaxsfm.sfm.check.other_places import Refused, Surface, other_places
 from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
 from jaxsfm.sfm.check.scale import shrunk
 from jaxsfm.sfm.check.thinning import thinned
@@ -136,7 +136,7 @@ def second_places(
     model = thinned(model)
     normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     refused = Refused({pair: given.matches[pair] for pair in sorted(against)}, given.seed)
-    return other_places(model, normal, images, refinement, refused)
+    return other_places(Surface(model, normal), images, refinement, refused)
 
 
 def _refuted(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pair, Contradiction]:

@@ -19,9 +19,9 @@ from jaxsfm.sfm.check.agreement import agreement
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import OtherPlace
 from jaxsfm.sfm.check.thinning import thinned_points
+from jaxsfm.sfm.refine.candidates import may_show
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
-from jaxsfm.sfm.refine.track_alignment import may_show
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 MIN_INLIERS = 30
@@ -52,9 +52,32 @@ class Refused(NamedTuple):
     """For RANSAC."""
 
 
+class Surface(NamedTuple):
+    """The points of a model as pieces of a surface."""
+
+    model: Model
+    normal: np.ndarray
+    """float64 (points, 3)."""
+
+    def few(self) -> "Surface":
+        """So many of the points as are tested in a second place."""
+        rows = thinned_points(self.model, per_view=TESTED_PER_VIEW)
+        tracks = self.model.tracks.select_points(rows)
+        return Surface(self.model.with_tracks(tracks), self.normal[rows])
+
+    def of_others(self, k: int) -> "Surface":
+        """The same without the observations of one view, by index."""
+        return self._replace(model=self.model.select(self.model.tracks.view != k))
+
+    def with_view(self, k: int, view: View) -> "Surface":
+        """The same with another view in the place of one, by index."""
+        views = self.model.views
+        return self._replace(model=self.model.with_views([*views[:k], view, *views[k + 1 :]]))
+
+
 def other_place(
-    model: Model,
-    normal: np.ndarray,
+    whole: Surface,
+    few: Surface,
     images: DeviceImages,
     refinement: Refinement,
     refused: Refused,
@@ -63,15 +86,16 @@ def other_place(
     """The second place of a view; None if it has none.
 
     Args:
-      normal: float64 (points, 3), of the model's points.
+      whole: places are found from its points.
+      few: those of its points that are tested (`Surface.few`).
       images: those of the views, in the model's pixels.
       k: index of the view.
     """
-    view = model.views[k]
+    view = whole.model.views[k]
     own = {pair: each for pair, each in refused.pairs.items() if view.name in pair}
     # What the view itself has contributed to the model holds at its first place only.
-    others = model.select(model.tracks.view != k)
-    parts = [matched_points(view, others, normal, {pair: each}) for pair, each in own.items()]
+    others = whole.of_others(k)
+    parts = [matched_points(view, *others, {pair: each}) for pair, each in own.items()]
     xy, points = (np.concatenate(column) for column in zip(*parts, strict=True))
     there = find_view(
         view,
@@ -92,8 +116,7 @@ def other_place(
         for (a, b), count in zip(own, support, strict=True)
         if count >= MIN_SUPPORT
     ]
-    moved = others.with_views([*model.views[:k], there, *model.views[k + 1 :]])
-    tested, contradicted = shown_by(moved, normal, images, refinement, k)
+    tested, contradicted = shown_by(few.with_view(k, there), images, refinement, k)
     if tested - contradicted < MIN_AGREED or contradicted > MAX_CONTRADICTED * tested:
         return None
     return OtherPlace(
@@ -119,13 +142,11 @@ def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
     return bool(turned > OTHER_ROTATION_DEG or away > OTHER_DISTANCE * distance)
 
 
-def shown_by(
-    model: Model, normal: np.ndarray, images: DeviceImages, refinement: Refinement, k: int
-) -> tuple[int, int]:
+def shown_by(few: Surface, images: DeviceImages, refinement: Refinement, k: int) -> tuple[int, int]:
     """What a view shows of the points that other views have seen.
 
     Args:
-      normal: float64 (points, 3), of the model's points.
+      few: the points that are tested, with the view where it is to stand.
       images: those of the views, in the model's pixels.
       k: index of the view.
 
@@ -133,10 +154,9 @@ def shown_by(
       the number of points that it should show and on which something can be said, and the number of
       contradictions among them (`jaxsfm.sfm.check.agreement`): means over the other views.
     """
-    others = model.select(model.tracks.view != k)
-    rows = thinned_points(others, per_view=TESTED_PER_VIEW)
-    rows = rows[may_show(others.tracks.points[rows], [others.views[k]])]
-    some = others.with_tracks(others.tracks.select_points(rows))
+    model, normal = few.of_others(k)
+    rows = np.flatnonzero(may_show(model.tracks.points, [model.views[k]]))
+    some = model.with_tracks(model.tracks.select_points(rows))
     found = agreement(some, images, refinement, targets=[k], normal=normal[rows])
     counts = found.tested[:, k]
     if not counts.any():
@@ -146,17 +166,13 @@ def shown_by(
 
 
 def other_places(
-    model: Model,
-    normal: np.ndarray,
-    images: DeviceImages,
-    refinement: Refinement,
-    refused: Refused,
+    surface: Surface, images: DeviceImages, refinement: Refinement, refused: Refused
 ) -> list[OtherPlace]:
     """The second places of all views of a model, sorted by name. Arguments as in `other_place`."""
-    named = {name for pair in refused.pairs for name in pair}
+    named, few = {name for pair in refused.pairs for name in pair}, surface.few()
     found = [
-        other_place(model, normal, images, refinement, refused, k)
-        for k, view in enumerate(model.views)
+        other_place(surface, few, images, refinement, refused, k)
+        for k, view in enumerate(surface.model.views)
         if view.name in named
     ]
     places = [place for place in found if place is not None]

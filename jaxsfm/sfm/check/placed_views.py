@@ -12,7 +12,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.check.other_places import shown_by
+from jaxsfm.sfm.check.other_places import Surface, shown_by
 from jaxsfm.sfm.check.pair_fit import MIN_FIT, pair_fits
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -51,7 +51,7 @@ def doubts(
     normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     following = [pair for pair in placed.neighbours if placed.full_size.keys() & set(pair)]
     fits = pair_fits(model, normal, placed.matches, following)
-    found = {}
+    few, found = Surface(model, normal).few(), {}
     for pair in sorted(pair for pair, fit in fits.items() if fit < MIN_FIT):
         for name in placed.full_size.keys() & set(pair):
             (other,) = set(pair) - {name}
@@ -59,7 +59,7 @@ def doubts(
     for k, view in enumerate(model.views):
         if view.name in found or not placed.full_size.get(view.name):
             continue
-        tested, contradicted = shown_by(model, normal, images, refinement, k)
+        tested, contradicted = shown_by(few, images, refinement, k)
         if contradicted >= max(MIN_CONTRADICTED, MOST_CONTRADICTED * tested):
             found[view.name] = (
                 f"of {tested} points that it should show there, it shows something else instead of "

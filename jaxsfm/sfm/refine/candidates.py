@@ -5,10 +5,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import present_groups
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.refine.plane_geometry import ReferencePatches, Visibility
+from jaxsfm.sfm.refine.plane_geometry import ReferencePatches, Visibility, seen_from
+
+SLACK = 0.25
+"""Share of a view's sides, beyond its borders. Points outside are left out early; they may still
+move along their reference rays before they are aligned, by at most 5 % of their depth."""
 
 
 class Candidates(NamedTuple):
@@ -58,6 +63,48 @@ def find_candidates(
     affine = plane_affines(views, patches.select(point), view)
     ok = np.isfinite(affine).all((1, 2))
     return Candidates(point[ok], view[ok], start[ok], affine[ok])
+
+
+def may_be_candidates(
+    model: Model, normal: np.ndarray, refinement: Refinement, targets: Sequence[int]
+) -> np.ndarray:
+    """bool (n,): the points of which some views may become candidates, and a few more.
+
+    A view that stands far from a street has all of it in its image, but could align none of it.
+
+    Args:
+      normal: float64 (n, 3), of the model's points, each of which has an observation.
+      targets: indices of the views.
+    """
+    tracks, stretch = model.tracks, np.log(refinement.max_stretch)
+    shown = may_show(tracks.points, [model.views[k] for k in targets])
+    own = shown[tracks.point]
+    point, view = tracks.point[own], tracks.view[own]
+    least, most = np.full(len(shown), np.inf), np.full(len(shown), -np.inf)
+    for k, rows in present_groups(view):
+        seen = point[rows]
+        _, scale = seen_from(model.views[k], tracks.points[seen], normal[seen])
+        np.minimum.at(least, seen, scale)
+        np.maximum.at(most, seen, scale)
+    found = np.zeros(len(shown), bool)
+    found[point[np.isin(view, targets)]] = True
+    rows = np.flatnonzero(shown)
+    for k in targets:
+        cosine, scale = seen_from(model.views[k], tracks.points[rows], normal[rows])
+        fits = (scale > least[rows] - stretch) & (scale < most[rows] + stretch)
+        found[rows] |= fits & (cosine > refinement.min_cosine)
+    return found
+
+
+def may_show(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
+    """bool (n,): whether points (n, 3) could lie in any of the views when they are aligned."""
+    shown = np.zeros(len(points), bool)
+    for view in views:
+        at, _ = view.project(points)
+        reach = SLACK * np.asarray(view.size)
+        with np.errstate(invalid="ignore"):
+            shown |= ((at >= -reach) & (at <= view.size + reach)).all(1)
+    return shown
 
 
 def within_most_views(

@@ -65,19 +65,24 @@ def normals(model: Model, *, neighbours: int) -> np.ndarray:
     return normal * np.where(np.einsum("ni,ni->n", towards, normal) < 0, -1.0, 1.0)[:, None]
 
 
+def seen_from(view: View, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How one view would see planes at points (n, 3) with normals (n, 3): their cosines and
+    logarithms of scale (n,), as in `Visibility`."""
+    ray = view.centre - points
+    distance = np.linalg.norm(ray, axis=1)
+    cosine = np.einsum("ni,ni->n", ray, normal) / distance
+    focal = view.camera.mean_focal_length() / view.mean_scale
+    facing = np.log(np.maximum(cosine, MIN_NORMAL_COSINE))
+    return cosine, facing + 2 * np.log(focal / distance)
+
+
 def visibility(model: Model, normal: np.ndarray) -> Visibility:
     """How every view would see every point's plane, of normals (n, 3)."""
     tracks = model.tracks
     n, v = len(tracks.points), len(model.views)
     cosine, log_scale = np.zeros((n, v)), np.zeros((n, v))
     for k, view in enumerate(model.views):
-        ray = view.centre - tracks.points
-        distance = np.linalg.norm(ray, axis=1)
-        cosine[:, k] = np.einsum("ni,ni->n", ray, normal) / distance
-        focal = view.camera.mean_focal_length() / view.mean_scale
-        log_scale[:, k] = np.log(np.maximum(cosine[:, k], MIN_NORMAL_COSINE)) + 2 * np.log(
-            focal / distance
-        )
+        cosine[:, k], log_scale[:, k] = seen_from(view, tracks.points, normal)
     tracked = np.zeros((n, v), bool)
     tracked[tracks.point, tracks.view] = True
     xy = np.full((n, v, 2), np.nan)

@@ -16,7 +16,12 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.core.align import Aligned, Patch, Templates, square_patch
 from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.candidates import Candidates, find_candidates
+from jaxsfm.sfm.refine.candidates import (
+    Candidates,
+    find_candidates,
+    may_be_candidates,
+    may_show,
+)
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.device_templates import DeviceTemplates
 from jaxsfm.sfm.refine.padding import chunks
@@ -34,9 +39,6 @@ CELLS = 5_000_000
 2.7 kB on the device, rounded up to a power of two of points."""
 MIN_BLOCK, MAX_BLOCK = 1000, 100_000
 """Points of a block, whatever the number of views."""
-SLACK = 0.25
-"""Share of a view's sides, beyond its borders. Points outside are left out early; they may still
-move along their reference rays before they are aligned, by at most 5 % of their depth."""
 
 
 class AlignedBlock(NamedTuple):
@@ -153,25 +155,18 @@ def neighbourhoods(tracks: Tracks, count: int) -> np.ndarray:
     return np.argsort(first, kind="stable")
 
 
-def may_show(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
-    """bool (n,): whether points (n, 3) could become candidates in any of the views."""
-    shown = np.zeros(len(points), bool)
-    for view in views:
-        at, _ = view.project(points)
-        reach = SLACK * np.asarray(view.size)
-        with np.errstate(invalid="ignore"):
-            shown |= ((at >= -reach) & (at <= view.size + reach)).all(1)
-    return shown
-
-
 def _blocks(
-    tracks: Tracks, views: Sequence[View], targets: Sequence[int] | None
+    tracks: Tracks, views: int, wanted: np.ndarray | None
 ) -> Iterator[tuple[np.ndarray, Tracks]]:
-    """Blocks of points that the same views see: their indices, and their tracks."""
-    step = max(MIN_BLOCK, min(CELLS // len(views), MAX_BLOCK))
-    near = neighbourhoods(tracks, len(views))
-    if targets is not None:
-        near = near[may_show(tracks.points, [views[k] for k in targets])[near]]
+    """Blocks of points that the same views see: their indices, and their tracks.
+
+    Args:
+      wanted: bool (n,), the points; None: all.
+    """
+    step = max(MIN_BLOCK, min(CELLS // views, MAX_BLOCK))
+    near = neighbourhoods(tracks, views)
+    if wanted is not None:
+        near = near[wanted[near]]
     count = -(-len(near) // step)
     block = np.full(len(tracks.points), count)
     block[near] = np.arange(len(near)) // step
@@ -206,14 +201,15 @@ def align_blocks(
       model: every point has an observation.
       images: those of the views, in the model's pixels.
       limits: what an aligned keypoint must fulfil to count.
-      targets: indices of views. Only observations in these views are aligned, and only points that
-        they may show are looked at. None: all views.
+      targets: indices of views. Only observations in these views are aligned, and only points of
+        which they may become candidates are looked at. None: all views.
       normal: float64 (points, 3), of the model's points; None: from the points.
     """
     if normal is None:
         normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     patch = square_patch(refinement.radius)
-    for rows, tracks in _blocks(model.tracks, model.views, targets):
+    wanted = None if targets is None else may_be_candidates(model, normal, refinement, targets)
+    for rows, tracks in _blocks(model.tracks, len(model.views), wanted):
         part, number = _of_near_views(model.with_tracks(tracks), targets)
         views = part.views
         among = None if targets is None else np.flatnonzero(np.isin(number, targets)).tolist()
