@@ -93,9 +93,7 @@ def other_place(
     """
     view = whole.model.views[k]
     own = {pair: each for pair, each in refused.pairs.items() if view.name in pair}
-    # What the view itself has contributed to the model holds at its first place only.
-    others = whole.of_others(k)
-    parts = [matched_points(view, *others, {pair: each}) for pair, each in own.items()]
+    parts = [matched_points(view, *whole, {pair: each}) for pair, each in own.items()]
     xy, points = (np.concatenate(column) for column in zip(*parts, strict=True))
     there = find_view(
         view,
@@ -154,6 +152,7 @@ def shown_by(few: Surface, images: DeviceImages, refinement: Refinement, k: int)
       the number of points that it should show and on which something can be said, and the number of
       contradictions among them (`jaxsfm.sfm.check.agreement`): means over the other views.
     """
+    # What the view itself has contributed to the model holds at its first place only.
     model, normal = few.of_others(k)
     rows = np.flatnonzero(may_show(model.tracks.points, [model.views[k]]))
     some = model.with_tracks(model.tracks.select_points(rows))
