@@ -13,6 +13,7 @@ from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.colmap.triangulation import MIN_POINTS
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
+from jaxsfm.sfm.parts.straighten import straightened
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
@@ -181,6 +182,8 @@ def _adjust(
 ) -> Refined | None:
     """Filter the observations and adjust the bundle, twice; None if (nearly) nothing is left.
 
+    The first adjustment of a long row of photos is that of its parts.
+
     Args:
       weak: views whose observations were not aligned; they may have four times the error.
     """
@@ -192,6 +195,16 @@ def _adjust(
     # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
     for slack in (4.0, 1.0):
         good = model.errors_px() < slack * limit[model.tracks.view]
+        if slack > 1:
+            straight = straightened(
+                model.select(good),
+                error_px=float(limit.max()),
+                loss_px=loss_px,
+                threads=settings.threads,
+            )
+            if straight is not None:
+                model = straight
+                continue
         reconstruction = model.select(good).to_colmap()
         if reconstruction.num_points3D() < MIN_POINTS:
             return None
