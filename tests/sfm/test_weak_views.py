@@ -423,6 +423,22 @@ def test_points_that_cannot_become_candidates_are_not_looked_at(rendered, back):
     assert {0.0: share > 0.4, 8.0: 0.1 < share < 0.6, 40.0: share == 0}[back]
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_view_that_stands_in_a_point_does_not_see_it(rendered):
+    """The solver may leave a camera there. Nothing is said of it, and no warning is printed."""
+    model, refinement, k = exact_model(rendered), Refinement().in_all_views(), len(rendered.views)
+    there = dataclasses.replace(rendered.views[1], image_id=99, centre=model.tracks.points[0])
+    some = model.with_views([*rendered.views, there])
+    normal = plane_geometry.normals(some, neighbours=refinement.neighbours)
+    cosine, log_scale = plane_geometry.seen_from(there, some.tracks.points, normal)
+    assert (
+        np.flatnonzero(np.isnan(cosine)).tolist()
+        == [0]
+        == np.flatnonzero(np.isnan(log_scale)).tolist()
+    )
+    assert not may_be_candidates(some, normal, refinement, [k])[0]
+
+
 def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendered):
     before = without_night(rendered)
     evidence = night_matches(rendered, right=30, wrong=0)

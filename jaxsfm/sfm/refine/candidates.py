@@ -84,8 +84,8 @@ def may_be_candidates(
     for k, rows in present_groups(view):
         seen = point[rows]
         _, scale = seen_from(model.views[k], tracks.points[seen], normal[seen])
-        np.minimum.at(least, seen, scale)
-        np.maximum.at(most, seen, scale)
+        np.fmin.at(least, seen, scale)
+        np.fmax.at(most, seen, scale)
     found = np.zeros(len(shown), bool)
     found[point[np.isin(view, targets)]] = True
     rows = np.flatnonzero(shown)

@@ -67,13 +67,15 @@ def normals(model: Model, *, neighbours: int) -> np.ndarray:
 
 def seen_from(view: View, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How one view would see planes at points (n, 3) with normals (n, 3): their cosines and
-    logarithms of scale (n,), as in `Visibility`."""
+    logarithms of scale (n,), as in `Visibility`. Both are NaN where the camera stands in a point,
+    and such a view fits nothing."""
     ray = view.centre - points
     distance = np.linalg.norm(ray, axis=1)
-    cosine = np.einsum("ni,ni->n", ray, normal) / distance
     focal = view.camera.mean_focal_length() / view.mean_scale
-    facing = np.log(np.maximum(cosine, MIN_NORMAL_COSINE))
-    return cosine, facing + 2 * np.log(focal / distance)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.einsum("ni,ni->n", ray, normal) / distance
+        facing = np.log(np.maximum(cosine, MIN_NORMAL_COSINE))
+        return cosine, facing + 2 * np.log(focal / distance)
 
 
 def visibility(model: Model, normal: np.ndarray) -> Visibility:
