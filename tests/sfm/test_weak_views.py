@@ -430,7 +430,7 @@ def test_a_view_that_stands_in_a_point_does_not_see_it(rendered):
     there = dataclasses.replace(rendered.views[1], image_id=99, centre=model.tracks.points[0])
     some = model.with_views([*rendered.views, there])
     normal = plane_geometry.normals(some, neighbours=refinement.neighbours)
-    cosine, log_scale = plane_geometry.seen_from(there, some.tracks.points, normal)
+    cosine, log_scale = plane_geometry.seen_by([there], 0, some.tracks.points, normal)
     assert (
         np.flatnonzero(np.isnan(cosine)).tolist()
         == [0]

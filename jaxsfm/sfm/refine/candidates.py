@@ -9,7 +9,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import present_groups
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.refine.plane_geometry import ReferencePatches, Visibility, seen_from
+from jaxsfm.sfm.refine.plane_geometry import ReferencePatches, Visibility, seen_by
 
 SLACK = 0.25
 """Share of a view's sides, beyond its borders. Points outside are left out early; they may still
@@ -81,16 +81,14 @@ def may_be_candidates(
     own = shown[tracks.point]
     point, view = tracks.point[own], tracks.view[own]
     least, most = np.full(len(shown), np.inf), np.full(len(shown), -np.inf)
-    for k, rows in present_groups(view):
-        seen = point[rows]
-        _, scale = seen_from(model.views[k], tracks.points[seen], normal[seen])
-        np.fmin.at(least, seen, scale)
-        np.fmax.at(most, seen, scale)
+    _, scale = seen_by(model.views, view, tracks.points[point], normal[point])
+    np.fmin.at(least, point, scale)
+    np.fmax.at(most, point, scale)
     found = np.zeros(len(shown), bool)
     found[point[np.isin(view, targets)]] = True
     rows = np.flatnonzero(shown)
     for k in targets:
-        cosine, scale = seen_from(model.views[k], tracks.points[rows], normal[rows])
+        cosine, scale = seen_by(model.views, k, tracks.points[rows], normal[rows])
         fits = (scale > least[rows] - stretch) & (scale < most[rows] + stretch)
         found[rows] |= fits & (cosine > refinement.min_cosine)
     return found

@@ -2,6 +2,7 @@
 views. Pure functions of numpy arrays.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,17 +66,26 @@ def normals(model: Model, *, neighbours: int) -> np.ndarray:
     return normal * np.where(np.einsum("ni,ni->n", towards, normal) < 0, -1.0, 1.0)[:, None]
 
 
-def seen_from(view: View, points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How one view would see planes at points (n, 3) with normals (n, 3): their cosines and
-    logarithms of scale (n,), as in `Visibility`. Both are NaN where the camera stands in a point,
-    and such a view fits nothing."""
-    ray = view.centre - points
+def seen_by(
+    views: Sequence[View], which: np.ndarray | int, points: np.ndarray, normal: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """How planes at points (n, 3) with normals (n, 3) are seen, each by one view.
+
+    Args:
+      which: int (n,), the view of each point, or one for all.
+
+    Returns:
+      float64 (n,), their cosines and logarithms of scale, as in `Visibility`. Both are NaN where
+      the camera stands in the point, and such a view fits nothing.
+    """
+    centres = np.stack([view.centre for view in views])
+    focal = np.asarray([view.camera.mean_focal_length() / view.mean_scale for view in views])
+    ray = centres[which] - points
     distance = np.linalg.norm(ray, axis=1)
-    focal = view.camera.mean_focal_length() / view.mean_scale
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.einsum("ni,ni->n", ray, normal) / distance
         facing = np.log(np.maximum(cosine, MIN_NORMAL_COSINE))
-        return cosine, facing + 2 * np.log(focal / distance)
+        return cosine, facing + 2 * np.log(focal[which] / distance)
 
 
 def visibility(model: Model, normal: np.ndarray) -> Visibility:
@@ -84,7 +94,7 @@ def visibility(model: Model, normal: np.ndarray) -> Visibility:
     n, v = len(tracks.points), len(model.views)
     cosine, log_scale = np.zeros((n, v)), np.zeros((n, v))
     for k, view in enumerate(model.views):
-        cosine[:, k], log_scale[:, k] = seen_from(view, tracks.points, normal)
+        cosine[:, k], log_scale[:, k] = seen_by([view], 0, tracks.points, normal)
     tracked = np.zeros((n, v), bool)
     tracked[tracks.point, tracks.view] = True
     xy = np.full((n, v, 2), np.nan)
