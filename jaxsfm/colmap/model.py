@@ -88,6 +88,10 @@ class Model:
         Points with fewer than two observations, or with rays closer than 1.5 degrees, are left
         out. The points have no colours.
         """
+        return self.numbered_colmap()[0]
+
+    def numbered_colmap(self) -> tuple[pycolmap.Reconstruction, dict[int, int]]:
+        """The same, and the index of a point by its number in COLMAP's model."""
         model = pycolmap.Reconstruction()
         cameras = {**self.cameras, **{view.camera.camera_id: view.camera for view in self.views}}
         for camera_id in sorted(cameras):
@@ -105,6 +109,7 @@ class Model:
             model.add_image_with_trivial_frame(image, view.cam_from_world())
         order = np.argsort(tracks.point, kind="stable")
         ends = np.searchsorted(tracks.point[order], np.arange(len(tracks.points) + 1))
+        index = {}
         for k, xyz in enumerate(tracks.points):
             rows = order[ends[k] : ends[k + 1]]
             if len(rows) < 2:
@@ -112,9 +117,9 @@ class Model:
             track = pycolmap.Track()
             for row in rows:
                 track.add_element(self.views[tracks.view[row]].image_id, int(place[row]))
-            model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+            index[model.add_point3D(xyz, track, np.zeros(3, np.uint8))] = k
         pycolmap.ObservationManager(model).filter_all_points3D(1e9, MIN_TRI_ANGLE_DEG)
-        return model
+        return model, index
 
     def with_views(self, views: list[View]) -> "Model":
         """The same points and observations, with other views."""

@@ -11,7 +11,7 @@ from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import CameraPose, model_poses
-from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
@@ -19,6 +19,8 @@ from jaxsfm.sfm.evaluation import Similarity, evaluate
 from jaxsfm.sfm.parts import straighten
 from jaxsfm.sfm.parts.straighten import (
     LONG,
+    STRONGEST,
+    TIED,
     TOGETHER,
     hops,
     seen_together,
@@ -123,17 +125,89 @@ def test_only_long_rows_are_straightened():
 
 
 def test_a_row_whose_parts_do_not_fit_together_stays_as_it_is(long_row, monkeypatch):
-    assert straightened(long_row, error_px=0.01, **HOW) is None
+    found = straighten.common_frames
+
+    def one_is_too_large(count, shared):
+        (frames,) = found(count, shared)
+        return [frames | {1: frames[1]._replace(scale=1.2 * frames[1].scale)}]
+
+    monkeypatch.setattr(straighten, "common_frames", one_is_too_large)
+    assert straightened(long_row, error_px=4.0, **HOW) is None
+    monkeypatch.setattr(straighten, "common_frames", found)
     monkeypatch.setattr(straighten, "shared_views", lambda *_: None)
     assert straightened(long_row, error_px=4.0, **HOW) is None
+
+
+def with_points_of_both_ends(model: Model, count: int) -> Model:
+    """The row, and points far away that its first and its last photo see."""
+    length = model.views[-1].centre[0]
+    far = np.random.default_rng(1).uniform(-0.5, 0.5, (count, 3)) * (200, 200, 0)
+    far += (length / 2, 0, 20 * length)
+    ends = (0, len(model.views) - 1)
+    rows = np.arange(count)
+    seen = [
+        Observations(rows, np.full(count, k), model.views[k].project(far)[0] + 0.0) for k in ends
+    ]
+    return model.with_tracks(model.tracks.joined(Tracks.from_parts(far, seen)))
+
+
+@pytest.mark.parametrize(("count", "kept"), [(TIED - 1, True), (TIED, False)])
+def test_the_ends_of_a_row_are_not_torn_apart(long_row, count, kept):
+    """Points of both ends are few, so the share of right observations says nothing."""
+    before = with_points_of_both_ends(long_row, count)
+    home = [(k // 40, view) for k, view in enumerate(before.views)]
+    after = bent(before, 2.0)
+    assert (after.errors_px() < 4.0).mean() > 0.9
+    assert straighten._stays_tied(before, before, home, 4.0)
+    assert straighten._stays_tied(before, after, home, 4.0) == kept
+
+
+def test_a_weak_photo_does_not_keep_a_row_bent(long_row):
+    """It shares fewer points with each other photo than photos need to hold each other."""
+    weak = 100
+    rows = long_row.rows[weak]
+    drop = np.zeros(len(long_row.tracks.point), bool)
+    drop[rows[TOGETHER - 5 :]] = True
+    some = long_row.select(~drop)
+    many = np.flatnonzero(some.tracks.num_observations() >= 2)
+    wrong = bent(some.with_tracks(some.tracks.select_points(many)), 30.0)
+    found = straightened(wrong, error_px=4.0, **HOW)
+    assert found is not None and off(found, long_row) < 1.0
+
+
+def test_observations_cameras_and_photos_stay(long_row):
+    wrong = bent(long_row, 30.0)
+    found = straightened(wrong, error_px=4.0, **HOW)
+    assert found is not None
+    assert [view.name for view in found.views] == [view.name for view in wrong.views]
+    assert all(a.camera is b.camera for a, b in zip(found.views, wrong.views, strict=True))
+    for field in ("point", "view", "xy"):
+        np.testing.assert_array_equal(
+            getattr(found.tracks, field), getattr(wrong.tracks, field), field
+        )
+
+
+def test_a_point_that_is_in_no_part_moves_with_the_first_view_that_observes_it(long_row):
+    wrong = bent(with_points_of_both_ends(long_row, 3), 30.0)
+    found = straightened(wrong, error_px=4.0, **HOW)
+    assert found is not None
+    (was, _), (now, _) = (m.views[0].project(m.tracks.points[-3:]) for m in (wrong, found))
+    np.testing.assert_allclose(now, was, atol=1e-6)
+    assert np.abs(found.tracks.points[-3:] - wrong.tracks.points[-3:]).max() > 1.0
 
 
 def test_photos_with_few_common_points_do_not_hold_each_other(long_row):
     graph = seen_together(long_row)
     seen = [set(long_row.tracks.point[rows].tolist()) for rows in long_row.rows]
-    common = len(seen[3] & seen[5])
-    assert common >= TOGETHER and graph.weights[3, 5] == common == graph.weights[5, 3]
-    assert graph.weights.data.min() >= TOGETHER and graph.weights.diagonal().sum() == 0
+    common = [len(seen[20] & seen[k]) if k != 20 else 0 for k in range(len(seen))]
+    strongest = sorted(common)[-STRONGEST]
+    weights = graph.weights[[20]].toarray()[0]
+    assert all(
+        weights[k] == (count if count >= min(TOGETHER, strongest) else 0)
+        for k, count in enumerate(common)
+        if count != strongest
+    )
+    assert any(0 < count < TOGETHER for count in common) and graph.weights.diagonal().sum() == 0
 
 
 @pytest.mark.parametrize("straight", [False, True])

@@ -7,77 +7,96 @@ itself, and the parts are put together by the photos that they share. What is le
 small (docs/decisions/many-photos.md).
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.view import View
-from jaxsfm.sfm.evaluation import umeyama
+from jaxsfm.sfm.evaluation import Similarity, umeyama
 from jaxsfm.sfm.model_join import MIN_SHARED
 from jaxsfm.sfm.parts.frames import SharedPoints, common_frames
-from jaxsfm.sfm.parts.merge import merged
 from jaxsfm.sfm.parts.partition import Graph, overlapping_parts
 
 TOGETHER = 20
 """Photos with so many common points hold each other. Fewer may all be wrong: with one point, photos
 of look-alike houses came into one part, whose two ends nothing held together."""
+STRONGEST = 3
+"""The strongest pairs of each photo hold it, too, so that a weak photo is in a part with others."""
 LONG = 20
-"""Steps from photo to photo (`TOGETHER`) between the two ends of a row that is long. A street of
-100 photos has 8 and one of 1000 has 86; 500 frames of *kitchen* have 8, *statue* 5, *cup* 3."""
+"""Steps from photo to photo between the two ends of a row that is long. A street of 100 photos has
+8 and one of 1000 has 86; 500 frames of *kitchen* have 8, *statue* 5, *cup* 3."""
 PART, OVERLAP = 30, 20
 """Photos of a part, and photos that two parts share: parts of 80 are still bent after 50 steps."""
-RIGHT = 0.9
-"""The parts fit together if this share of the observations has no larger error than is allowed."""
+TIED, KEPT = 10, 0.5
+"""Two parts with so many common right points stay tied if this share of them stays right: where a
+row comes back to its start, its ends must not be torn apart."""
+
+
+class _Part(NamedTuple):
+    """A part of a row after its own adjustment."""
+
+    model: Model
+    rows: np.ndarray
+    """int (points,): the indices of its points in the row."""
 
 
 def straightened(model: Model, *, error_px: float, loss_px: float, threads: int) -> Model | None:
     """A long row of photos after its parts were adjusted; None if it is no long row, or if the
     parts do not fit together.
 
-    The cameras stay as they are.
+    Poses and points change; observations and cameras stay. The frame is that of the largest part,
+    which has the place and the size that it had in the row.
 
     Args:
       error_px: the largest error of a right observation, pixels of the views.
       loss_px, threads: as in `jaxsfm.colmap.bundle_adjustment`.
     """
     graph = seen_together(model)
-    if hops(graph) < LONG:
+    if hops(graph) < LONG or connected_components(graph.weights, directed=False)[0] > 1:
         return None
-    parts = []
-    for names in overlapping_parts(graph, size=PART, overlap=OVERLAP):
-        made = model.part(names)[0].to_colmap()
-        bundle_adjust(made, loss_px=loss_px, refine_intrinsics=False, threads=threads)
-        parts.append(Model.from_colmap(made, model.sizes))
+    parts = [
+        _adjusted(model, names, loss_px=loss_px, threads=threads)
+        for names in overlapping_parts(graph, size=PART, overlap=OVERLAP)
+    ]
+    parts.sort(key=lambda part: -len(part.model.views))
     shared = {
         (i, j): found
         for i, first in enumerate(parts)
         for j, second in enumerate(parts[i + 1 :], i + 1)
-        if (found := shared_views(first.views, second.views)) is not None
+        if (found := shared_views(first.model.views, second.model.views)) is not None
     }
     frames, *others = common_frames(len(parts), shared)
     if others:
         return None
-    whole = merged(parts, frames)
-    right = int((whole.errors_px() < error_px).sum())
-    return whole if right >= RIGHT * len(model.tracks.point) else None
+    home = _homes(model, parts)
+    whole = _put_together(model, parts, frames, home)
+    return whole if _stays_tied(model, whole, home, error_px) else None
 
 
 def seen_together(model: Model) -> Graph:
-    """The photos of a model, and how many points each two of them share, from `TOGETHER` on."""
+    """The photos of a model, and how many points each two of them share: pairs from `TOGETHER` on,
+    and the `STRONGEST` of each photo."""
     names = sorted(view.name for view in model.views)
     place = {name: k for k, name in enumerate(names)}
     own = np.asarray([place[view.name] for view in model.views], np.int64)
     tracks = model.tracks
-    shape = (len(tracks.points), len(names))
-    seen = coo_array((np.ones(len(tracks.point)), (tracks.point, own[tracks.view])), shape=shape)
+    seen = _incidence(tracks.point, own[tracks.view], (len(tracks.points), len(names)))
     both = (seen.T @ seen).tocoo()
-    keep = (both.row != both.col) & (both.data >= TOGETHER)
-    entries = (both.data[keep], (both.row[keep], both.col[keep]))
-    return Graph(names, csr_array(coo_array(entries, shape=both.shape)))
+    apart = both.row != both.col
+    row, column, count = both.row[apart], both.col[apart], both.data[apart]
+    order = np.lexsort((column, -count, row))
+    rank = np.empty(len(row), np.int64)
+    rank[order] = np.arange(len(row)) - np.searchsorted(row[order], row[order])
+    keep = (count >= TOGETHER) | (rank < STRONGEST)
+    one_way = csr_array(coo_array((count[keep], (row[keep], column[keep])), shape=both.shape))
+    return Graph(names, csr_array(one_way.maximum(one_way.T)))
 
 
 def hops(graph: Graph) -> int:
@@ -111,3 +130,78 @@ def shared_views(first: Sequence[View], second: Sequence[View]) -> SharedPoints 
             return None
         tips.append(np.concatenate([centres, (centres[:, None] + length * axes).reshape(-1, 3)]))
     return SharedPoints(tips[0], tips[1], umeyama(tips[1], tips[0]))
+
+
+def _incidence(row: np.ndarray, column: np.ndarray, shape: tuple[int, int]) -> csr_array:
+    """A matrix of ones at some places (n,), each once."""
+    found = csr_array(coo_array((np.ones(len(row)), (row, column)), shape=shape))
+    found.data[:] = 1
+    return found
+
+
+def _adjusted(model: Model, names: Sequence[str], *, loss_px: float, threads: int) -> _Part:
+    """A part of a row, adjusted by itself; its cameras stay."""
+    some, rows = model.part(names)
+    made, index = some.numbered_colmap()
+    bundle_adjust(made, loss_px=loss_px, refine_intrinsics=False, threads=threads)
+    kept = [index[number] for number in sorted(made.point3D_ids())]
+    return _Part(Model.from_colmap(made, model.sizes), rows[kept])
+
+
+def _homes(model: Model, parts: Sequence[_Part]) -> list[tuple[int, View]]:
+    """For each view of the row, the part in which it has most observations, and its view there."""
+    best: dict[str, tuple[int, int, View]] = {}
+    for number, part in enumerate(parts):
+        seen = np.bincount(part.model.tracks.view, minlength=len(part.model.views))
+        for view, count in zip(part.model.views, seen.tolist(), strict=True):
+            if view.name not in best or best[view.name][0] < count:
+                best[view.name] = (count, number, view)
+    return [best[view.name][1:] for view in model.views]
+
+
+def _put_together(
+    model: Model,
+    parts: Sequence[_Part],
+    frames: Mapping[int, Similarity],
+    home: Sequence[tuple[int, View]],
+) -> Model:
+    """The row with the poses of its parts, and with points in the middle of where parts have them.
+
+    A point that is in no part keeps its place before the first view that observes it.
+    """
+    poses = [
+        frames[number].moved(CameraPose(there.rotation, there.centre)) for number, there in home
+    ]
+    views = [
+        dataclasses.replace(view, rotation=pose.rotation, centre=pose.centre)
+        for view, pose in zip(model.views, poses, strict=True)
+    ]
+    tracks, points = model.tracks, np.zeros_like(model.tracks.points)
+    times = np.zeros(len(points))
+    for number, part in enumerate(parts):
+        points[part.rows] += frames[number].moved_points(part.model.tracks.points)
+        times[part.rows] += 1
+    points[times > 0] /= times[times > 0, None]
+    for k in np.flatnonzero(times == 0):
+        v = int(tracks.view[tracks.point == k][0])
+        before, after = model.views[v], views[v]
+        away = before.rotation @ (tracks.points[k] - before.centre)
+        points[k] = after.centre + frames[home[v][0]].scale * after.rotation.T @ away
+    return model.with_views(views).with_tracks(tracks._replace(points=points))
+
+
+def _stays_tied(
+    before: Model, after: Model, home: Sequence[tuple[int, View]], error_px: float
+) -> bool:
+    """Whether what was right within each part and between each two parts is so afterwards."""
+    tracks, part = before.tracks, np.asarray([number for number, _ in home])
+    shape = (len(tracks.points), int(part.max()) + 1)
+    ties = []
+    right = np.ones(len(tracks.points), bool)
+    for model in (before, after):
+        wrong = ~(model.errors_px() < error_px)
+        right[tracks.point[wrong]] = False
+        own = right[tracks.point]
+        seen = _incidence(tracks.point[own], part[tracks.view[own]], shape)
+        ties.append((seen.T @ seen).toarray())
+    return bool((ties[1] >= KEPT * ties[0])[ties[0] >= TIED].all())

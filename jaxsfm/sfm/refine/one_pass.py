@@ -198,7 +198,7 @@ def _adjust(
         if slack > 1:
             straight = straightened(
                 model.select(good),
-                error_px=float(limit.max()),
+                error_px=settings.refinement.max_error_px,
                 loss_px=loss_px,
                 threads=settings.threads,
             )
