@@ -8,7 +8,7 @@ wrongly are turned against each other, and only one of them is right.
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from jaxsfm.colmap.mapper import first_models
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.config import preset
 from jaxsfm.io.pairs import Pair
+from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.verdict import VerdictColour
 from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -57,16 +58,27 @@ class ModelFigures(TypedDict):
     """The mean reprojection error, original pixels."""
 
 
+class Made(NamedTuple):
+    """What a method made of a collection."""
+
+    models: "list[pycolmap.Reconstruction]"
+    """The one with most photos first."""
+    seconds: dict[str, float]
+    verdict: VerdictColour | None
+
+
 class CollectionRow(TypedDict):
     """The figures of one method."""
 
     method: str
     photos: int
+    """Those of the collection, with and without a reference pose."""
     registered: int
     """Photos in any model."""
     models: list[ModelFigures]
-    """Those with `JUDGED` photos or more, the largest first."""
+    """Those with `JUDGED` photos with a reference pose or more, the largest first."""
     small_models: int
+    """The number of the other models."""
     right_in_large: int
     """Different photos that are right in a model of `LARGE` photos or more."""
     verdict: VerdictColour | None
@@ -113,34 +125,29 @@ def model_figures(model: "pycolmap.Reconstruction", truth: Poses) -> ModelFigure
     }
 
 
-def _row(
-    method: str,
-    models: "list[pycolmap.Reconstruction]",
-    truth: Poses,
-    seconds: dict[str, float],
-    verdict: VerdictColour | None,
-) -> CollectionRow:
-    poses = [model_poses(model) for model in models]
+def _row(method: str, photos: int, made: Made, truth: Poses) -> CollectionRow:
+    poses = [model_poses(model) for model in made.models]
     judged = [
         model_figures(model, truth)
-        for model, placed in zip(models, poses, strict=True)
+        for model, placed in zip(made.models, poses, strict=True)
         if len(pair_names(placed, truth)) >= JUDGED
     ]
     return {
         "method": method,
-        "photos": len(truth),
+        "photos": photos,
         "registered": len(set().union(*poses)),
         "models": judged,
-        "small_models": len(models) - len(judged),
+        "small_models": len(made.models) - len(judged),
         "right_in_large": len({n for m in judged if m["photos"] >= LARGE for n in m["right"]}),
-        "verdict": verdict,
-        "seconds": seconds,
+        "verdict": made.verdict,
+        "seconds": made.seconds,
     }
 
 
 def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Iterator[CollectionRow]:
     """A row for each method; presets come first, because they choose the pairs."""
     pairs: set[Pair] = set()
+    photos = len(open_images(options.root)[0])
     for method in methods:
         work = options.out / method
         if method in OTHERS:
@@ -148,13 +155,14 @@ def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Itera
             seconds = write_other_matches(database, options.root, method, pairs, Cameras())
             with timed(seconds, "mapping"):
                 models = first_models(database, MapOptions(refine_intrinsics=True)).models
-            yield _row(method, models, truth, seconds, None)
+            made = Made(models, seconds, None)
         else:
             given = RunOptions(pairs=options.pairs, progress=True)
             report = reconstruct_folder(options.root, work, config=preset(method), options=given)
             pairs = {each.pair for each in report.pairs.each}
             models = [read_model(work / "sparse" / str(k)) for k in range(len(report.models))]
-            yield _row(method, models, truth, dict(report.seconds), report.verdict)
+            made = Made(models, dict(report.seconds), report.verdict)
+        yield _row(method, photos, made, truth)
 
 
 def bench_collection(options: CollectionOptions) -> BenchFigures[CollectionRow, dict[str, int]]:

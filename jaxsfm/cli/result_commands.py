@@ -23,7 +23,7 @@ def evaluate(
 
     Args:
       out: The folder of a run or of a COLMAP model.
-      reference: The folder of Strecha .camera files or of a COLMAP model.
+      reference: The folder of the reference poses, as in reconstruct.
       align_on: A text file with names of photos, one on each line. The model is fitted to the
         reference with these photos only, as the paper does for night photos.
       json: File.json to write, with all errors.
@@ -65,7 +65,7 @@ def report(
     Args:
       run: The folder of a run.
       images: The folder of the photos. Without it, the folder in which the run found them.
-      reference: Reference poses (Strecha .camera files or a COLMAP model). Without it, those of the
+      reference: Reference poses, as in reconstruct. Without it, those of the
         run.
       out: File.html to write. Without it, report.html in the folder of the run.
     """
@@ -91,7 +91,7 @@ def view(
     Args:
       run: The folder of a run.
       images: The folder of the photos. Without it, the folder in which the run found them.
-      reference: Reference poses (Strecha .camera files or a COLMAP model). Without it, those of the
+      reference: Reference poses, as in reconstruct. Without it, those of the
         run.
       port: The port of the server. If it is taken, the next free port is used.
       host: The address of the server. With 0.0.0.0, other machines can connect too.

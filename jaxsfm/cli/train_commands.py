@@ -32,7 +32,7 @@ class Training:
     peakiness: float = 0.0
     """Weight of the part of the loss that makes the random walks more certain."""
     reference: Path | None = None
-    """Reference poses of the photos (Strecha .camera files or a COLMAP model).
+    """Reference poses of the photos, as in reconstruct.
     With them, the training also uses real pairs of photos and their epipolar lines."""
     intrinsics: str | None = None
     """The camera of all photos, needed with --reference. It must have no distortion.

@@ -84,9 +84,12 @@ def _read_llff(path: Path) -> Poses:
     """The poses of the photos in a folder, or in its sub-folder `images`."""
     photos = path.parent / "images" if (path.parent / "images").is_dir() else path.parent
     try:
-        rows = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            rows = np.lib.format.read_array(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise UserError(f"{path}: not a table of poses ({error})") from error
+    if rows.dtype.kind not in "fiu":
+        raise UserError(f"{path}: not a table of poses (no numbers)")
     names = find_images(photos)
     if rows.shape != (len(names), 17) or not np.isfinite(rows[:, :15]).all():
         raise UserError(
@@ -156,10 +159,10 @@ def read_poses(path: Path, *, option: str = "--reference") -> Poses:
             return {file.name.removesuffix(".camera"): _read_strecha(file) for file in cameras}
         if matrices := sorted(folder.glob("*.pose.txt")):
             return {_photo_of(file): _read_matrix(file) for file in matrices}
-        if (folder / LLFF).is_file():
-            return _read_llff(folder / LLFF)
         if _has_model(folder):
             return model_poses(read_model(folder))
+    if (path / LLFF).is_file():  # last: a model beside it has the photos' names
+        return _read_llff(path / LLFF)
     raise UserError(
         f"{option} {path}: no .camera files, .pose.txt files, {LLFF} or COLMAP model in it"
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench import collection
-from jaxsfm.bench.collection import LARGE, cells, model_figures, right_photos
+from jaxsfm.bench.collection import LARGE, Made, cells, model_figures, right_photos
 from jaxsfm.bench.rendered_video import turned
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose
@@ -78,10 +78,17 @@ def test_neighbours_are_judged_within_five_degrees():
     assert shares[1]["pairs_right"] == 1
 
 
-def test_photos_without_a_reference_are_not_judged_and_no_photo_is_right_in_an_empty_model():
+def test_photos_without_a_reference_are_registered_and_not_judged():
     truth = ring(12)
-    model = truth | {"strange.jpg": truth["00.jpg"]}
-    assert "strange.jpg" not in right_photos(model, truth) and right_photos({}, truth) == []
+    model = truth | {"strange.jpg": truth["00.jpg"], "another.jpg": truth["01.jpg"]}
+    row = collection._row("default", 20, Made([Model(model)], {}, None), truth)
+    assert (row["photos"], row["registered"], row["right_in_large"]) == (20, 14, 12)
+    assert row["models"][0]["photos"] == 14 and cells(row)["registered"] == "14 of 20"
+    assert right_photos({}, truth) == []
+    few = {name: truth["00.jpg"] for name in ("a.jpg", "b.jpg", "c.jpg")} | {
+        "00.jpg": truth["00.jpg"]
+    }
+    assert collection._row("default", 20, Made([Model(few)], {}, None), truth)["small_models"] == 1
 
 
 def test_only_large_models_count_and_a_photo_counts_once():
@@ -89,7 +96,7 @@ def test_only_large_models_count_and_a_photo_counts_once():
     names = sorted(truth)
     parts = [names[:LARGE], names[LARGE - 1 : 2 * LARGE - 1], names[20:25], names[28:]]
     models = [Model({n: truth[n] for n in part}) for part in parts]
-    row = collection._row("default", models, truth, {"mapping": 2.0}, "amber")
+    row = collection._row("default", 31, Made(models, {"mapping": 2.0}, "amber"), truth)
     assert row["right_in_large"] == 2 * LARGE - 1
     assert row["registered"] == len(set().union(*parts))
     assert [model["photos"] for model in row["models"]] == [LARGE, LARGE, 5]

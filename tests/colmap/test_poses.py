@@ -235,6 +235,16 @@ def test_a_table_of_llff_that_does_not_fit_the_photos_is_refused(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", np.asarray([{}], object), allow_pickle=True)
     with pytest.raises(UserError, match=r"poses_bounds\.npy: not a table of poses"):
         read_poses(tmp_path)
-    (tmp_path / "poses_bounds.npy").write_bytes(b"")
-    with pytest.raises(UserError, match=r"poses_bounds\.npy: not a table of poses"):
+    for damaged in (b"", b"PK\x03\x04 no archive"):
+        (tmp_path / "poses_bounds.npy").write_bytes(damaged)
+        with pytest.raises(UserError, match=r"poses_bounds\.npy: not a table of poses"):
+            read_poses(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", np.full((5, 17), "one"))
+    with pytest.raises(UserError, match=r"poses_bounds\.npy: not a table of poses \(no numbers\)"):
         read_poses(tmp_path)
+
+
+def test_a_model_beside_a_table_of_llff_is_read_because_it_has_names(tmp_path):
+    write_llff(tmp_path, {f"{i}.jpg": pose for i, pose in enumerate(arc(4))})
+    model = write_model(tmp_path / "sparse" / "0")
+    assert_poses(read_poses(tmp_path), model_poses(model))
