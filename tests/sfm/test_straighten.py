@@ -196,6 +196,13 @@ def test_a_point_that_is_in_no_part_moves_with_the_first_view_that_observes_it(l
     assert np.abs(found.tracks.points[-3:] - wrong.tracks.points[-3:]).max() > 1.0
 
 
+def test_a_point_that_lost_all_its_observations_does_no_harm(long_row):
+    """The filter before an adjustment takes observations out, and leaves points."""
+    seen = long_row.select(long_row.tracks.point != 7)
+    found = straightened(bent(seen, 30.0), error_px=4.0, **HOW)
+    assert found is not None and np.isfinite(found.tracks.points).all()
+
+
 def test_photos_with_few_common_points_do_not_hold_each_other(long_row):
     graph = seen_together(long_row)
     seen = [set(long_row.tracks.point[rows].tolist()) for rows in long_row.rows]

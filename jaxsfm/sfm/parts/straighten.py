@@ -182,11 +182,12 @@ def _put_together(
         points[part.rows] += frames[number].moved_points(part.model.tracks.points)
         times[part.rows] += 1
     points[times > 0] /= times[times > 0, None]
-    for k in np.flatnonzero(times == 0):
-        v = int(tracks.view[tracks.point == k][0])
-        before, after = model.views[v], views[v]
+    first = np.full(len(points), -1)
+    first[tracks.point[::-1]] = tracks.view[::-1]
+    for k in np.flatnonzero((times == 0) & (first >= 0)):
+        before, after = model.views[first[k]], views[first[k]]
         away = before.rotation @ (tracks.points[k] - before.centre)
-        points[k] = after.centre + frames[home[v][0]].scale * after.rotation.T @ away
+        points[k] = after.centre + frames[home[first[k]][0]].scale * after.rotation.T @ away
     return model.with_views(views).with_tracks(tracks._replace(points=points))
 
 
