@@ -86,36 +86,42 @@ class CollectionRow(TypedDict):
     seconds: dict[str, float]
 
 
-def right_photos(model: Poses, truth: Poses) -> list[str]:
-    """The right photos of a model, sorted; all of them have a reference pose.
+def differences(model: Poses, truth: Poses) -> tuple[list[str], np.ndarray]:
+    """How far photos disagree on the rotation between the two worlds.
 
-    The rotation between the two worlds is that of the photo that most photos agree with; of equal
-    ones, the first by name.
+    Returns:
+      the photos of the model that have a reference pose, sorted; float64 (n, n), for each two of
+      them the angle between the rotations that they say, degrees.
     """
     names = pair_names(model, truth)
     ours = sorted(names)
-    if not ours:
+    said = [model[name].rotation.T @ truth[names[name]].rotation for name in ours]
+    between = np.asarray(said).reshape(-1, 3, 3)
+    return ours, rotation_angle_deg(between[:, None], between[None])
+
+
+def right_photos(names: list[str], off: np.ndarray) -> list[str]:
+    """The right ones of some photos, in their order. Arguments are what `differences` returns.
+
+    The rotation between the two worlds is that of the photo that most photos agree with; of equal
+    ones, the first.
+    """
+    if not names:
         return []
-    between = np.stack([model[n].rotation.T @ truth[names[n]].rotation for n in ours])
-    agree = rotation_angle_deg(between[:, None], between[None]) < RIGHT_DEG
-    return [name for name, right in zip(ours, agree[agree.sum(1).argmax()], strict=True) if right]
+    agree = off < RIGHT_DEG
+    return [name for name, right in zip(names, agree[agree.sum(1).argmax()], strict=True) if right]
 
 
 def model_figures(model: "pycolmap.Reconstruction", truth: Poses) -> ModelFigures:
     """Judge a model of three photos or more."""
     poses = model_poses(model)
-    names = pair_names(poses, truth)
-    ours = sorted(names)
-    own = np.stack([poses[n].rotation for n in ours])
-    true = np.stack([truth[names[n]].rotation for n in ours])
-    centres = np.stack([poses[n].centre for n in ours])
+    ours, off = differences(poses, truth)
+    centres = np.stack([poses[name].centre for name in ours])
     far = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     np.fill_diagonal(far, math.inf)
-    between = own.swapaxes(1, 2) @ true
-    off = rotation_angle_deg(between[:, None], between[None])
     return {
         "photos": len(poses),
-        "right": right_photos(poses, truth),
+        "right": right_photos(ours, off),
         "pairs_right": float((off < RIGHT_DEG)[np.triu_indices(len(ours), 1)].mean()),
         "neighbours_right": float(
             (off[np.arange(len(ours)), far.argmin(1)] < NEIGHBOUR_DEG).mean()

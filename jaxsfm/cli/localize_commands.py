@@ -30,8 +30,8 @@ def localize(
       model: The folder of a finished run.
       out: File.json to write: the poses, the numbers of matches that support them, and their
         expected errors.
-      reference: Reference poses (as in reconstruct) of these photos and of
-        the run's photos. With them, the errors of the poses are printed.
+      reference: Reference poses of these photos and of the run's photos, as in reconstruct.
+        With them, the errors of the poses are printed.
       network: The files of the network's parameters. They must be those of the run.
     """
     check_writable(out, "--out", (".json",))

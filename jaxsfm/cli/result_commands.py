@@ -65,8 +65,7 @@ def report(
     Args:
       run: The folder of a run.
       images: The folder of the photos. Without it, the folder in which the run found them.
-      reference: Reference poses, as in reconstruct. Without it, those of the
-        run.
+      reference: Reference poses, as in reconstruct. Without it, those of the run.
       out: File.html to write. Without it, report.html in the folder of the run.
     """
     check_writable(out, "--out", (".html",))
@@ -91,8 +90,7 @@ def view(
     Args:
       run: The folder of a run.
       images: The folder of the photos. Without it, the folder in which the run found them.
-      reference: Reference poses, as in reconstruct. Without it, those of the
-        run.
+      reference: Reference poses, as in reconstruct. Without it, those of the run.
       port: The port of the server. If it is taken, the next free port is used.
       host: The address of the server. With 0.0.0.0, other machines can connect too.
     """

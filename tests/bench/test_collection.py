@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxsfm.bench import collection
-from jaxsfm.bench.collection import LARGE, Made, cells, model_figures, right_photos
+from jaxsfm.bench.collection import LARGE, Made, cells, differences, model_figures, right_photos
 from jaxsfm.bench.rendered_video import turned
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose
@@ -66,7 +66,7 @@ def test_of_two_groups_that_are_turned_against_each_other_the_larger_one_is_righ
 def test_a_photo_is_right_within_ten_degrees(degrees, right):
     truth = ring(12)
     off = moved({"05.jpg": truth["05.jpg"]}, 70.0 + degrees)
-    assert len(right_photos(moved(truth, 70.0) | off, truth)) == right
+    assert len(right_photos(*differences(moved(truth, 70.0) | off, truth))) == right
 
 
 def test_neighbours_are_judged_within_five_degrees():
@@ -84,7 +84,7 @@ def test_photos_without_a_reference_are_registered_and_not_judged():
     row = collection._row("default", 20, Made([Model(model)], {}, None), truth)
     assert (row["photos"], row["registered"], row["right_in_large"]) == (20, 14, 12)
     assert row["models"][0]["photos"] == 14 and cells(row)["registered"] == "14 of 20"
-    assert right_photos({}, truth) == []
+    assert right_photos(*differences({}, truth)) == []
     few = {name: truth["00.jpg"] for name in ("a.jpg", "b.jpg", "c.jpg")} | {
         "00.jpg": truth["00.jpg"]
     }

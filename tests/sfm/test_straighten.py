@@ -124,6 +124,16 @@ def test_only_long_rows_are_straightened():
     assert straightened(bent(short, 30.0), error_px=4.0, **HOW) is None
 
 
+def test_rows_that_nothing_connects_stay_as_they_are(long_row):
+    """Each of them is long, but nothing says how they lie to each other."""
+    middle = len(long_row.views) // 2
+    across = np.zeros((len(long_row.tracks.points), 2), bool)
+    across[long_row.tracks.point, (long_row.tracks.view < middle).astype(int)] = True
+    torn = long_row.select(~across.all(1)[long_row.tracks.point])
+    assert hops(seen_together(row(middle))) >= LONG
+    assert straightened(torn, error_px=4.0, **HOW) is None
+
+
 def test_a_row_whose_parts_do_not_fit_together_stays_as_it_is(long_row, monkeypatch):
     found = straighten.common_frames
 

@@ -49,21 +49,32 @@ def merged(models: Sequence[Model], frames: Mapping[int, Similarity]) -> Model:
 
 def _views(models: Sequence[Model], frames: Mapping[int, Similarity]) -> list[View]:
     """The photos in the frame of the result, in the order of their ids."""
-    best: dict[str, tuple[int, View]] = {}
+    chosen = {number: models[number] for number in sorted(frames)}
     cameras = {}
-    for number in sorted(frames):
-        model = models[number]
+    for model in chosen.values():
+        for view in model.views:
+            cameras.setdefault(view.camera.camera_id, view.camera)
+    found = []
+    for number, view in homes(chosen).values():
+        pose = frames[number].moved(CameraPose(view.rotation, view.centre))
+        camera = cameras[view.camera.camera_id]
+        found.append(
+            dataclasses.replace(view, rotation=pose.rotation, centre=pose.centre, camera=camera)
+        )
+    return sorted(found, key=lambda view: view.image_id)
+
+
+def homes(models: Mapping[int, Model]) -> dict[str, tuple[int, View]]:
+    """For each photo, the number of the model in which it has most observations, the first of equal
+    ones, and its view there."""
+    most: dict[str, int] = {}
+    found: dict[str, tuple[int, View]] = {}
+    for number, model in models.items():
         seen = np.bincount(model.tracks.view, minlength=len(model.views))
-        for k, view in enumerate(model.views):
-            camera = cameras.setdefault(view.camera.camera_id, view.camera)
-            if view.name in best and best[view.name][0] >= seen[k]:
-                continue
-            pose = frames[number].moved(CameraPose(view.rotation, view.centre))
-            moved = dataclasses.replace(
-                view, rotation=pose.rotation, centre=pose.centre, camera=camera
-            )
-            best[view.name] = (int(seen[k]), moved)
-    return sorted((view for _, view in best.values()), key=lambda view: view.image_id)
+        for view, count in zip(model.views, seen.tolist(), strict=True):
+            if count > most.get(view.name, -1):
+                most[view.name], found[view.name] = count, (number, view)
+    return found
 
 
 def _joined_tracks(tracks: Tracks) -> Tracks:

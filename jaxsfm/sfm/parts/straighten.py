@@ -8,6 +8,7 @@ small (docs/decisions/many-photos.md).
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from jaxsfm.colmap.view import View
 from jaxsfm.sfm.evaluation import Similarity, umeyama
 from jaxsfm.sfm.model_join import MIN_SHARED
 from jaxsfm.sfm.parts.frames import SharedPoints, common_frames
+from jaxsfm.sfm.parts.merge import homes
 from jaxsfm.sfm.parts.partition import Graph, overlapping_parts
 
 TOGETHER = 20
@@ -59,7 +61,8 @@ def straightened(model: Model, *, error_px: float, loss_px: float, threads: int)
       loss_px, threads: as in `jaxsfm.colmap.bundle_adjustment`.
     """
     graph = seen_together(model)
-    if hops(graph) < LONG or connected_components(graph.weights, directed=False)[0] > 1:
+    groups, _ = connected_components(graph.weights, directed=False)
+    if groups != 1 or hops(graph) < LONG:
         return None
     parts = [
         _adjusted(model, names, loss_px=loss_px, threads=threads)
@@ -75,7 +78,8 @@ def straightened(model: Model, *, error_px: float, loss_px: float, threads: int)
     frames, *others = common_frames(len(parts), shared)
     if others:
         return None
-    home = _homes(model, parts)
+    of_photo = homes({number: part.model for number, part in enumerate(parts)})
+    home = [of_photo[view.name] for view in model.views]
     whole = _put_together(model, parts, frames, home)
     return whole if _stays_tied(model, whole, home, error_px) else None
 
@@ -100,14 +104,9 @@ def seen_together(model: Model) -> Graph:
 
 
 def hops(graph: Graph) -> int:
-    """The steps from photo to photo between the two ends of a graph, as far as photos are
-    connected with the first one."""
-    if not graph.names:
-        return 0
-    reached = dijkstra(graph.weights, directed=False, indices=0, unweighted=True)
-    end = int(np.where(np.isfinite(reached), reached, -1).argmax())
-    back = dijkstra(graph.weights, directed=False, indices=end, unweighted=True)
-    return int(back[np.isfinite(back)].max())
+    """The steps from photo to photo between the two ends of a graph whose photos are connected."""
+    steps = functools.partial(dijkstra, graph.weights, directed=False, unweighted=True)
+    return int(steps(indices=int(steps(indices=0).argmax())).max())
 
 
 def shared_views(first: Sequence[View], second: Sequence[View]) -> SharedPoints | None:
@@ -148,17 +147,6 @@ def _adjusted(model: Model, names: Sequence[str], *, loss_px: float, threads: in
     return _Part(Model.from_colmap(made, model.sizes), rows[kept])
 
 
-def _homes(model: Model, parts: Sequence[_Part]) -> list[tuple[int, View]]:
-    """For each view of the row, the part in which it has most observations, and its view there."""
-    best: dict[str, tuple[int, int, View]] = {}
-    for number, part in enumerate(parts):
-        seen = np.bincount(part.model.tracks.view, minlength=len(part.model.views))
-        for view, count in zip(part.model.views, seen.tolist(), strict=True):
-            if view.name not in best or best[view.name][0] < count:
-                best[view.name] = (count, number, view)
-    return [best[view.name][1:] for view in model.views]
-
-
 def _put_together(
     model: Model,
     parts: Sequence[_Part],
@@ -168,6 +156,9 @@ def _put_together(
     """The row with the poses of its parts, and with points in the middle of where parts have them.
 
     A point that is in no part keeps its place before the first view that observes it.
+
+    Args:
+      home: for each view of the row, the number of its part, and its view there (`homes`).
     """
     poses = [
         frames[number].moved(CameraPose(there.rotation, there.centre)) for number, there in home

@@ -195,9 +195,10 @@ def _adjust(
     # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
     for slack in (4.0, 1.0):
         good = model.errors_px() < slack * limit[model.tracks.view]
+        model = model.select(good)
         if slack > 1:
             straight = straightened(
-                model.select(good),
+                model,
                 error_px=settings.refinement.max_error_px,
                 loss_px=loss_px,
                 threads=settings.threads,
@@ -205,7 +206,7 @@ def _adjust(
             if straight is not None:
                 model = straight
                 continue
-        reconstruction = model.select(good).to_colmap()
+        reconstruction = model.to_colmap()
         if reconstruction.num_points3D() < MIN_POINTS:
             return None
         bundle_adjust(
