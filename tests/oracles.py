@@ -352,6 +352,43 @@ def bundle_adjustment(cameras, points: np.ndarray, xy: np.ndarray, weight: np.nd
     return rotations, shifts / length, points / length, error
 
 
+# -- view graph ----------------------------------------------------------------------------------
+
+
+def grown_rotations(pairs: dict, most_votes: int, tolerance_deg: float) -> list[dict]:
+    """Rotations of images (world to camera) in groups that pairs join, the strongest pair first.
+
+    Where two groups meet, every pair between them is looked up anew, and votes on the rotation from
+    the world of the one to that of the other.
+
+    Args:
+      pairs: by two names, the rotation from the first camera to the second (scipy's), and the
+        vote. The strongest pair comes first.
+    """
+    groups = [{name: Rotation.identity()} for name in sorted({each for p in pairs for each in p})]
+    for pair in pairs:
+        one, other = (next(g for g in groups if name in g) for name in pair)
+        if one is other:
+            continue
+        moves = []
+        for (a, b), (relative, vote) in pairs.items():
+            if a in one and b in other:
+                moves.append((one[a].inv() * relative.inv() * other[b], vote))
+            elif a in other and b in one:
+                moves.append((one[b].inv() * relative * other[a], vote))
+        moves = moves[:most_votes]
+        agreeing = [
+            [(r, w) for r, w in moves if np.degrees((move.inv() * r).magnitude()) < tolerance_deg]
+            for move, _ in moves
+        ]
+        won = max(agreeing, key=lambda each: sum(w for _, w in each))
+        rotations, weights = zip(*won, strict=True)
+        move = Rotation.concatenate(rotations).mean(weights)
+        groups = [g for g in groups if g is not one and g is not other]
+        groups.append({**one, **{name: r * move.inv() for name, r in other.items()}})
+    return groups
+
+
 # -- checks of models ------------------------------------------------------------------------------
 
 

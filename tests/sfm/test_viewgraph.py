@@ -1,14 +1,17 @@
 """Laws of the view graph: which pairs are trusted."""
 
 import itertools
+from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from oracles import grown_rotations
 from scipy.spatial.transform import Rotation
 from strategies import rng_of, seeds
 
 from jaxsfm.colmap.two_views import PairGeometry, spread
+from jaxsfm.sfm import view_graph
 from jaxsfm.sfm.view_graph import (
     STEEPNESS,
     STRONG,
@@ -151,6 +154,33 @@ def test_a_strong_pair_needs_a_right_rotation_only_where_it_is_asked_for():
     assert [pair for pair, verdict in strict.items() if not verdict.trusted] == [false]
     assert strict[false].strength > STRONG and "deg" in strict[false].reason
     assert not any(verdict.refuted for verdict in strict.values())
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds)
+def test_groups_that_pairs_join_are_those_of_a_search_through_all_pairs(seed):
+    """Groups of all sizes meet; four of ten pairs are false, and few vote, so it is close."""
+    rng = rng_of(seed)
+    names = [f"{k:02d}" for k in range(16)]
+    rotations = dict(zip(names, Rotation.random(16, rng), strict=True))
+    chosen = [p for p in itertools.combinations(names, 2) if rng.random() < 0.4]
+    rng.shuffle(chosen)
+    pairs = {}
+    for a, b in map(tuple, chosen):
+        turn = Rotation.from_rotvec([0, 2, 0]) if rng.random() < 0.4 else Rotation.identity()
+        noise = Rotation.from_rotvec(rng.normal(0, 0.02, 3))
+        pairs[a, b] = (noise * rotations[b] * turn * rotations[a].inv(), float(rng.uniform(1, 2)))
+    expected = grown_rotations(pairs, 5, view_graph.TOLERANCE_DEG)
+    with mock.patch.object(view_graph, "MAX_VOTES", 5):
+        found = view_graph._grow(
+            list(pairs),
+            {p: PairGeometry(num_inliers=1, rotation=r.as_matrix()) for p, (r, _) in pairs.items()},
+            {p: vote for p, (_, vote) in pairs.items()},
+        )
+    assert sum(map(len, expected)) == len(found)
+    for group in expected:
+        worlds = [found[name].T @ rotation.as_matrix() for name, rotation in group.items()]
+        np.testing.assert_allclose(worlds, worlds[:1] * len(worlds), atol=1e-9)
 
 
 def test_many_pairs_between_two_groups_stay_cheap():
