@@ -4,15 +4,19 @@ Such a reference has errors of its own, and often comes from another program. So
 compared. A photo of a model is *right* if its rotation is that of the reference, up to the one
 rotation between the two worlds that most of the model's photos agree on. Groups that were joined
 wrongly are turned against each other, and only one of them is right.
+
+Some photos can be kept out of the models, and added to the largest one by `extend`.
 """
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
+from jaxsfm.bench.frames import chosen_frames, linked
 from jaxsfm.bench.model_options import CollectionOptions
 from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
@@ -23,9 +27,10 @@ from jaxsfm.config import preset
 from jaxsfm.io.pairs import Pair
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.verdict import VerdictColour
+from jaxsfm.runs.extend import extend_run
 from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
-from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.runs.run_options import LocalizeOptions, RunOptions
 from jaxsfm.sfm.evaluation import pair_names
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
@@ -58,6 +63,16 @@ class ModelFigures(TypedDict):
     """The mean reprojection error, original pixels."""
 
 
+class ExtensionFigures(TypedDict):
+    """What became of the photos that were kept out and then added."""
+
+    photos: int
+    placed: int
+    right: list[str]
+    """The names of the right ones, sorted; without a reference pose, a photo is not right."""
+    seconds: float
+
+
 class Made(NamedTuple):
     """What a method made of a collection."""
 
@@ -65,6 +80,7 @@ class Made(NamedTuple):
     """The one with most photos first."""
     seconds: dict[str, float]
     verdict: VerdictColour | None
+    extension: ExtensionFigures | None = None
 
 
 class CollectionRow(TypedDict):
@@ -84,6 +100,8 @@ class CollectionRow(TypedDict):
     verdict: VerdictColour | None
     """None: the method gives none."""
     seconds: dict[str, float]
+    extension: ExtensionFigures | None
+    """None: no photo was kept out, or the method cannot add photos to a model."""
 
 
 def differences(model: Poses, truth: Poses) -> tuple[list[str], np.ndarray]:
@@ -147,27 +165,54 @@ def _row(method: str, photos: int, made: Made, truth: Poses) -> CollectionRow:
         "right_in_large": len({n for m in judged if m["photos"] >= LARGE for n in m["right"]}),
         "verdict": made.verdict,
         "seconds": made.seconds,
+        "extension": made.extension,
+    }
+
+
+def _extended(work: Path, every: Path, added: set[str], truth: Poses) -> ExtensionFigures:
+    """Add photos to the largest model of a run, and judge them in it.
+
+    Args:
+      every: a folder of the run's photos and the added ones.
+    """
+    seconds: dict[str, float] = {}
+    with timed(seconds, "extension"):
+        extend_run(work, options=LocalizeOptions(images=every, progress=True))
+    poses = model_poses(read_model(work / "sparse" / "0"))
+    return {
+        "photos": len(added),
+        "placed": len(poses.keys() & added),
+        "right": [n for n in right_photos(*differences(poses, truth)) if n in added],
+        "seconds": seconds["extension"],
     }
 
 
 def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Iterator[CollectionRow]:
     """A row for each method; presets come first, because they choose the pairs."""
     pairs: set[Pair] = set()
-    photos = len(open_images(options.root)[0])
+    folder, out, added = options.root, options.out, []
+    if options.extend:
+        mapped, added = chosen_frames(options.root, 1, options.extend)
+        out = options.out / f"extend-{options.extend}"
+        folder = linked(mapped, out / "photos")
+    photos = len(open_images(folder)[0])
     for method in methods:
-        work = options.out / method
+        work = out / method
         if method in OTHERS:
             database = work / "database.db"
-            seconds = write_other_matches(database, options.root, method, pairs, Cameras())
+            seconds = write_other_matches(database, folder, method, pairs, Cameras())
             with timed(seconds, "mapping"):
                 models = first_models(database, MapOptions(refine_intrinsics=True)).models
             made = Made(models, seconds, None)
         else:
             given = RunOptions(pairs=options.pairs, progress=True)
-            report = reconstruct_folder(options.root, work, config=preset(method), options=given)
+            report = reconstruct_folder(folder, work, config=preset(method), options=given)
             pairs = {each.pair for each in report.pairs.each}
             models = [read_model(work / "sparse" / str(k)) for k in range(len(report.models))]
             made = Made(models, dict(report.seconds), report.verdict)
+            if added:
+                names = {path.name for path in added}
+                made = made._replace(extension=_extended(work, options.root, names, truth))
         yield _row(method, photos, made, truth)
 
 
@@ -205,6 +250,11 @@ def cells(row: CollectionRow) -> Cells:
             "points": str(first["points"]),
             "error px": f"{first['error_px']:.2f}",
         }
+    if extended := row["extension"]:
+        found["added"] = (
+            f"{len(extended['right'])} of {extended['placed']} of {extended['photos']}, "
+            f"{extended['seconds']:.0f} s"
+        )
     return found | {
         "verdict": row["verdict"] or "",
         "seconds": f"{sum(row['seconds'].values()):.0f}",
@@ -221,4 +271,5 @@ def table_lines(result: BenchFigures[CollectionRow, dict[str, int]]) -> list[str
         "pairs, neighbours: of the largest model, the pairs of cameras that are turned rightly "
         f"within {RIGHT_DEG:g} deg, and the cameras that are so beside the nearest one, within "
         f"{NEIGHBOUR_DEG:g} deg.",
+        "added: with --extend, the right ones of the placed ones of the photos that were kept out.",
     ]

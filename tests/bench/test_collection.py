@@ -110,6 +110,13 @@ def test_rootsift_needs_a_preset_which_chooses_the_pairs(tmp_path, capsys):
     assert "rootsift needs a preset beside it" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("extend", ["1", "-2"])
+def test_each_second_photo_or_fewer_can_be_kept_out(extend, tmp_path, capsys):
+    both = ["--root", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main(["bench", "collection", *both, "--extend", extend]) == 2
+    assert f"--extend must be 0, or at least 2; got {extend}" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_street_is_right_beside_rootsift_on_the_same_pairs(street, tmp_path, monkeypatch):
     monkeypatch.undo()
@@ -122,3 +129,18 @@ def test_a_street_is_right_beside_rootsift_on_the_same_pairs(street, tmp_path, m
     assert ours["registered"] == ours["right_in_large"] == ours["photos"] == 11
     assert ours["verdict"] in ("green", "amber") and theirs["verdict"] is None
     assert theirs["registered"] >= 3
+
+
+@pytest.mark.slow
+def test_photos_that_were_kept_out_are_added_and_judged(street, tmp_path, monkeypatch):
+    monkeypatch.undo()
+    figures = tmp_path / "figures.json"
+    given = ["--root", str(street / "images"), "--reference", str(street / "reference")]
+    end = ["--methods", "default", "--extend", "4", "--out", str(tmp_path), "--json", str(figures)]
+    assert main(["bench", "collection", *given, *end]) == 0
+    row = json.loads(figures.read_text())["rows"][0]
+    assert row["photos"] == row["registered"] == 8
+    assert (row["extension"]["photos"], row["extension"]["placed"]) == (3, 3)
+    kept_out = sorted(path.name for path in (street / "images").iterdir())[2::4]
+    assert row["extension"]["right"] == kept_out
+    assert cells(row)["added"].startswith("3 of 3 of 3, ")
