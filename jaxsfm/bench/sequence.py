@@ -25,7 +25,7 @@ from jaxsfm.colmap.inliers import read_inliers
 from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import first_models
-from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import preset
@@ -187,7 +187,7 @@ def _placed_by_matches(
             seed=0,
         )
         if at is not None:
-            pose = to_truth.moved(CameraPose(at.rotation, at.centre))
+            pose = to_truth.moved(at.pose)
             found[frame.name] = pose_error(pose, given.truth[frame.stem])
     return found
 

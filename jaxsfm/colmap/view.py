@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.io.pixels import Pixels
 
 
@@ -47,6 +48,15 @@ class View:
             pixels=pixels,
             size=size,
         )
+
+    @property
+    def pose(self) -> CameraPose:
+        """Where the camera stands, and how it is turned."""
+        return CameraPose(self.rotation, self.centre)
+
+    def at(self, pose: CameraPose) -> "View":
+        """The same view with another pose."""
+        return dataclasses.replace(self, rotation=pose.rotation, centre=pose.centre)
 
     @property
     def mean_scale(self) -> float:

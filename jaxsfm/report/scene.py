@@ -79,12 +79,6 @@ def _upright(poses: list[CameraPose]) -> np.ndarray:
     return np.stack([right, np.cross(up, right), up])
 
 
-def _moved(pose: CameraPose, by: Similarity) -> CameraPose:
-    """A pose after a similarity of the world."""
-    centre = by.scale * by.rotation @ pose.centre + by.translation
-    return CameraPose(pose.rotation @ by.rotation.T, centre)
-
-
 def _depth(centres: np.ndarray, extent: float) -> float:
     """The depth of a frustum with which cameras neither touch each other nor vanish."""
     nearest = extent
@@ -100,7 +94,7 @@ def shown_scene(run: FinishedRun) -> Scene:
     model = run.model
     own = Similarity(1.0, np.eye(3), np.zeros(3))
     to_reference = run.reference.similarity if run.reference else own
-    poses = [_moved(CameraPose(v.rotation, v.centre), to_reference) for v in model.views]
+    poses = [to_reference.moved(view.pose) for view in model.views]
     # The float32 of a browser has too few digits for geographic coordinates: move to the origin.
     known = run.report.in_metres and run.reference is None
     upright = np.eye(3) if known else _upright(poses)
@@ -108,7 +102,7 @@ def shown_scene(run: FinishedRun) -> Scene:
     corners = [_corners(view) for view in model.views]
 
     def camera(name: str, pose: CameraPose, at: np.ndarray) -> ShownCamera:
-        turned = _moved(pose, turn)
+        turned = turn.moved(pose)
         return ShownCamera(name, turned, at @ turned.rotation)
 
     cameras = [

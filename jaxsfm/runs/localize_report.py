@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Literal, get_args
 
-from jaxsfm.colmap.poses import CameraPose, Poses
+from jaxsfm.colmap.poses import Poses
 from jaxsfm.colmap.view import View
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
@@ -149,10 +149,10 @@ def error_against(
     partner = pair_names([name], reference).get(name)
     if partner is None:
         return None
-    poses = {each.name: CameraPose(each.rotation, each.centre) for each in views}
+    poses = {each.name: each.pose for each in views}
     known = pair_names(poses, reference)
     others = {other: poses[other] for other in known if known[other] != partner}
-    both = {**others, name: CameraPose(view.rotation, view.centre)}
+    both = {**others, name: view.pose}
     try:
         return evaluate(both, reference, align_on=sorted(others)).images[name]
     except UserError:  # there are too few others, or they lie on one line

@@ -120,11 +120,6 @@ def find_frame(
     return CommonFrame(best, agree)
 
 
-def moved_points(points: np.ndarray, by: Similarity) -> np.ndarray:
-    """World points (n, 3) after a similarity."""
-    return by.scale * points @ by.rotation.T + by.translation
-
-
 def _agree(
     first: Model, second: Model, points: CommonPoints, by: Similarity, error_px: float
 ) -> np.ndarray:
@@ -134,7 +129,7 @@ def _agree(
     place[points.first] = np.arange(count)
     rows = np.flatnonzero(place[tracks.point] >= 0)
     point = place[tracks.point[rows]]
-    at = moved_points(second.tracks.points[points.second], by)
+    at = by.moved_points(second.tracks.points[points.second])
     errors = first.with_tracks(Tracks(at, point, tracks.view[rows], tracks.xy[rows])).errors_px()
     total = np.bincount(point, errors, count)
     return total < error_px * np.bincount(point, minlength=count)

@@ -10,7 +10,7 @@ from jaxsfm.colmap.model import Model, point_colours, stored_sizes
 from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import named
-from jaxsfm.sfm.common_frame import CommonFrame, moved_points
+from jaxsfm.sfm.common_frame import CommonFrame
 from jaxsfm.sfm.evaluation import pose_error
 from jaxsfm.sfm.model_join import ERROR_PX, adjusted, find_join, joined
 from jaxsfm.sfm.old_frame import move_back
@@ -78,7 +78,7 @@ def merge_models(
     b = _with_new_ids(b, max(view.image_id for view in a.views) + 1)
     both = joined(a, b, join, joined_cameras(a, b, shared))
     colours = np.concatenate([point_colours(first), point_colours(second)])
-    before = [a.tracks.points, moved_points(b.tracks.points, join.frame.similarity)]
+    before = [a.tracks.points, join.frame.similarity.moved_points(b.tracks.points)]
     model = adjusted(both, error_px=error_px, refine_intrinsics=refine_intrinsics, threads=threads)
     move_back(model, model_poses(first))
     coloured(model, np.concatenate(before), colours)
@@ -93,8 +93,7 @@ def _with_new_ids(model: Model, start: int) -> Model:
 
 
 def _pose(model: Model, name: str) -> CameraPose:
-    view = next(view for view in model.views if view.name == name)
-    return CameraPose(view.rotation, view.centre)
+    return next(view for view in model.views if view.name == name).pose
 
 
 def _elsewhere(a: Model, b: Model, shared: list[str], frame: CommonFrame) -> list[str]:

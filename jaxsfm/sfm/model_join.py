@@ -8,14 +8,12 @@ import numpy as np
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.sfm.common_frame import (
     CommonFrame,
     CommonPoints,
     common_points,
     find_frame,
-    moved_points,
 )
 
 if TYPE_CHECKING:
@@ -87,17 +85,15 @@ def joined(
         if view.name in number:
             place[k] = number[view.name]
             continue
-        pose = frame.similarity.moved(CameraPose(view.rotation, view.centre))
         place[k] = len(views)
-        camera = cameras[view.camera.camera_id]
-        moved = dataclasses.replace(view, rotation=pose.rotation, centre=pose.centre, camera=camera)
-        views.append(moved)
+        moved = view.at(frame.similarity.moved(view.pose))
+        views.append(dataclasses.replace(moved, camera=cameras[view.camera.camera_id]))
     same = join.points.select(frame.agree)
     target = np.full(len(second.tracks.points), -1)
     target[same.second] = same.first
     alone = np.flatnonzero(target < 0)
     target[alone] = len(first.tracks.points) + np.arange(len(alone))
-    added = moved_points(second.tracks.points[alone], frame.similarity)
+    added = frame.similarity.moved_points(second.tracks.points[alone])
     point, view = target[second.tracks.point], place[second.tracks.view]
     taken = first.tracks.point * len(views) + first.tracks.view
     new = np.flatnonzero(~np.isin(point * len(views) + view, taken))

@@ -12,7 +12,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.sfm.evaluation import Similarity
@@ -56,11 +55,8 @@ def _views(models: Sequence[Model], frames: Mapping[int, Similarity]) -> list[Vi
             cameras.setdefault(view.camera.camera_id, view.camera)
     found = []
     for number, view in homes(chosen).values():
-        pose = frames[number].moved(CameraPose(view.rotation, view.centre))
-        camera = cameras[view.camera.camera_id]
-        found.append(
-            dataclasses.replace(view, rotation=pose.rotation, centre=pose.centre, camera=camera)
-        )
+        moved = view.at(frames[number].moved(view.pose))
+        found.append(dataclasses.replace(moved, camera=cameras[view.camera.camera_id]))
     return sorted(found, key=lambda view: view.image_id)
 
 

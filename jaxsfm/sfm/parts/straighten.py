@@ -7,7 +7,6 @@ itself, and the parts are put together by the photos that they share. What is le
 small (docs/decisions/many-photos.md).
 """
 
-import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -18,7 +17,6 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.view import View
 from jaxsfm.sfm.evaluation import Similarity, umeyama
 from jaxsfm.sfm.model_join import MIN_SHARED
@@ -160,12 +158,9 @@ def _put_together(
     Args:
       home: for each view of the row, the number of its part, and its view there (`homes`).
     """
-    poses = [
-        frames[number].moved(CameraPose(there.rotation, there.centre)) for number, there in home
-    ]
     views = [
-        dataclasses.replace(view, rotation=pose.rotation, centre=pose.centre)
-        for view, pose in zip(model.views, poses, strict=True)
+        view.at(frames[number].moved(there.pose))
+        for view, (number, there) in zip(model.views, home, strict=True)
     ]
     tracks, points = model.tracks, np.zeros_like(model.tracks.points)
     times = np.zeros(len(points))
