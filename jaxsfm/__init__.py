@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxsfm.colmap.cameras import Cameras as Cameras
-    from jaxsfm.colmap.intrinsics import parse_intrinsics as parse_intrinsics
+    from jaxsfm.colmap.given_cameras import parse_intrinsics as parse_intrinsics
     from jaxsfm.colmap.map_options import MapOptions as MapOptions
     from jaxsfm.colmap.poses import model_poses as model_poses
     from jaxsfm.colmap.poses import read_poses as read_poses
@@ -45,7 +45,7 @@ _HOME = {
     "Execution": "matching.execution",
     "Cameras": "colmap.cameras",
     "MapOptions": "colmap.mapper",
-    "parse_intrinsics": "colmap.intrinsics",
+    "parse_intrinsics": "colmap.given_cameras",
     "PairResult": "io.pairs",
     "best_pairs": "io.pairs",
     "exhaustive_pairs": "io.pairs",

@@ -18,15 +18,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.bench.scenes import PHOTOS, Scene, Subset, inspected, reference_of
-from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, parse_intrinsics
+from jaxsfm.colmap.given_cameras import read_camera_list
+from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
 from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import ImageFile
 
 PAIRS = "image_pairs_to_match.txt"
-Camera = tuple[Intrinsics, tuple[int, int]]
-"""A camera, and the (width, height) of its images."""
 NVM_COLUMNS = 11
 """NAME, focal length, quaternion (w, x, y, z), centre, distortion, 0."""
 
@@ -90,7 +89,7 @@ def read_nvm(path: Path) -> Poses:
     return poses
 
 
-def read_reference(root: Path) -> tuple[Poses, dict[str, Camera]]:
+def read_reference(root: Path) -> tuple[Poses, dict[str, Intrinsics]]:
     """The poses of the database photos, and their cameras if the model is one of COLMAP.
 
     Raises:
@@ -103,8 +102,11 @@ def read_reference(root: Path) -> tuple[Poses, dict[str, Camera]]:
         cameras = {}
         for image in (model.image(k) for k in model.reg_image_ids()):
             camera = model.cameras[image.camera_id]
-            known = Intrinsics(model=camera.model_name, params=tuple(camera.params))
-            cameras[image.name] = (known, (camera.width, camera.height))
+            cameras[image.name] = Intrinsics(
+                model=camera.model_name,
+                params=tuple(camera.params),
+                size=(camera.width, camera.height),
+            )
         return model_poses(model), cameras
     files = sorted(folder.rglob("*.nvm"))
     if not files:
@@ -112,7 +114,7 @@ def read_reference(root: Path) -> tuple[Poses, dict[str, Camera]]:
     return read_nvm(files[0]), {}
 
 
-def read_cameras(root: Path) -> dict[str, Camera]:
+def read_cameras(root: Path) -> dict[str, Intrinsics]:
     """The cameras of all lists of intrinsics, by photo.
 
     Raises:
@@ -120,36 +122,23 @@ def read_cameras(root: Path) -> dict[str, Camera]:
     """
     name = "*intrinsics*.txt"
     lists = [*root.glob(name), *root.glob(f"quer*/{name}"), *(root / "3D-models").rglob(name)]
-    cameras = {}
+    cameras: dict[str, Intrinsics] = {}
     for path in sorted(lists):
-        for words in _lines(path, "--root"):
-            try:
-                photo, model, width, height, *params = words
-                known = parse_intrinsics(f"{model}:{','.join(params)}")
-                cameras[photo] = (known, (int(width), int(height)))
-            except (ValueError, UserError) as error:
-                raise UserError(
-                    f"--root: {path} must have lines of NAME MODEL w h params; got {words}"
-                ) from error
+        cameras |= read_camera_list(path, "--root")
     return cameras
 
 
 def _known_cameras(
-    root: Path, images: Mapping[str, ImageFile], cameras: Mapping[str, Camera]
+    root: Path, images: Mapping[str, ImageFile], cameras: Mapping[str, Intrinsics]
 ) -> dict[str, Intrinsics]:
     """The cameras of the photos that are used, after a check of their sizes."""
-    for name, image in images.items():
+    for name in images:
         if name not in cameras:
             raise UserError(
                 f"--root {root}: no intrinsics of {name}; expected a line NAME MODEL w h params in "
                 "queries/night_time_queries_with_intrinsics.txt or database_intrinsics.txt"
             )
-        if cameras[name][1] != image.size:
-            raise UserError(
-                f"--root {root}: {name} has {image.size[0]} x {image.size[1]} pixels, its "
-                f"intrinsics are for {cameras[name][1][0]} x {cameras[name][1][1]}"
-            )
-    known = {name: cameras[name][0] for name in images}
+    known = {name: cameras[name] for name in images}
     try:
         check_fits(known, {name: image.size for name, image in images.items()})
     except UserError as error:

@@ -194,7 +194,7 @@ def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Itera
     if options.extend:
         mapped, added = chosen_frames(options.root, 1, options.extend)
         out = options.out / f"extend-{options.extend}"
-        folder = linked(mapped, out / "photos")
+        folder = linked(options.root, (path.name for path in mapped), out / "photos")
     photos = len(open_images(folder)[0])
     for method in methods:
         work = out / method

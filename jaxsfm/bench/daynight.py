@@ -14,11 +14,11 @@ from jaxsfm.bench import scenes
 from jaxsfm.bench.aachen import PAIRS, aachen_scene, write_submission
 from jaxsfm.bench.curves import write_curves
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
-from jaxsfm.bench.methods import RUN_METHODS
+from jaxsfm.bench.methods import NAIVE, RUN_METHODS
 from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night_protocol import LIMITS, SubsetRow, Summary, judge, limit_name, summary
 from jaxsfm.bench.scenes import Scene
-from jaxsfm.bench.subset_models import dense_models, rootsift_models
+from jaxsfm.bench.subset_models import dense_models, naive_models, rootsift_models
 from jaxsfm.errors import UserError
 
 PUBLISHED = {
@@ -118,6 +118,8 @@ def _row(
     start = time.monotonic()
     if method == "rootsift":
         models = rootsift_models(scene, scratch, options)
+    elif method == NAIVE:
+        models = naive_models(scene, scratch, options)
     else:
         models = dense_models(scene, scratch, method, options)
     subsets = [

@@ -24,7 +24,7 @@ from jaxsfm.bench.memory import peak_bytes
 from jaxsfm.bench.simulated import SimulatedStreet
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.store import Store

@@ -1,6 +1,7 @@
 """The frames of a video with reference poses that a benchmark uses, and their camera."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,12 +35,13 @@ def chosen_frames(folder: Path, every: int, localize: int) -> Frames:
     return Frames([path for path in frames if path not in out], out)
 
 
-def linked(frames: list[Path], folder: Path) -> Path:
-    """A folder with links to some frames."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for frame in frames:
-        if not (folder / frame.name).exists():
-            os.symlink(frame.absolute(), folder / frame.name)
+def linked(photos: Path, names: Iterable[str], folder: Path) -> Path:
+    """A folder with links to some photos of another one, by their paths below it."""
+    for name in names:
+        link = folder / name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        if not link.exists():
+            os.symlink((photos / name).absolute(), link)
     return folder
 
 

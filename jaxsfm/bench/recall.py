@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.options import RecallOptions, whole_numbers
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.poses import find_model, read_model, read_poses
 from jaxsfm.colmap.view import View
 from jaxsfm.errors import UserError

@@ -19,7 +19,8 @@ from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night import synthetic_night
 from jaxsfm.bench.strecha_sets import strecha_intrinsics
 from jaxsfm.bench.synthetic import write_photo
-from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, check_fits, parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_cameras, parse_intrinsics
+from jaxsfm.colmap.intrinsics import KnownCameras, check_fits
 from jaxsfm.colmap.poses import Poses, read_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, inspect_image, read_image
@@ -84,13 +85,13 @@ def synthetic_scene(folder: Path, target: Path, options: DayNightOptions) -> Sce
     return Scene(target, images, subsets, truth, camera, True)
 
 
-def _known_camera(path: Path, images: dict[str, ImageFile]) -> Intrinsics | None:
+def _known_camera(path: Path, images: dict[str, ImageFile]) -> KnownCameras | None:
     """Read a camera from a file with MODEL:p1,p2,.. or a 3 x 3 matrix; None without the file."""
     if not path.is_file():
         return None
     try:
         text = path.read_text(encoding="utf-8").strip()
-        found = parse_intrinsics(text if ":" in text else str(path))
+        found = parse_intrinsics(text) if ":" in text else parse_cameras(str(path))
         check_fits(found, {name: image.size for name, image in images.items()})
     except (OSError, UnicodeDecodeError, UserError) as error:
         why = str(error).removeprefix("--intrinsics").strip(" :")

@@ -21,8 +21,8 @@ from jaxsfm.bench.options import whole_numbers
 from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
+from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.inliers import read_inliers
-from jaxsfm.colmap.intrinsics import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import first_models
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
@@ -92,7 +92,7 @@ def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[P
     """Models of a preset, and localized frames; the pairs that were tried, for other methods."""
     out = given.work / name
     report = reconstruct_folder(
-        linked(given.frames.mapped, given.work / "frames"),
+        linked(given.folder, [f.name for f in given.frames.mapped], given.work / "frames"),
         out,
         config=preset(name),
         options=RunOptions(
@@ -131,8 +131,9 @@ def with_other_features(given: FrameSequence, method: str, pairs: set[Pair]) -> 
     """The same of `OTHERS` on given pairs: a model of COLMAP's incremental mapper, and frames
     localized by the matches with points of the model."""
     database = given.work / method / "database.db"
-    folder = linked([*given.frames.mapped, *given.frames.localized], given.work / "all")
-    cameras = Cameras(known=parse_intrinsics(given.intrinsics) if given.intrinsics else None)
+    every = [frame.name for frame in (*given.frames.mapped, *given.frames.localized)]
+    folder = linked(given.folder, every, given.work / "all")
+    cameras = Cameras(known=parse_cameras(given.intrinsics) if given.intrinsics else None)
     seconds = write_other_matches(database, folder, method, pairs, cameras)
     names = [frame.name for frame in given.frames.mapped]
     options = MapOptions(refine_intrinsics=given.held is None)

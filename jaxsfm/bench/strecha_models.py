@@ -20,7 +20,7 @@ from jaxsfm.bench.methods import (
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.strecha_sets import StrechaSet
 from jaxsfm.colmap.cameras import Cameras
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import build_models
 from jaxsfm.colmap.model_folders import write_models

@@ -1,10 +1,10 @@
 """Reconstruct the subsets of a day and night scene by a method."""
 
-import functools
 import shutil
 from pathlib import Path
 from typing import NamedTuple
 
+from jaxsfm.bench.frames import linked
 from jaxsfm.bench.methods import NAIVE, method_config
 from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.naive import match_pairs_naively
@@ -12,20 +12,19 @@ from jaxsfm.bench.night_matches import NightMatches, night_matches
 from jaxsfm.bench.scenes import Scene
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import drop_pairs
+from jaxsfm.colmap.given_cameras import write_camera_list
+from jaxsfm.colmap.intrinsics import camera_of
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import build_models
-from jaxsfm.colmap.poses import Poses, model_poses
+from jaxsfm.colmap.poses import Poses, model_poses, read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
-from jaxsfm.io.features import ImageFeatures, image_capacity
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.io.store import FAILED
 from jaxsfm.io.weights import chosen_weights
-from jaxsfm.matching.extraction import image_features
-from jaxsfm.matching.pair_matching import match_pairs
-from jaxsfm.sfm.reconstruction import reconstruct
-
-FEATURES = 64
-"""Photos whose features are held (at least all photos of a subset): 50 MB each at 1536 x 1024."""
+from jaxsfm.runs.reconstruct import reconstruct_folder
+from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.reconstruction import DATABASE, reconstruct
 
 
 class SubsetModel(NamedTuple):
@@ -76,21 +75,48 @@ def rootsift_models(scene: Scene, scratch: Path, options: DayNightOptions) -> li
 def dense_models(
     scene: Scene, scratch: Path, method: str, options: DayNightOptions
 ) -> list[SubsetModel]:
-    """A model of each subset by one of our methods.
+    """A model of each subset by a run of ours, as `jaxsfm reconstruct` makes it.
 
-    A photo's features and a pair's matches are computed once for all subsets.
+    All runs have one work folder, so that a photo's features and a pair's matches are computed once
+    for all subsets.
     """
-    config = method_config(method)
+    work = scratch / method
+    given = RunOptions(
+        pairs="exhaustive",  # as RootSIFT
+        intrinsics=_written_cameras(scene, scratch / "cameras.txt"),
+        network=options.network,
+        seed=options.seed,
+        threads=options.threads,
+        keep_features=True,
+        progress=True,
+    )
+    models = []
+    for k, subset in enumerate(scene.subsets):
+        photos = linked(scene.folder, (*subset.day, subset.night), scratch / f"{method}-{k}")
+        report = reconstruct_folder(photos, work, config=method_config(method), options=given)
+        if report.models:
+            poses = model_poses(read_model(work / "sparse" / "0"))
+            models.append(SubsetModel(poses, night_matches(work / DATABASE, scene, subset)))
+        else:
+            failed = work / FAILED / DATABASE
+            models.append(SubsetModel({}, night_matches(failed, scene, subset)))
+    return models
+
+
+def _written_cameras(scene: Scene, path: Path) -> str | None:
+    """The value of `--intrinsics`: a list of the scene's cameras; None if they are not known."""
+    if scene.camera is None:
+        return None
+    known = {name: camera_of(scene.camera, image) for name, image in scene.images.items()}
+    sizes = {name: image.size for name, image in scene.images.items()}
+    write_camera_list(path, known, sizes)
+    return str(path)
+
+
+def naive_models(scene: Scene, scratch: Path, options: DayNightOptions) -> list[SubsetModel]:
+    """A model of each subset from matches of pixels. A pair's matches are computed once."""
+    config = method_config(NAIVE)
     weights = chosen_weights(options.network, config.backbone)
-    largest = max(len(subset.day) + 1 for subset in scene.subsets)
-
-    @functools.lru_cache(maxsize=max(FEATURES, largest))
-    def features(name: str) -> ImageFeatures:
-        return image_features(weights, scene.images[name], config=config)
-
-    capacities = {
-        name: image_capacity(image, config=config) for name, image in scene.images.items()
-    }
     last_use = {
         pair: k
         for k, subset in enumerate(scene.subsets)
@@ -101,10 +127,8 @@ def dense_models(
     for k, subset in enumerate(scene.subsets):
         pairs = exhaustive_pairs([*subset.day, subset.night])
         missing = [pair for pair in pairs if pair not in results]
-        for result in (
-            match_pairs_naively(weights, scene.images, missing, config=config, seed=options.seed)
-            if method == NAIVE
-            else match_pairs(features, capacities, missing, config=config, seed=options.seed)
+        for result in match_pairs_naively(
+            weights, scene.images, missing, config=config, seed=options.seed
         ):
             results[result.pair] = result
         made = reconstruct(

@@ -61,7 +61,7 @@ def train(what: tyro.conf.Positional[Literal["relocalizer"]], *, training: Train
     check_writable(training.out, "--out", (".safetensors",))
     if (training.reference is None) != (training.intrinsics is None):
         raise UserError("--reference and --intrinsics belong together; one is missing")
-    from jaxsfm.colmap.intrinsics import parse_intrinsics
+    from jaxsfm.colmap.given_cameras import parse_intrinsics
     from jaxsfm.colmap.poses import read_poses
     from jaxsfm.io.weights import load_weights
     from jaxsfm.matching.pipeline import open_images

@@ -99,7 +99,7 @@ class Cameras:
         if isinstance(self.known, Intrinsics):
             return image.size, image.orientation if is_turned(self.known, image) else None
         if self.known is not None:
-            return image.name
+            return self.known[image.name], image.size
         match self.sharing:
             case "single":
                 return image.size

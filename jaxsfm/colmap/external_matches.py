@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsfm.colmap.formats.database import read_database
 from jaxsfm.colmap.formats.tables import CameraRow, Tables, one_to_one
-from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, camera_of
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
@@ -65,7 +65,7 @@ def read_external_matches(
     database: Path | None,
     hloc: tuple[Path, Path] | None,
     images: Collection[ImageFile],
-    intrinsics: Intrinsics | None,
+    intrinsics: KnownCameras | None,
     *,
     dense: Path | None = None,
 ) -> ExternalMatches:
@@ -102,7 +102,7 @@ def read_external_matches(
 def _checked(
     tables: Tables,
     images: Collection[ImageFile],
-    intrinsics: Intrinsics | None,
+    intrinsics: KnownCameras | None,
     where: str,
     files: list[Path],
 ) -> ExternalMatches:
@@ -117,7 +117,8 @@ def _checked(
                 f"but the photo {_by(size)}"
             )
         if intrinsics is not None and name in tables.cameras:
-            _check_focal(tables.cameras[name], intrinsics, where, name)
+            camera = camera_of(intrinsics, known[name])
+            _check_focal(tables.cameras[name], camera, where, name)
         inside = np.clip(
             tables.keypoints[name], -0.5, np.asarray(size, np.float32) - np.float32(0.5)
         )

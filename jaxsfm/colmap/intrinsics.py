@@ -1,12 +1,7 @@
-"""Camera intrinsics, from a K.txt or from `MODEL:p1,p2,...`, checked before COLMAP sees them.
-
-A K matrix counts pixels from the centre of the top-left one, as OpenCV does. The parameters of a
-COLMAP model count them as COLMAP does, where that centre is (0.5, 0.5).
-"""
+"""Known cameras, and whether they are those of the photos."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -26,6 +21,8 @@ class Intrinsics:
     model: str
     params: tuple[float, ...]
     """Parameters of the COLMAP model, in COLMAP's pixels."""
+    size: tuple[int, int] | None = None
+    """(width, height) of the photos, if whoever gave the camera said so."""
 
     def camera(self, size: tuple[int, int]) -> pycolmap.Camera:
         """The COLMAP camera for images of `size` (width, height), marked as known.
@@ -109,77 +106,26 @@ def sizes_of(known: KnownCameras, images: Iterable[ImageFile]) -> dict[str, tupl
     }
 
 
-def _numbers(texts: list[str], where: str) -> list[float]:
-    try:
-        values = [float(text) for text in texts]
-    except ValueError as error:
-        raise UserError(f"{where}: {error}") from error
-    if not np.isfinite(values).all():
-        raise UserError(f"{where}: the numbers must be finite; got {values}")
-    return values
-
-
-def _from_matrix(path: Path) -> Intrinsics:
-    where = f"--intrinsics {path}"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{where}: cannot be read as text") from error
-    values = _numbers(text.replace(",", " ").split(), where)
-    if len(values) != 9:
-        raise UserError(f"{where}: expected the 9 numbers of a 3 x 3 matrix; got {len(values)}")
-    (fx, skew, cx), (zero, fy, cy), last = np.reshape(values, (3, 3)).tolist()
-    if last != [0, 0, 1] or zero != 0:
-        raise UserError(f"{where}: not a camera matrix (rows must be fx 0 cx, 0 fy cy, 0 0 1)")
-    if skew != 0:
-        raise UserError(f"{where}: skew must be 0; got {skew}")
-    if fx <= 0 or fy <= 0:
-        raise UserError(f"{where}: focal lengths must be positive; got {fx} and {fy}")
-    return Intrinsics(model="PINHOLE", params=(fx, fy, cx + 0.5, cy + 0.5))
-
-
-def parse_intrinsics(text: str) -> Intrinsics:
-    """Read intrinsics from the path of a K.txt, or from `MODEL:p1,p2,...` (a COLMAP camera model).
-
-    Raises UserError if the text is neither, or its numbers make no camera.
-    """
-    model, colon, params = text.partition(":")
-    if not colon or model not in MODELS:
-        path = Path(text)
-        if path.is_file():
-            return _from_matrix(path)
-        if colon and model.isupper():
-            raise UserError(
-                f"--intrinsics: unknown camera model {model!r}; one of {', '.join(MODELS)}"
-            )
-        shown = shown_name(text)
-        raise UserError(f"--intrinsics {shown}: no such file, and not MODEL:p1,p2,...")
-    where = f"--intrinsics {model}"
-    values = _numbers(params.split(","), where)
-    camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1)
-    if len(values) != len(camera.params):
-        raise UserError(
-            f"{where}: expected {len(camera.params)} numbers ({camera.params_info}); "
-            f"got {len(values)}"
-        )
-    for index in camera.focal_length_idxs():
-        if values[index] <= 0:
-            raise UserError(f"{where}: the focal length must be positive; got {values[index]}")
-    return Intrinsics(model=model, params=tuple(values))
-
-
 def check_fits(intrinsics: KnownCameras, sizes: dict[str, tuple[int, int]]) -> None:
-    """Raise UserError unless all images hold the principal point of their camera, and the images of
-    one camera have one size.
+    """Raise UserError unless all images have a camera and hold its principal point, and the images
+    of one camera have one size, which is that of the camera if it has any.
 
     Args:
       sizes: image name -> (width, height).
     """
     if not isinstance(intrinsics, Intrinsics):
         for name, size in sizes.items():
+            if name not in intrinsics:
+                raise UserError(f"--intrinsics: the list has no camera of {shown_name(name)}")
             check_fits(intrinsics[name], {name: size})
         return
     check_one_size(sizes, "--intrinsics describe")
+    for name, (width, height) in sizes.items():
+        if intrinsics.size not in (None, (width, height)):
+            raise UserError(
+                f"--intrinsics: the camera of {shown_name(name)} is for {intrinsics.size[0]} x "
+                f"{intrinsics.size[1]} pixels, but the photo has {width} x {height}"
+            )
     for width, height in set(sizes.values()):
         camera = intrinsics.camera((width, height))
         cx, cy = camera.principal_point_x, camera.principal_point_y

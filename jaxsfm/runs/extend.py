@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.looks import Looks, SavedMatches
@@ -85,7 +85,7 @@ def _extend(
     model = read_working_model(run / "sparse" / "0", finished.config, seed=seed)
     names = [view.name for view in model.views]
     files = _unchanged_photos(finished, usable, names) | images
-    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
+    intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     taken_with = finished.photos.taken_with
     cameras = {
         name: camera_prior(image, model.views, intrinsics, taken_with)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
@@ -31,7 +31,7 @@ from jaxsfm.runs.localize_report import (
     UnusablePhoto,
     error_against,
 )
-from jaxsfm.runs.queries import Query, match_queries, open_queries
+from jaxsfm.runs.queries import Query, camera_of_query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
@@ -76,10 +76,12 @@ def localize_photos(
         raise UserError(f"{run}: this run has no model to localize photos in")
     seed = finished.report.options.seed
     model = read_working_model(finished.folder / "sparse" / "0", finished.config, seed=seed)
-    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
+    intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     usable, unusable = open_queries(photos)
     cameras = {
-        path: camera_prior(image, model.views, intrinsics, finished.photos.taken_with)
+        path: camera_prior(
+            image, model.views, camera_of_query(path, intrinsics), finished.photos.taken_with
+        )
         for path, image in usable.items()
     }
     weights = weights_of_run(finished, options.network)

@@ -5,6 +5,8 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from jaxsfm.colmap.given_cameras import listed_name
+from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, inspect_image, orientations
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
@@ -52,6 +54,20 @@ def open_queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str
     if not usable:
         raise UserError(next(iter(unusable.values()), "no photos to localize were given"))
     return usable, unusable
+
+
+def camera_of_query(path: str, known: KnownCameras | None) -> Intrinsics | None:
+    """The known camera of a photo, by its path as it was given; None if none is known.
+
+    Raises:
+      UserError: the cameras are those of a list, and the photo is not on it.
+    """
+    if known is None or isinstance(known, Intrinsics):
+        return known
+    name = listed_name(Path(path), known)
+    if name is None:
+        raise UserError(f"--intrinsics: the list has no camera of {path}")
+    return known[name]
 
 
 def match_queries(

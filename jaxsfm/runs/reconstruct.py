@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import read_external_matches
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
@@ -69,7 +69,7 @@ def reconstruct_folder(
     """
     check_options(options)
     reference = read_poses(options.reference) if options.reference else None
-    intrinsics = parse_intrinsics(options.intrinsics) if options.intrinsics else None
+    intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     usable, skipped = open_images(images, progress=options.progress)
     names = [*(image.name for image in usable), *skipped]
     options = dataclasses.replace(options, pairs=chosen_pairs(options.pairs, len(usable)))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.cameras import Cameras, estimated_camera
-from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.intrinsics import KnownCameras
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.view import View
@@ -60,7 +60,7 @@ def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> Workin
 def camera_prior(
     image: ImageFile,
     views: Sequence[View],
-    intrinsics: Intrinsics | None,
+    intrinsics: KnownCameras | None,
     taken_with: Callable[[str], str] = lambda _: "",
 ) -> CameraPrior:
     """The camera that a photo starts with.

@@ -142,7 +142,7 @@ def test_databases_hold_the_known_camera_of_each_photo(folder, tmp_path):
     ("file", "text", "words"),
     [
         (QUERIES, None, ["no intrinsics of", QUERY]),
-        (QUERIES, f"{QUERY} SIMPLE_RADIAL 320 240 320 160", ["NAME MODEL w h params"]),
+        (QUERIES, f"{QUERY} SIMPLE_RADIAL 320 240 320 160", ["NAME MODEL WIDTH HEIGHT"]),
         (QUERIES, f"{QUERY} SIMPLE_RADIAL 640 480 320 160 120 0", ["320 x 240", "640 x 480"]),
         (QUERIES, f"{QUERY} SIMPLE_RADIAL 320 240 320 900 120 0", ["principal point"]),
         (QUERIES, b"\xff\xfe", ["cannot be read"]),

@@ -16,7 +16,7 @@ from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
 from jaxsfm.bench.night_protocol import LIMITS, judge, summary
 from jaxsfm.bench.scenes import Subset
-from jaxsfm.bench.subset_models import SubsetModel, dense_models, rootsift_models
+from jaxsfm.bench.subset_models import SubsetModel, dense_models, naive_models, rootsift_models
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose, read_poses
 
@@ -107,6 +107,7 @@ def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monke
     for runs in (
         rootsift_models(made, tmp_path, options),
         dense_models(made, tmp_path, "paper", options),
+        naive_models(made, tmp_path, options),
     ):
         for (poses, matches), subset in zip(runs, made.subsets, strict=True):
             assert subset.night in poses and set(poses) <= {*subset.day, subset.night}

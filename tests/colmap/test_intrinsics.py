@@ -4,7 +4,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
+from jaxsfm.colmap.intrinsics import check_fits
 from jaxsfm.errors import UserError
 
 K = "1000 0 511.5\n0 1010 383.5\n0 0 1\n"

@@ -9,7 +9,7 @@ from room_scene import Room, camera, exact_model, exact_tracks, view_of
 
 from jaxsfm.colmap import other_camera as module
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.other_camera import OTHER, camera_distance, other_camera
 

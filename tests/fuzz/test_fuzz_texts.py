@@ -7,7 +7,8 @@ from mutations import damaged_text, outcome
 from jaxsfm.bench.aachen import PAIRS as AACHEN_PAIRS
 from jaxsfm.bench.aachen import read_cameras, read_nvm, read_subsets
 from jaxsfm.bench.synthetic import camera_matrix
-from jaxsfm.colmap.intrinsics import check_fits, parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
+from jaxsfm.colmap.intrinsics import check_fits
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.io.pairs import read_pairs
 from jaxsfm.io.position_tables import read_position_table

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jaxsfm.bench.simulated import SimulatedStreet
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import Mapped
 from jaxsfm.colmap.model import Model, stored_sizes

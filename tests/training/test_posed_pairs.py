@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxsfm.colmap.intrinsics import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.errors import UserError
 from jaxsfm.matching.pipeline import open_images

@@ -1,0 +1,166 @@
+"""Known cameras as users write them: a K.txt, `MODEL:p1,p2,...`, or a list with a line for each
+photo, checked before COLMAP sees them.
+
+A K matrix counts pixels from the centre of the top-left one, as OpenCV does. The parameters of a
+COLMAP model count them as COLMAP does, where that centre is (0.5, 0.5).
+"""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from jaxsfm.colmap.intrinsics import MODELS, Intrinsics, KnownCameras
+from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.images import shown_name
+
+_LINE = re.compile(rf"(.+?)\s+({'|'.join(MODELS)})\s+(\d+)\s+(\d+)\s+(.+)")
+"""A line of a list of cameras."""
+
+
+def _numbers(texts: list[str], where: str) -> list[float]:
+    try:
+        values = [float(text) for text in texts]
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from error
+    if not np.isfinite(values).all():
+        raise UserError(f"{where}: the numbers must be finite; got {values}")
+    return values
+
+
+def _from_matrix(path: Path) -> Intrinsics:
+    where = f"--intrinsics {path}"
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{where}: cannot be read as text") from error
+    values = _numbers(text.replace(",", " ").split(), where)
+    if len(values) != 9:
+        raise UserError(f"{where}: expected the 9 numbers of a 3 x 3 matrix; got {len(values)}")
+    (fx, skew, cx), (zero, fy, cy), last = np.reshape(values, (3, 3)).tolist()
+    if last != [0, 0, 1] or zero != 0:
+        raise UserError(f"{where}: not a camera matrix (rows must be fx 0 cx, 0 fy cy, 0 0 1)")
+    if skew != 0:
+        raise UserError(f"{where}: skew must be 0; got {skew}")
+    if fx <= 0 or fy <= 0:
+        raise UserError(f"{where}: focal lengths must be positive; got {fx} and {fy}")
+    return Intrinsics(model="PINHOLE", params=(fx, fy, cx + 0.5, cy + 0.5))
+
+
+def parse_intrinsics(text: str) -> Intrinsics:
+    """Read intrinsics from the path of a K.txt, or from `MODEL:p1,p2,...` (a COLMAP camera model).
+
+    Raises UserError if the text is neither, or its numbers make no camera.
+    """
+    model, colon, params = text.partition(":")
+    if not colon or model not in MODELS:
+        path = Path(text)
+        if path.is_file():
+            return _from_matrix(path)
+        if colon and model.isupper():
+            raise UserError(
+                f"--intrinsics: unknown camera model {model!r}; one of {', '.join(MODELS)}"
+            )
+        shown = shown_name(text)
+        raise UserError(f"--intrinsics {shown}: no such file, and not MODEL:p1,p2,...")
+    where = f"--intrinsics {model}"
+    values = _numbers(params.split(","), where)
+    camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1)
+    if len(values) != len(camera.params):
+        raise UserError(
+            f"{where}: expected {len(camera.params)} numbers ({camera.params_info}); "
+            f"got {len(values)}"
+        )
+    for index in camera.focal_length_idxs():
+        if values[index] <= 0:
+            raise UserError(f"{where}: the focal length must be positive; got {values[index]}")
+    return Intrinsics(model=model, params=tuple(values))
+
+
+def parse_cameras(text: str) -> KnownCameras:
+    """What `parse_intrinsics` reads, or the cameras of a list (`read_camera_list`) by photo.
+
+    A file with text that begins with anything but a number is a list.
+    """
+    path = Path(text)
+    if not path.is_file() or _begins_with_number(path):
+        return parse_intrinsics(text)
+    found = read_camera_list(path, "--intrinsics")
+    if not found:
+        raise UserError(f"--intrinsics {path}: neither a 3 x 3 matrix nor a list of cameras")
+    return found
+
+
+def _begins_with_number(path: Path) -> bool:
+    try:
+        float(path.read_text(encoding="utf-8").replace(",", " ").split()[0])
+    except (ValueError, OSError, IndexError):
+        return False
+    return True
+
+
+def read_camera_list(path: Path, option: str) -> dict[str, Intrinsics]:
+    """Read the cameras of photos from lines of NAME MODEL WIDTH HEIGHT PARAMETERS.
+
+    It is the list of queries that hloc and the benchmarks of visual localization use. A line that
+    starts with # is a comment. A name may have blanks.
+
+    Args:
+      option: which option named the file, for the sentence of an error.
+
+    Raises:
+      UserError: a line is anything else, or gives a photo a second camera.
+    """
+    where = f"{option} {path}"
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{where}: cannot be read as text") from error
+    found: dict[str, Intrinsics] = {}
+    for number, line in enumerate(map(str.strip, lines), 1):
+        if not line or line.startswith("#"):
+            continue
+        try:
+            name, camera = _listed(line)
+        except (ValueError, UserError) as error:
+            raise UserError(
+                f"{where}: line {number} is not NAME MODEL WIDTH HEIGHT PARAMETERS: {line[:80]!r}"
+            ) from error
+        if found.setdefault(name, camera) != camera:
+            raise UserError(f"{where}: line {number} is a second camera of {shown_name(name)}")
+    return found
+
+
+def write_camera_list(
+    path: Path, known: Mapping[str, Intrinsics], sizes: Mapping[str, tuple[int, int]]
+) -> None:
+    """Write a list that `read_camera_list` reads.
+
+    Args:
+      sizes: (width, height) of the photos, by name.
+    """
+    lines = [
+        " ".join([name, camera.model, *map(str, (*sizes[name], *map(float, camera.params)))])
+        for name, camera in known.items()
+    ]
+    write_atomic(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+def _listed(line: str) -> tuple[str, Intrinsics]:
+    """The photo of a line, and its camera; ValueError or UserError if it is no such line."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        raise ValueError("no camera model")
+    name, model, width, height, params = match.groups()
+    camera = parse_intrinsics(f"{model}:{','.join(params.split())}")
+    return name, dataclasses.replace(camera, size=(int(width), int(height)))
+
+
+def listed_name(path: Path, known: Mapping[str, Intrinsics]) -> str | None:
+    """The name under which a list has a photo: the longest one that its path ends with."""
+    names = ("/".join(path.parts[k:]) for k in range(len(path.parts)))
+    return next((name for name in names if name in known), None)

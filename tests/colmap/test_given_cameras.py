@@ -1,0 +1,111 @@
+"""Lists of known cameras: what a line says, whose camera it is, and what is refused."""
+
+from pathlib import Path
+
+import pytest
+
+from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.given_cameras import (
+    listed_name,
+    parse_cameras,
+    parse_intrinsics,
+    read_camera_list,
+    write_camera_list,
+)
+from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
+from jaxsfm.errors import UserError
+from jaxsfm.io.images import ImageFile
+
+FIRST = "day/a.jpg SIMPLE_PINHOLE 640 480 500 320 240"
+LAST = "night/a b.jpg OPENCV 800 600 700 701 400 300 0.1 -0.02 1e-3 0"
+
+
+def written(tmp_path, *lines: str) -> Path:
+    path = tmp_path / "cameras.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_list_says_the_camera_and_the_size_of_each_photo(tmp_path):
+    path = written(tmp_path, "# NAME MODEL WIDTH HEIGHT PARAMETERS", "", FIRST, f"  {LAST} ", FIRST)
+    found = parse_cameras(str(path))
+    assert found == {
+        "day/a.jpg": Intrinsics(
+            model="SIMPLE_PINHOLE", params=(500.0, 320.0, 240.0), size=(640, 480)
+        ),
+        "night/a b.jpg": Intrinsics(
+            model="OPENCV", params=(700, 701, 400, 300, 0.1, -0.02, 1e-3, 0), size=(800, 600)
+        ),
+    }
+    assert found == read_camera_list(path, "--root")
+    again = tmp_path / "again.txt"
+    write_camera_list(again, found, {name: camera.size for name, camera in found.items()})
+    assert parse_cameras(str(again)) == found
+
+
+@pytest.mark.parametrize("text", ["K.txt", "SIMPLE_PINHOLE:500,320,240"])
+def test_one_camera_of_all_photos_is_read_as_before(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    Path("K.txt").write_text("500 0 319.5\n0 500 239.5\n0 0 1\n")
+    assert parse_cameras(text) == parse_intrinsics(text)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([FIRST, "b.jpg SIMPLE_PINHOLE 640 480 500 320"], "line 2 is not NAME MODEL WIDTH HEIGHT"),
+        ([FIRST, "b.jpg LENS 640 480 500 320 240"], "line 2 is not NAME MODEL"),
+        ([FIRST, "SIMPLE_PINHOLE 640 480 500 320 240"], "line 2 is not NAME MODEL"),
+        ([FIRST, "b.jpg SIMPLE_PINHOLE 640.5 480 500 320 240"], "line 2 is not NAME MODEL"),
+        ([FIRST, "b.jpg SIMPLE_PINHOLE 640 480 -500 320 240"], "line 2 is not NAME MODEL"),
+        ([LAST, FIRST, FIRST.replace("500", "501")], "line 3 is a second camera of day/a.jpg"),
+        (["# nothing"], "neither a 3 x 3 matrix nor a list of cameras"),
+        ([""], "neither a 3 x 3 matrix nor a list of cameras"),
+    ],
+)
+def test_a_damaged_list_is_refused_naming_file_and_line(tmp_path, lines, message):
+    path = written(tmp_path, *lines)
+    with pytest.raises(UserError) as raised:
+        parse_cameras(str(path))
+    assert str(raised.value).startswith(f"--intrinsics {path}")
+    assert message in str(raised.value)
+
+
+def test_a_photo_that_is_not_on_the_list_or_has_another_size_is_named(tmp_path):
+    known = parse_cameras(str(written(tmp_path, FIRST, LAST)))
+    check_fits(known, {"day/a.jpg": (640, 480), "night/a b.jpg": (800, 600)})
+    with pytest.raises(UserError, match=r"no camera of night/a\.jpg"):
+        check_fits(known, {"night/a.jpg": (800, 600)})
+    with pytest.raises(UserError, match=r"day/a\.jpg is for 640 x 480 pixels, .* has 640 x 481"):
+        check_fits(known, {"day/a.jpg": (640, 481)})
+
+
+def test_photos_with_equal_cameras_share_one(tmp_path):
+    focal = {"a": 5, "b": 6, "c": 5}
+    lines = [f"{name}.jpg SIMPLE_PINHOLE 640 480 {f} 320 240" for name, f in focal.items()]
+    images = [
+        ImageFile(name=f"{name}.jpg", path=tmp_path / name, size=(640, 480), sha256=name)
+        for name in "abc"
+    ]
+    cameras = Cameras(known=parse_cameras(str(written(tmp_path, *lines))))
+    shared = [
+        (camera.params[0], [image.name for image in group])
+        for camera, group in cameras.assigned(images)
+    ]
+    assert shared == [(5, ["a.jpg", "c.jpg"]), (6, ["b.jpg"])]
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("photos/night/a.jpg", "night/a.jpg"),
+        ("a.jpg", "a.jpg"),
+        ("other/a.jpg", "a.jpg"),
+        ("/photos/day/a.jpg", "a.jpg"),
+        ("night/b.jpg", None),
+        ("night/aa.jpg", None),
+    ],
+)
+def test_a_photo_has_the_longest_name_that_its_path_ends_with(path, name):
+    known = dict.fromkeys(["a.jpg", "night/a.jpg", "x/night/b.jpg"], None)
+    assert listed_name(Path(path), known) == name
