@@ -102,6 +102,22 @@ def test_refine_intrinsics_moves_a_wrong_focal_length(scene, tmp_path):
     assert focal["auto"] == focal["no"] == 340 and focal["yes"] != 340
 
 
+def test_a_list_gives_each_photo_its_camera_and_equal_ones_are_shared(
+    scene, tmp_path, copied, capsys
+):
+    focal = {"view0.png": 320, "view1_night.png": 321, "view2.png": 320}
+    path = tmp_path / "cameras.txt"
+    path.write_text("".join(f"{n} SIMPLE_PINHOLE 320 240 {f} 160 120\n" for n, f in focal.items()))
+    run(scene, copied, "--intrinsics", path, "--refine", "0")
+    found = rows(copied, "select name, params from images join cameras using (camera_id)")
+    assert {name: np.frombuffer(params)[0] for name, params in found} == focal
+    assert rows(copied, "select count(*) from cameras") == [(2,)]
+    path.write_text("view0.png SIMPLE_PINHOLE 320 240 320 160 120\n")
+    args = ["reconstruct", str(scene / "images"), "--out", str(copied), "--intrinsics", str(path)]
+    assert main(args) == 2
+    assert "the list has no camera of view1_night.png" in capsys.readouterr().err
+
+
 def test_a_pair_file_limits_what_is_tried(scene, tmp_path, copied):
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("view0.png view1_night.png\nview1_night.png view2.png\n")

@@ -7,7 +7,7 @@ from mutations import damaged_text, outcome
 from jaxsfm.bench.aachen import PAIRS as AACHEN_PAIRS
 from jaxsfm.bench.aachen import read_cameras, read_nvm, read_subsets
 from jaxsfm.bench.synthetic import camera_matrix
-from jaxsfm.colmap.given_cameras import parse_intrinsics
+from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.intrinsics import check_fits
 from jaxsfm.colmap.poses import read_poses
 from jaxsfm.io.pairs import read_pairs
@@ -56,7 +56,7 @@ def pairs(rng, folder) -> str:
 
 def checked(text: str) -> str:
     def parse():
-        found = parse_intrinsics(text)
+        found = parse_cameras(text)
         check_fits(found, {"a.jpg": SIZE})
         return found, found.camera(SIZE)
 

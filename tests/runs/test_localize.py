@@ -15,6 +15,7 @@ from kept_runs import change_report
 
 from jaxsfm.bench.synthetic import camera_matrix, look_at, render, room
 from jaxsfm.cli.main import main
+from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, inspect_image
@@ -26,6 +27,7 @@ from jaxsfm.report.finished_run import read_run
 from jaxsfm.runs import localize as localize_module
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
+from jaxsfm.runs.queries import camera_of_query
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import similar_photos
 from jaxsfm.runs.working_model import camera_prior, read_working_model
@@ -344,6 +346,16 @@ def test_nothing_localized_ends_with_1(plain, photos, capsys, monkeypatch):
     assert "no photo could be localized" in captured.err and "1 lost of 1" in captured.out
 
 
+def test_the_camera_of_a_query_is_the_one_of_all_photos_or_that_of_its_path():
+    camera = Intrinsics(model="SIMPLE_PINHOLE", params=(320.0, 160.0, 120.0))
+    other = dataclasses.replace(camera, params=(330.0, 160.0, 120.0))
+    known = {"night/a.png": camera, "a.png": other}
+    assert camera_of_query("a.png", None) is None
+    assert camera_of_query("anything.png", camera) is camera
+    assert camera_of_query("photos/night/a.png", known) is camera
+    assert camera_of_query("photos/a.png", known) is other
+
+
 def test_wrong_calls_are_one_sentence(plain, photos, scene, tmp_path, capsys):
     out, new = plain[0], photos / "photos" / "new.png"
     broken = photos / "photos" / "broken.png"
@@ -354,6 +366,10 @@ def test_wrong_calls_are_one_sentence(plain, photos, scene, tmp_path, capsys):
     assert "gone or changed" in says(capsys, new, "--model", out, "--images", scene)
     far = "PINHOLE:320,320,390,50"
     assert "principal point" in says(capsys, new, "--model", out, "--intrinsics", far)
+    others = tmp_path / "cameras.txt"
+    others.write_text("other.png SIMPLE_PINHOLE 320 240 320 160 120\n")
+    said = says(capsys, new, "--model", out, "--intrinsics", others)
+    assert f"the list has no camera of {new}" in said
     assert "--out" in says(capsys, new, "--model", out, "--out", tmp_path / "poses.txt")
 
 
