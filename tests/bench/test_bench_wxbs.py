@@ -120,17 +120,19 @@ def test_a_rendered_pair_scores_well_and_repeats(root, tmp_path, capsys):
         assert rows[method]["scores"] == runs[1][method]["scores"]
     assert rows["paper"]["maa"]["min"] > 0.6 < rows["default"]["maa"]["min"]
     text = capsys.readouterr().out
-    assert "WG/room" in text and "mean of all" in text
+    assert "WG/room" in text and "mean of all" in text and "published" not in text
     assert figures["summary"]["paper"]["WG"] == figures["summary"]["paper"]["all"]
 
 
 @pytest.mark.slow
-def test_the_published_protocol_is_run(root, tmp_path):
+def test_the_published_protocol_is_run_beside_published_figures(root, tmp_path, capsys):
     out = tmp_path / "figures.json"
     args = ["--root", str(root), "--methods", "rootsift", "--seeds", "1", "--protocol", "lo"]
     assert main(["bench", "wxbs", *args, "--json", str(out)]) == 0
     (row,) = json.loads(out.read_text())["rows"]
     assert row["maa"]["mean"] > 0.5 and row["evidence"] is None
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert lines[-2:] == ["published, all pairs DKM 0.589", "published, all pairs RoMa 0.801"]
 
 
 def test_categories_and_pairs_are_chosen_by_name(root, tmp_path, capsys):
