@@ -100,10 +100,10 @@ class ReconstructionChoice:
       retrieval: How a photo is described by one vector for retrieval:K. netvlad needs NetVLAD's
         weights, given with --weights.
       best_pairs: Map only the N pairs of each image that have the most inliers.
-      intrinsics: The known camera of all photos. FILE: a text file with a 3 x 3 matrix, in which
-        the centre of the top-left pixel is (0, 0), or with a line NAME MODEL WIDTH HEIGHT p1 p2 ..
-        for each photo. MODEL:p1,p2,..: a COLMAP camera model with its parameters, in COLMAP's
-        pixels, in which that centre is (0.5, 0.5). Without it, cameras are estimated.
+      intrinsics: The known camera of all photos, or of each. FILE: a text file with a 3 x 3 matrix,
+        in which the centre of the top-left pixel is (0, 0), or with a line NAME MODEL WIDTH HEIGHT
+        p1 p2 .. for each photo. MODEL:p1,p2,..: a COLMAP camera model with its parameters, in
+        COLMAP's pixels, in which that centre is (0.5, 0.5). Without it, cameras are estimated.
       masks: Folder with masks, images of the size of the photos. Black pixels are not used. The
         mask of sub/a.jpg is sub/a.jpg.png.
       cameras: Which photos share a camera. single: all photos. folder: the photos of each

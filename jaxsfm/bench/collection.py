@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypedDict
 import numpy as np
 
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
-from jaxsfm.bench.frames import chosen_frames, linked
+from jaxsfm.bench.frames import linked
 from jaxsfm.bench.model_options import CollectionOptions
 from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
@@ -24,6 +24,7 @@ from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import first_models
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.config import preset
+from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.verdict import VerdictColour
@@ -190,12 +191,12 @@ def _extended(work: Path, every: Path, added: set[str], truth: Poses) -> Extensi
 def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Iterator[CollectionRow]:
     """A row for each method; presets come first, because they choose the pairs."""
     pairs: set[Pair] = set()
-    folder, out, added = options.root, options.out, []
+    folder, out, added = options.root, options.out, set[str]()
+    names = sorted((image.name for image in open_images(folder)[0]), key=natural)
     if options.extend:
-        mapped, added = chosen_frames(options.root, 1, options.extend)
+        added = {*names[options.extend // 2 :: options.extend]}
         out = options.out / f"extend-{options.extend}"
-        folder = linked(options.root, (path.name for path in mapped), out / "photos")
-    photos = len(open_images(folder)[0])
+        folder = linked(options.root, [n for n in names if n not in added], out / "photos")
     for method in methods:
         work = out / method
         if method in OTHERS:
@@ -210,10 +211,9 @@ def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Itera
             pairs = {each.pair for each in report.pairs.each}
             models = [read_model(work / "sparse" / str(k)) for k in range(len(report.models))]
             made = Made(models, dict(report.seconds), report.verdict)
-            if added:
-                names = {path.name for path in added}
-                made = made._replace(extension=_extended(work, options.root, names, truth))
-        yield _row(method, photos, made, truth)
+            if added and models:
+                made = made._replace(extension=_extended(work, options.root, added, truth))
+        yield _row(method, len(names) - len(added), made, truth)
 
 
 def bench_collection(options: CollectionOptions) -> BenchFigures[CollectionRow, dict[str, int]]:

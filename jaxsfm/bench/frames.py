@@ -1,6 +1,5 @@
 """The frames of a video with reference poses that a benchmark uses, and their camera."""
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -36,12 +35,15 @@ def chosen_frames(folder: Path, every: int, localize: int) -> Frames:
 
 
 def linked(photos: Path, names: Iterable[str], folder: Path) -> Path:
-    """A folder with links to some photos of another one, by their paths below it."""
-    for name in names:
-        link = folder / name
+    """A folder with links to some photos of another one, by their paths below it, and no others."""
+    wanted = {folder / name: (photos / name).absolute() for name in names}
+    for path in list(folder.rglob("*")):
+        if path.is_symlink() and wanted.get(path) != path.readlink():
+            path.unlink()
+    for link, photo in wanted.items():
         link.parent.mkdir(parents=True, exist_ok=True)
-        if not link.exists():
-            os.symlink((photos / name).absolute(), link)
+        if not link.is_symlink():
+            link.symlink_to(photo)
     return folder
 
 

@@ -32,8 +32,9 @@ ABLATIONS: dict[str, Callable[[Config], Config]] = {
 """Changes of a preset, by the name that follows PRESET- in a method's name.
 
 Each change leaves out one idea of the preset or exchanges it for another one. `no-placing` changes
-models and leaves matches as they are; `no-alignment` and `no-closer-looks` change the matches of
-single pairs and leave models as they are.
+models and leaves matches as they are; `no-alignment` changes the matches of single pairs and leaves
+models as they are. `no-closer-looks` changes the matches of single pairs, and leaves photos without
+a place where they are.
 """
 KEYPOINTS: dict[str, Keypoints] = {"grid": "grid", "reloc": "relocalized", "learned": "learned"}
 """Methods that differ only in the place of a keypoint within its cell."""

@@ -4,7 +4,8 @@
   for any severity.
 * Simple scenes: SCENE/day/*, SCENE/night/* and SCENE/reference (Strecha .camera files, or a COLMAP
   model whose image names, or their stems, are those of the photos). If all photos share a known
-  camera, SCENE/intrinsics.txt holds it as MODEL:p1,p2,.. (COLMAP's pixels) or as a 3 x 3 matrix.
+  camera, SCENE/intrinsics.txt holds it as MODEL:p1,p2,.. (COLMAP's pixels) or as a 3 x 3 matrix. It
+  can also be a list of cameras (`jaxsfm.colmap.given_cameras.read_camera_list`).
 * Aachen Day-Night (`jaxsfm.bench.aachen`), which has a folder images_upright.
 """
 
@@ -20,7 +21,7 @@ from jaxsfm.bench.night import synthetic_night
 from jaxsfm.bench.strecha_sets import strecha_intrinsics
 from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.colmap.given_cameras import parse_cameras, parse_intrinsics
-from jaxsfm.colmap.intrinsics import KnownCameras, check_fits
+from jaxsfm.colmap.intrinsics import MODELS, KnownCameras, check_fits
 from jaxsfm.colmap.poses import Poses, read_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, inspect_image, read_image
@@ -86,12 +87,13 @@ def synthetic_scene(folder: Path, target: Path, options: DayNightOptions) -> Sce
 
 
 def _known_camera(path: Path, images: dict[str, ImageFile]) -> KnownCameras | None:
-    """Read a camera from a file with MODEL:p1,p2,.. or a 3 x 3 matrix; None without the file."""
+    """Read cameras from a file with MODEL:p1,p2,.., a 3 x 3 matrix or a list; None without it."""
     if not path.is_file():
         return None
     try:
         text = path.read_text(encoding="utf-8").strip()
-        found = parse_intrinsics(text) if ":" in text else parse_cameras(str(path))
+        spoken = text.partition(":")[0] in MODELS
+        found = parse_intrinsics(text) if spoken else parse_cameras(str(path))
         check_fits(found, {name: image.size for name, image in images.items()})
     except (OSError, UnicodeDecodeError, UserError) as error:
         why = str(error).removeprefix("--intrinsics").strip(" :")

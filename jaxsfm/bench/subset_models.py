@@ -19,12 +19,19 @@ from jaxsfm.colmap.mapper import build_models
 from jaxsfm.colmap.poses import Poses, model_poses, read_model
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
+from jaxsfm.errors import UserError
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
-from jaxsfm.io.store import FAILED
 from jaxsfm.io.weights import chosen_weights
+from jaxsfm.io.work_folder import RECORD
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.reconstruction import DATABASE, reconstruct
+
+FEATURES = 64
+"""Photos whose features are kept for the next subset (at least those of one): 25 MB each at 1536 x
+1024."""
+KEPT = ("features", "matches")
+"""The folders of a run that the next one can use."""
 
 
 class SubsetModel(NamedTuple):
@@ -77,10 +84,11 @@ def dense_models(
 ) -> list[SubsetModel]:
     """A model of each subset by a run of ours, as `jaxsfm reconstruct` makes it.
 
-    All runs have one work folder, so that a photo's features and a pair's matches are computed once
-    for all subsets.
+    A run takes over the features and matches of the subset before, if they have photos in common.
+
+    Raises:
+      UserError: a photo cannot be used.
     """
-    work = scratch / method
     given = RunOptions(
         pairs="exhaustive",  # as RootSIFT
         intrinsics=_written_cameras(scene, scratch / "cameras.txt"),
@@ -90,17 +98,33 @@ def dense_models(
         keep_features=True,
         progress=True,
     )
-    models = []
-    for k, subset in enumerate(scene.subsets):
-        photos = linked(scene.folder, (*subset.day, subset.night), scratch / f"{method}-{k}")
-        report = reconstruct_folder(photos, work, config=method_config(method), options=given)
-        if report.models:
-            poses = model_poses(read_model(work / "sparse" / "0"))
-            models.append(SubsetModel(poses, night_matches(work / DATABASE, scene, subset)))
-        else:
-            failed = work / FAILED / DATABASE
-            models.append(SubsetModel({}, night_matches(failed, scene, subset)))
+    work, photos = scratch / method, scratch / f"{method}-photos"
+    models, before = [], set[str]()
+    for subset in scene.subsets:
+        names = {*subset.day, subset.night}
+        _forget_results(work, features=len(before) <= FEATURES and not names.isdisjoint(before))
+        before = names if not work.exists() else before | names
+        report = reconstruct_folder(
+            linked(scene.folder, names, photos), work, config=method_config(method), options=given
+        )
+        if skipped := report.images.skipped:
+            raise UserError(f"--root: {next(iter(skipped.values()))}")
+        poses = model_poses(read_model(work / "sparse" / "0")) if report.models else {}
+        models.append(SubsetModel(poses, night_matches(work / DATABASE, scene, subset)))
+    shutil.rmtree(work)
     return models
+
+
+def _forget_results(work: Path, *, features: bool) -> None:
+    """Leave nothing of a run, or nothing but its features and matches."""
+    if not features:
+        shutil.rmtree(work, ignore_errors=True)
+        return
+    for path in work.iterdir():
+        if path.is_dir() and path.name not in KEPT:
+            shutil.rmtree(path)
+        elif path.is_file() and path.name != RECORD:
+            path.unlink()
 
 
 def _written_cameras(scene: Scene, path: Path) -> str | None:

@@ -18,6 +18,8 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import shown_name
 
+ENCODING = "utf-8-sig"
+"""With or without the mark that editors of Windows write first."""
 _LINE = re.compile(rf"(.+?)\s+({'|'.join(MODELS)})\s+(\d+)\s+(\d+)\s+(.+)")
 """A line of a list of cameras."""
 
@@ -35,7 +37,7 @@ def _numbers(texts: list[str], where: str) -> list[float]:
 def _from_matrix(path: Path) -> Intrinsics:
     where = f"--intrinsics {path}"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding=ENCODING)
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{where}: cannot be read as text") from error
     values = _numbers(text.replace(",", " ").split(), where)
@@ -82,12 +84,9 @@ def parse_intrinsics(text: str) -> Intrinsics:
 
 
 def parse_cameras(text: str) -> KnownCameras:
-    """What `parse_intrinsics` reads, or the cameras of a list (`read_camera_list`) by photo.
-
-    A file with text that begins with anything but a number is a list.
-    """
+    """What `parse_intrinsics` reads, or the cameras of a list (`read_camera_list`) by photo."""
     path = Path(text)
-    if not path.is_file() or _begins_with_number(path):
+    if not path.is_file() or _is_matrix(path):
         return parse_intrinsics(text)
     found = read_camera_list(path, "--intrinsics")
     if not found:
@@ -95,12 +94,14 @@ def parse_cameras(text: str) -> KnownCameras:
     return found
 
 
-def _begins_with_number(path: Path) -> bool:
+def _is_matrix(path: Path) -> bool:
+    """Whether a file begins with a number, and has no line of a list."""
     try:
-        float(path.read_text(encoding="utf-8").replace(",", " ").split()[0])
+        text = path.read_text(encoding=ENCODING)
+        float(text.replace(",", " ").split()[0])
     except (ValueError, OSError, IndexError):
         return False
-    return True
+    return not any(_LINE.fullmatch(line.strip()) for line in text.splitlines())
 
 
 def read_camera_list(path: Path, option: str) -> dict[str, Intrinsics]:
@@ -117,7 +118,7 @@ def read_camera_list(path: Path, option: str) -> dict[str, Intrinsics]:
     """
     where = f"{option} {path}"
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding=ENCODING).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{where}: cannot be read as text") from error
     found: dict[str, Intrinsics] = {}
@@ -128,7 +129,8 @@ def read_camera_list(path: Path, option: str) -> dict[str, Intrinsics]:
             name, camera = _listed(line)
         except (ValueError, UserError) as error:
             raise UserError(
-                f"{where}: line {number} is not NAME MODEL WIDTH HEIGHT PARAMETERS: {line[:80]!r}"
+                f"{where}: line {number} is not NAME MODEL WIDTH HEIGHT PARAMETERS ({error}): "
+                f"{line[:80]!r}"
             ) from error
         if found.setdefault(name, camera) != camera:
             raise UserError(f"{where}: line {number} is a second camera of {shown_name(name)}")
@@ -142,7 +144,13 @@ def write_camera_list(
 
     Args:
       sizes: (width, height) of the photos, by name.
+
+    Raises:
+      UserError: a name cannot be read back from a line.
     """
+    for name in known:
+        if name != name.strip() or name.startswith("#"):
+            raise UserError(f"{name!r}: a list of cameras cannot hold this name")
     lines = [
         " ".join([name, camera.model, *map(str, (*sizes[name], *map(float, camera.params)))])
         for name, camera in known.items()
@@ -161,6 +169,7 @@ def _listed(line: str) -> tuple[str, Intrinsics]:
 
 
 def listed_name(path: Path, known: Mapping[str, Intrinsics]) -> str | None:
-    """The name under which a list has a photo: the longest one that its path ends with."""
-    names = ("/".join(path.parts[k:]) for k in range(len(path.parts)))
-    return next((name for name in names if name in known), None)
+    """The name under which a list has a photo: the longest one that its absolute path ends with."""
+    absolute = path.absolute()
+    ends = ("/".join(absolute.parts[k:]) for k in range(1, len(absolute.parts)))
+    return next((name for name in (absolute.as_posix(), *ends) if name in known), None)

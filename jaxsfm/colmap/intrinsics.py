@@ -84,6 +84,14 @@ def camera_of(known: KnownCameras, image: ImageFile, *, upright: bool = False) -
     return known
 
 
+def used_cameras(known: KnownCameras, images: Iterable[ImageFile]) -> KnownCameras:
+    """The known cameras without those of a list that no image has: they are not what a run depends
+    on."""
+    if isinstance(known, Intrinsics):
+        return known
+    return {image.name: known[image.name] for image in images if image.name in known}
+
+
 def is_turned(camera: Intrinsics, image: ImageFile) -> bool:
     """Whether the image has the camera's size only when it is upright."""
     if image.orientation not in QUARTERS or image.upright_size == image.size:

@@ -2,9 +2,11 @@
 
 Each photo is matched with photos of the run, and its pose is found in the model
 (`jaxsfm.sfm.register.locate_view`). The result of a photo depends on its content, the run and the
-options. It does not depend on the photo's name, or on the other photos of the same call.
+options. It does not depend on the other photos of the same call, nor on the photo's name,
+unless a list of known cameras names it.
 """
 
+import dataclasses
 import functools
 import importlib.metadata
 import tempfile
@@ -31,7 +33,7 @@ from jaxsfm.runs.localize_report import (
     UnusablePhoto,
     error_against,
 )
-from jaxsfm.runs.queries import Query, camera_of_query, match_queries, open_queries
+from jaxsfm.runs.queries import Query, cameras_of_query, match_queries, open_queries
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
@@ -80,7 +82,10 @@ def localize_photos(
     usable, unusable = open_queries(photos)
     cameras = {
         path: camera_prior(
-            image, model.views, camera_of_query(path, intrinsics), finished.photos.taken_with
+            dataclasses.replace(image, name=path),
+            model.views,
+            cameras_of_query(path, intrinsics),
+            finished.photos.taken_with,
         )
         for path, image in usable.items()
     }

@@ -56,8 +56,8 @@ def open_queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str
     return usable, unusable
 
 
-def camera_of_query(path: str, known: KnownCameras | None) -> Intrinsics | None:
-    """The known camera of a photo, by its path as it was given; None if none is known.
+def cameras_of_query(path: str, known: KnownCameras | None) -> KnownCameras | None:
+    """The known cameras, where a photo has its path, as it was given, for a name.
 
     Raises:
       UserError: the cameras are those of a list, and the photo is not on it.
@@ -67,7 +67,7 @@ def camera_of_query(path: str, known: KnownCameras | None) -> Intrinsics | None:
     name = listed_name(Path(path), known)
     if name is None:
         raise UserError(f"--intrinsics: the list has no camera of {path}")
-    return known[name]
+    return {path: known[name]}
 
 
 def match_queries(

@@ -10,6 +10,7 @@ from tqdm import tqdm
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import read_external_matches
 from jaxsfm.colmap.given_cameras import parse_cameras
+from jaxsfm.colmap.intrinsics import used_cameras
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
@@ -80,6 +81,8 @@ def reconstruct_folder(
         usable, bare = with_masks(usable, options.masks)
         if bare:
             logger.warning("%s: no mask in %s, so all of it is used", named(bare), options.masks)
+    if intrinsics is not None:
+        intrinsics = used_cameras(intrinsics, usable)
     cameras = Cameras(known=intrinsics, sharing=options.cameras, model=options.camera_model)
     cameras.check_fits(usable)
     measured = measured_positions(options.georeference, usable)

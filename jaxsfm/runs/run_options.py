@@ -56,8 +56,8 @@ def check_options(options: RunOptions) -> None:
         )
     if options.intrinsics is not None and options.cameras in ("folder", "photo"):
         raise UserError(
-            f"--cameras {options.cameras} and --intrinsics exclude each other, because the known "
-            "camera is that of all photos"
+            f"--cameras {options.cameras} and --intrinsics exclude each other, because a known "
+            "camera is that of all photos, and a list says the camera of each"
         )
     check_seed(options.seed)
     check_threads(options.threads)

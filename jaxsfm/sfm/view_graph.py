@@ -179,11 +179,12 @@ def _grow(
 
 
 def _join(between: list[dict[int, list[int]]], a: int, b: int) -> None:
-    """Group b becomes part of group a: the pairs of b with others are those of a."""
+    """Group b becomes part of group a: the pairs of b with others are those of a. Those that would
+    not vote are forgotten."""
     del between[a][b], between[b][a]
     for other, ranks in between[b].items():
         del between[other][b]
-        both = sorted(between[a].get(other, []) + ranks)
+        both = sorted(between[a].get(other, []) + ranks)[:MAX_VOTES]
         between[a][other] = between[other][a] = both
     between[b].clear()
 

@@ -1,5 +1,6 @@
 """`bench daynight`: scenes in every layout, the protocol's figures, a run on the rendered room."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -19,6 +20,7 @@ from jaxsfm.bench.scenes import Subset
 from jaxsfm.bench.subset_models import SubsetModel, dense_models, naive_models, rootsift_models
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose, read_poses
+from jaxsfm.errors import UserError
 
 
 def test_every_image_of_a_strecha_set_is_the_night_once(strecha, tmp_path):
@@ -113,6 +115,40 @@ def test_a_subset_is_made_of_its_own_photos_alone(scene, simple, tmp_path, monke
             assert subset.night in poses and set(poses) <= {*subset.day, subset.night}
             assert (matches is None) == (subset.night not in made.truth)
             assert matches is None or 0.5 * matches.number < matches.correct <= matches.number
+
+
+@pytest.mark.slow
+def test_a_subset_without_a_model_and_one_of_other_photos_leave_nothing_to_the_next(
+    simple, tmp_path
+):
+    """The first subset has three unlike photos; the next ones have none of them."""
+    room = tmp_path / "room"
+    shutil.copytree(simple / "room", room)
+    made = scenes.simple_scene(room)
+    night = made.subsets[0].night
+    noise = np.random.default_rng(0).integers(0, 255, (3, 240, 320, 3), np.uint8)
+    for name, pixels in zip(("n0.png", "n1.png", "n2.png"), noise, strict=True):
+        cv2.imwrite(str(room / name), pixels)
+        made.images[name] = dataclasses.replace(made.images[night], name=name, path=room / name)
+        made.truth[name] = made.truth[night]
+    odd = Subset(["n0.png", "n1.png"], "n2.png")
+    made = made._replace(subsets=[odd, made.subsets[0], odd])
+    options = DayNightOptions(root=tmp_path, threads=1)
+    first, second, third = dense_models(made, tmp_path, "paper", options)
+    assert first.poses == third.poses == {} and first.matches.correct == 0
+    assert night in second.poses and second.matches.correct > 0
+    assert not list(tmp_path.rglob("features"))
+
+
+@pytest.mark.slow
+def test_a_photo_that_cannot_be_decoded_is_one_sentence(simple, tmp_path):
+    room = tmp_path / "room"
+    shutil.copytree(simple / "room", room)
+    made = scenes.simple_scene(room)
+    path = room / made.subsets[0].night
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(UserError, match=path.name):
+        dense_models(made, tmp_path, "paper", DayNightOptions(root=tmp_path, threads=1))
 
 
 def poses_on_arc(names):

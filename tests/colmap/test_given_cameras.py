@@ -12,10 +12,11 @@ from jaxsfm.colmap.given_cameras import (
     read_camera_list,
     write_camera_list,
 )
-from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
+from jaxsfm.colmap.intrinsics import Intrinsics, check_fits, used_cameras
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 
+CAMERA = Intrinsics(model="SIMPLE_PINHOLE", params=(500.0, 320.0, 240.0))
 FIRST = "day/a.jpg SIMPLE_PINHOLE 640 480 500 320 240"
 LAST = "night/a b.jpg OPENCV 800 600 700 701 400 300 0.1 -0.02 1e-3 0"
 
@@ -46,7 +47,7 @@ def test_a_list_says_the_camera_and_the_size_of_each_photo(tmp_path):
 @pytest.mark.parametrize("text", ["K.txt", "SIMPLE_PINHOLE:500,320,240"])
 def test_one_camera_of_all_photos_is_read_as_before(tmp_path, monkeypatch, text):
     monkeypatch.chdir(tmp_path)
-    Path("K.txt").write_text("500 0 319.5\n0 500 239.5\n0 0 1\n")
+    Path("K.txt").write_text("\ufeff500 0 319.5\n0 500 239.5\n0 0 1\n", encoding="utf-8")
     assert parse_cameras(text) == parse_intrinsics(text)
 
 
@@ -69,6 +70,30 @@ def test_a_damaged_list_is_refused_naming_file_and_line(tmp_path, lines, message
         parse_cameras(str(path))
     assert str(raised.value).startswith(f"--intrinsics {path}")
     assert message in str(raised.value)
+
+
+@pytest.mark.parametrize("first", ["\ufeff", ""])
+@pytest.mark.parametrize("name", ["1 (2).jpg", "2024,01.jpg", "a\tb.jpg", "SIMPLE_PINHOLE 7.jpg"])
+def test_names_that_begin_as_a_matrix_does_or_have_blanks_are_those_of_a_list(
+    tmp_path, name, first
+):
+    path = tmp_path / "cameras.txt"
+    path.write_text(f"{first}{name} SIMPLE_PINHOLE 640 480 500 320 240\n", encoding="utf-8")
+    assert list(parse_cameras(str(path))) == [name]
+
+
+@pytest.mark.parametrize("name", ["#a.jpg", " a.jpg", "a.jpg "])
+def test_a_name_that_a_list_cannot_hold_is_not_written(tmp_path, name):
+    with pytest.raises(UserError, match=r"a\.jpg.*cannot hold this name"):
+        write_camera_list(tmp_path / "list.txt", {name: CAMERA}, {name: (640, 480)})
+    assert not (tmp_path / "list.txt").exists()
+
+
+def test_a_run_depends_on_the_cameras_of_its_own_photos_alone(tmp_path):
+    images = [ImageFile(name="a.jpg", path=tmp_path / "a", size=(640, 480), sha256="a")]
+    known = {"a.jpg": CAMERA, "b.jpg": CAMERA}
+    assert used_cameras(known, images) == {"a.jpg": CAMERA}
+    assert used_cameras(CAMERA, images) is CAMERA
 
 
 def test_a_photo_that_is_not_on_the_list_or_has_another_size_is_named(tmp_path):
@@ -103,9 +128,11 @@ def test_photos_with_equal_cameras_share_one(tmp_path):
         ("other/a.jpg", "a.jpg"),
         ("/photos/day/a.jpg", "a.jpg"),
         ("night/b.jpg", None),
+        ("/x/c.jpg", "/x/c.jpg"),
+        ("y/x/c.jpg", None),
         ("night/aa.jpg", None),
     ],
 )
 def test_a_photo_has_the_longest_name_that_its_path_ends_with(path, name):
-    known = dict.fromkeys(["a.jpg", "night/a.jpg", "x/night/b.jpg"], None)
+    known = dict.fromkeys(["a.jpg", "night/a.jpg", "x/night/b.jpg", "/x/c.jpg"], None)
     assert listed_name(Path(path), known) == name

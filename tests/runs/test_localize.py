@@ -27,7 +27,7 @@ from jaxsfm.report.finished_run import read_run
 from jaxsfm.runs import localize as localize_module
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
-from jaxsfm.runs.queries import camera_of_query
+from jaxsfm.runs.queries import cameras_of_query
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import similar_photos
 from jaxsfm.runs.working_model import camera_prior, read_working_model
@@ -350,10 +350,10 @@ def test_the_camera_of_a_query_is_the_one_of_all_photos_or_that_of_its_path():
     camera = Intrinsics(model="SIMPLE_PINHOLE", params=(320.0, 160.0, 120.0))
     other = dataclasses.replace(camera, params=(330.0, 160.0, 120.0))
     known = {"night/a.png": camera, "a.png": other}
-    assert camera_of_query("a.png", None) is None
-    assert camera_of_query("anything.png", camera) is camera
-    assert camera_of_query("photos/night/a.png", known) is camera
-    assert camera_of_query("photos/a.png", known) is other
+    assert cameras_of_query("a.png", None) is None
+    assert cameras_of_query("anything.png", camera) is camera
+    assert cameras_of_query("photos/night/a.png", known) == {"photos/night/a.png": camera}
+    assert cameras_of_query("photos/a.png", known) == {"photos/a.png": other}
 
 
 def test_wrong_calls_are_one_sentence(plain, photos, scene, tmp_path, capsys):
