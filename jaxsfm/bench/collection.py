@@ -206,7 +206,7 @@ def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Itera
                 models = first_models(database, MapOptions(refine_intrinsics=True)).models
             made = Made(models, seconds, None)
         else:
-            given = RunOptions(pairs=options.pairs, progress=True)
+            given = RunOptions(pairs=options.pairs, keep_features=bool(added), progress=True)
             report = reconstruct_folder(folder, work, config=preset(method), options=given)
             pairs = {each.pair for each in report.pairs.each}
             models = [read_model(work / "sparse" / str(k)) for k in range(len(report.models))]
