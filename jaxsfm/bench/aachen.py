@@ -17,9 +17,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.bench.scenes import PHOTOS, Scene, Subset, inspected, reference_of
+from jaxsfm.bench.scenes import (
+    PHOTOS,
+    Scene,
+    Subset,
+    check_cameras,
+    inspected,
+    reference_of,
+)
 from jaxsfm.colmap.given_cameras import read_camera_list
-from jaxsfm.colmap.intrinsics import Intrinsics, check_fits
+from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
@@ -129,7 +136,7 @@ def read_cameras(root: Path) -> dict[str, Intrinsics]:
 
 
 def _known_cameras(
-    root: Path, images: Mapping[str, ImageFile], cameras: Mapping[str, Intrinsics]
+    root: Path, images: dict[str, ImageFile], cameras: Mapping[str, Intrinsics]
 ) -> dict[str, Intrinsics]:
     """The cameras of the photos that are used, after a check of their sizes."""
     for name in images:
@@ -139,10 +146,7 @@ def _known_cameras(
                 "queries/night_time_queries_with_intrinsics.txt or database_intrinsics.txt"
             )
     known = {name: cameras[name] for name in images}
-    try:
-        check_fits(known, {name: image.size for name, image in images.items()})
-    except UserError as error:
-        raise UserError(f"--root {root}: {error}") from error
+    check_cameras(known, images, root)
     return known
 
 

@@ -92,13 +92,25 @@ def _known_camera(path: Path, images: dict[str, ImageFile]) -> KnownCameras | No
         return None
     try:
         text = path.read_text(encoding="utf-8").strip()
-        spoken = text.partition(":")[0] in MODELS
-        found = parse_intrinsics(text) if spoken else parse_cameras(str(path))
-        check_fits(found, {name: image.size for name, image in images.items()})
+        found = parse_cameras(text if text.partition(":")[0] in MODELS else str(path))
     except (OSError, UnicodeDecodeError, UserError) as error:
-        why = str(error).removeprefix("--intrinsics").strip(" :")
-        raise UserError(f"--root: {path}: {why}") from error
+        raise _of_root(path, error) from error
+    check_cameras(found, images, path)
     return found
+
+
+def check_cameras(known: KnownCameras, images: dict[str, ImageFile], path: Path) -> None:
+    """Raise UserError, which names a path, unless cameras are those of images."""
+    try:
+        check_fits(known, {name: image.size for name, image in images.items()})
+    except UserError as error:
+        raise _of_root(path, error) from error
+
+
+def _of_root(path: Path, error: Exception) -> UserError:
+    """An error in what was found below `--root`, not in `--intrinsics`, which was not given."""
+    why = str(error).removeprefix("--intrinsics").strip(" :")
+    return UserError(f"--root: {path}: {why}")
 
 
 def simple_scene(folder: Path) -> Scene:

@@ -1,5 +1,6 @@
 """Reconstruct the subsets of a day and night scene by a method."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 from typing import NamedTuple
@@ -131,9 +132,11 @@ def _written_cameras(scene: Scene, path: Path) -> str | None:
     """The value of `--intrinsics`: a list of the scene's cameras; None if they are not known."""
     if scene.camera is None:
         return None
-    known = {name: camera_of(scene.camera, image) for name, image in scene.images.items()}
-    sizes = {name: image.size for name, image in scene.images.items()}
-    write_camera_list(path, known, sizes)
+    known = {
+        name: dataclasses.replace(camera_of(scene.camera, image), size=image.size)
+        for name, image in scene.images.items()
+    }
+    write_camera_list(path, known)
     return str(path)
 
 

@@ -34,12 +34,14 @@ def _numbers(texts: list[str], where: str) -> list[float]:
     return values
 
 
-def _from_matrix(path: Path) -> Intrinsics:
-    where = f"--intrinsics {path}"
+def _text_of(path: Path, where: str) -> str:
     try:
-        text = path.read_text(encoding=ENCODING)
+        return path.read_text(encoding=ENCODING)
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{where}: cannot be read as text") from error
+
+
+def _from_matrix(text: str, where: str) -> Intrinsics:
     values = _numbers(text.replace(",", " ").split(), where)
     if len(values) != 9:
         raise UserError(f"{where}: expected the 9 numbers of a 3 x 3 matrix; got {len(values)}")
@@ -62,7 +64,8 @@ def parse_intrinsics(text: str) -> Intrinsics:
     if not colon or model not in MODELS:
         path = Path(text)
         if path.is_file():
-            return _from_matrix(path)
+            where = f"--intrinsics {path}"
+            return _from_matrix(_text_of(path, where), where)
         if colon and model.isupper():
             raise UserError(
                 f"--intrinsics: unknown camera model {model!r}; one of {', '.join(MODELS)}"
@@ -86,20 +89,23 @@ def parse_intrinsics(text: str) -> Intrinsics:
 def parse_cameras(text: str) -> KnownCameras:
     """What `parse_intrinsics` reads, or the cameras of a list (`read_camera_list`) by photo."""
     path = Path(text)
-    if not path.is_file() or _is_matrix(path):
+    if not path.is_file():
         return parse_intrinsics(text)
-    found = read_camera_list(path, "--intrinsics")
+    where = f"--intrinsics {path}"
+    content = _text_of(path, where)
+    if _is_matrix(content):
+        return _from_matrix(content, where)
+    found = _from_list(content, where)
     if not found:
-        raise UserError(f"--intrinsics {path}: neither a 3 x 3 matrix nor a list of cameras")
+        raise UserError(f"{where}: neither a 3 x 3 matrix nor a list of cameras")
     return found
 
 
-def _is_matrix(path: Path) -> bool:
-    """Whether a file begins with a number, and has no line of a list."""
+def _is_matrix(text: str) -> bool:
+    """Whether a text begins with a number, and has no line of a list."""
     try:
-        text = path.read_text(encoding=ENCODING)
         float(text.replace(",", " ").split()[0])
-    except (ValueError, OSError, IndexError):
+    except (ValueError, IndexError):
         return False
     return not any(_LINE.fullmatch(line.strip()) for line in text.splitlines())
 
@@ -117,19 +123,20 @@ def read_camera_list(path: Path, option: str) -> dict[str, Intrinsics]:
       UserError: a line is anything else, or gives a photo a second camera.
     """
     where = f"{option} {path}"
-    try:
-        lines = path.read_text(encoding=ENCODING).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{where}: cannot be read as text") from error
+    return _from_list(_text_of(path, where), where)
+
+
+def _from_list(text: str, where: str) -> dict[str, Intrinsics]:
     found: dict[str, Intrinsics] = {}
-    for number, line in enumerate(map(str.strip, lines), 1):
+    for number, line in enumerate(map(str.strip, text.splitlines()), 1):
         if not line or line.startswith("#"):
             continue
         try:
             name, camera = _listed(line)
         except (ValueError, UserError) as error:
+            why = str(error).removeprefix("--intrinsics ")
             raise UserError(
-                f"{where}: line {number} is not NAME MODEL WIDTH HEIGHT PARAMETERS ({error}): "
+                f"{where}: line {number} is not NAME MODEL WIDTH HEIGHT PARAMETERS ({why}): "
                 f"{line[:80]!r}"
             ) from error
         if found.setdefault(name, camera) != camera:
@@ -137,25 +144,22 @@ def read_camera_list(path: Path, option: str) -> dict[str, Intrinsics]:
     return found
 
 
-def write_camera_list(
-    path: Path, known: Mapping[str, Intrinsics], sizes: Mapping[str, tuple[int, int]]
-) -> None:
-    """Write a list that `read_camera_list` reads.
-
-    Args:
-      sizes: (width, height) of the photos, by name.
+def write_camera_list(path: Path, known: Mapping[str, Intrinsics]) -> None:
+    """Write cameras that say the size of their photos as a list that `read_camera_list` reads.
 
     Raises:
       UserError: a name cannot be read back from a line.
+      ValueError: a camera does not say the size.
     """
-    for name in known:
+    lines = []
+    for name, camera in known.items():
         if name != name.strip() or name.startswith("#"):
             raise UserError(f"{name!r}: a list of cameras cannot hold this name")
-    lines = [
-        " ".join([name, camera.model, *map(str, (*sizes[name], *map(float, camera.params)))])
-        for name, camera in known.items()
-    ]
-    write_atomic(path, "".join(f"{line}\n" for line in lines).encode())
+        if camera.size is None:
+            raise ValueError(f"the camera of {name} must have a size; got None")
+        numbers = (*camera.size, *map(float, camera.params))
+        lines.append(" ".join([name, camera.model, *map(str, numbers)]) + "\n")
+    write_atomic(path, "".join(lines).encode())
 
 
 def _listed(line: str) -> tuple[str, Intrinsics]:

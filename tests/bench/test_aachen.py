@@ -163,6 +163,7 @@ def test_damaged_data_are_named_before_the_first_run(copy, capsys, file, text, w
     assert main(["bench", "daynight", "--root", str(copy), "--methods", "paper"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("jaxsfm: ") and "Traceback" not in error
+    assert "--intrinsics" not in error  # which was not given
     for word in words:
         assert word in error
 

@@ -112,6 +112,10 @@ def test_a_list_gives_each_photo_its_camera_and_equal_ones_are_shared(
     found = rows(copied, "select name, params from images join cameras using (camera_id)")
     assert {name: np.frombuffer(params)[0] for name, params in found} == focal
     assert rows(copied, "select count(*) from cameras") == [(2,)]
+    capsys.readouterr()
+    path.write_text(path.read_text() + "another.png SIMPLE_PINHOLE 320 240 500 160 120\n")
+    run(scene, copied, "--intrinsics", path, "--refine", "0")
+    assert "mapped: as before" in capsys.readouterr().err
     path.write_text("view0.png SIMPLE_PINHOLE 320 240 320 160 120\n")
     args = ["reconstruct", str(scene / "images"), "--out", str(copied), "--intrinsics", str(path)]
     assert main(args) == 2

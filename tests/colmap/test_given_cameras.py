@@ -40,7 +40,7 @@ def test_a_list_says_the_camera_and_the_size_of_each_photo(tmp_path):
     }
     assert found == read_camera_list(path, "--root")
     again = tmp_path / "again.txt"
-    write_camera_list(again, found, {name: camera.size for name, camera in found.items()})
+    write_camera_list(again, found)
     assert parse_cameras(str(again)) == found
 
 
@@ -85,7 +85,7 @@ def test_names_that_begin_as_a_matrix_does_or_have_blanks_are_those_of_a_list(
 @pytest.mark.parametrize("name", ["#a.jpg", " a.jpg", "a.jpg "])
 def test_a_name_that_a_list_cannot_hold_is_not_written(tmp_path, name):
     with pytest.raises(UserError, match=r"a\.jpg.*cannot hold this name"):
-        write_camera_list(tmp_path / "list.txt", {name: CAMERA}, {name: (640, 480)})
+        write_camera_list(tmp_path / "list.txt", {name: CAMERA})
     assert not (tmp_path / "list.txt").exists()
 
 
