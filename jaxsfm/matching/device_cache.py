@@ -11,11 +11,14 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxsfm.core.pair_shape import Products
 from jaxsfm.core.sharded import join_everywhere
-from jaxsfm.core.types import JoinedFeatures
+from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart
 from jaxsfm.io.features import ImageFeatures, pad_features
+from jaxsfm.io.traced_programs import Traced
 
 Name = TypeVar("Name")
 Loaded = TypeVar("Loaded")
+
+_join = Traced(join_everywhere, DenseFeatures, JoinedFeatures, OctavePart)
 
 
 def tile_order(pairs: Sequence[tuple[Name, Name]], side: int) -> list[tuple[Name, Name]]:
@@ -50,7 +53,7 @@ def put_on_devices(
 ) -> DeviceFeatures:
     """Join an image's octaves on all devices of a mesh, padded to `num_coarse` coarse cells."""
     bare = features.dense._replace(coarse=(), fine=())
-    joined = join_everywhere(pad_features(features.dense, num_coarse), mesh=mesh, products=products)
+    joined = _join(pad_features(features.dense, num_coarse), mesh=mesh, products=products)
     return DeviceFeatures(features._replace(dense=bare), joined)
 
 

@@ -1,7 +1,4 @@
-"""Extraction and matching as programs that run without jaxsfm (`jax.export`).
-
-Needs the package flatbuffers (`pip install 'jaxsfm[export]'`).
-"""
+"""Extraction and matching as programs that run without jaxsfm (`jax.export`)."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -17,7 +14,6 @@ from jaxsfm.core.lanes import in_turn_on_cpus
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pair
 from jaxsfm.core.types import JoinedFeatures, OctavePart
-from jaxsfm.errors import UserError
 from jaxsfm.io.features import feature_capacity, padded_size
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import extraction_settings
@@ -57,9 +53,6 @@ def export_programs(
       batch: the extraction is for any number of photos. CPUs compute them in turn, and accelerators
         all together. `jaxsfm.matching.execution.ACCELERATOR_BYTES_PER_PIXEL` is the memory that a
         run plans for.
-
-    Raises:
-      UserError: flatbuffers is not installed.
     """
     capacity = feature_capacity(size)
     settings = extraction_settings(weights, config, capacity.num_coarse)
@@ -90,16 +83,11 @@ def export_programs(
         any_number = export.symbolic_shape("photos")
         given = tuple(jax.ShapeDtypeStruct((*any_number, *x.shape), x.dtype) for x in given)
     number = jax.ShapeDtypeStruct((), jnp.uint32)
-    try:
-        return Programs(
-            bytes(_exported(partial(features, parameters), platforms)(*given).serialize()),
-            bytes(_exported(matches, platforms)(number, found, found).serialize()),
-        )
-    except ImportError as error:
-        raise UserError(
-            "exporting programs needs flatbuffers: pip install 'jaxsfm[export]'"
-        ) from error
+    return Programs(
+        _exported(partial(features, parameters), given, platforms),
+        _exported(matches, (number, found, found), platforms),
+    )
 
 
-def _exported(function, platforms: Sequence[str]):
-    return export.export(jax.jit(function), platforms=list(platforms))
+def _exported(function, given: Sequence, platforms: Sequence[str]) -> bytes:
+    return bytes(export.export(jax.jit(function), platforms=list(platforms))(*given).serialize())

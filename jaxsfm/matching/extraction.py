@@ -25,6 +25,7 @@ from jaxsfm.io.features import (
     without_unused,
 )
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
+from jaxsfm.io.traced_programs import Traced
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import (
     ONE_AT_A_TIME,
@@ -33,6 +34,8 @@ from jaxsfm.matching.execution import (
     overlap_batches,
     select_devices,
 )
+
+_extract = Traced(extract_batch, DenseFeatures)
 
 READERS = 8
 """Threads that decode images at most. A JPEG takes 20 ms, and an accelerator takes 150 images a
@@ -53,7 +56,7 @@ def _start(
     for k, each in enumerate(working):
         height, width = sizes[k] = each.rgb.shape[:2]
         images[k, :height, :width] = each.rgb
-    return extract_batch(
+    return _extract(
         weights.params,
         weights.scores(config),
         images,

@@ -15,11 +15,12 @@ from jax.sharding import Mesh
 
 from jaxsfm.config import Config, PairShape
 from jaxsfm.core.sharded import match_batch, pick
-from jaxsfm.core.types import JoinedFeatures, PairMatches, Status, Thresholds
+from jaxsfm.core.types import JoinedFeatures, OctavePart, PairMatches, Status, Thresholds
 from jaxsfm.io.features import FeatureCapacity, ImageFeatures
 from jaxsfm.io.orientation import stored_points
 from jaxsfm.io.pairs import Name, PairResult, make_pair
 from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.traced_programs import Traced
 from jaxsfm.matching.device_cache import (
     DeviceFeatures,
     ImageCache,
@@ -34,6 +35,8 @@ from jaxsfm.matching.execution import (
     pairs_at_once,
     select_devices,
 )
+
+_match = Traced(match_batch, JoinedFeatures, OctavePart, Thresholds, PairMatches)
 
 
 def match_features(
@@ -91,7 +94,7 @@ def match_pairs(
     def start(batch: _Batch) -> _Started:
         missing = batch.side_by_side * mesh.size - len(batch.images)
         filled = batch.images + batch.images[-1:] * missing
-        found = match_batch(
+        found = _match(
             root,
             _identities(filled, mesh),
             tuple(_columns(filled, mesh)),

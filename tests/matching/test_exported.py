@@ -12,9 +12,7 @@ from jaxsfm.config import Config, preset
 from jaxsfm.core.features import extract
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair import match_pair
-from jaxsfm.errors import UserError
 from jaxsfm.io.features import feature_capacity, padded_size
-from jaxsfm.matching import exported
 from jaxsfm.matching.exported import PLATFORMS, export_programs
 from jaxsfm.matching.extraction import extraction_settings
 from jaxsfm.matching.pair_matching import pair_shape, thresholds
@@ -46,7 +44,6 @@ def settings_of(name: str) -> Config:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "default"])
 def test_programs_run_without_jaxsfm_and_give_what_it_gives(weights, photos, tmp_path, name):
-    pytest.importorskip("flatbuffers")
     config = settings_of(name)
     programs = export_programs(weights, SIZE, config=config)
     for part, data in programs._asdict().items():
@@ -80,7 +77,6 @@ def test_programs_run_without_jaxsfm_and_give_what_it_gives(weights, photos, tmp
 @pytest.mark.parametrize("name", ["paper", "default"])
 def test_a_program_for_any_number_of_photos_gives_what_one_photo_gives(weights, photos, name):
     """Bit for bit on a CPU, where the photos of a batch are computed in turn."""
-    pytest.importorskip("flatbuffers")
     config = settings_of(name)
     one, many = (
         jax.export.deserialize(
@@ -99,12 +95,3 @@ def test_a_program_for_any_number_of_photos_gives_what_one_photo_gives(weights, 
                 *map(jax.tree.leaves, (found, one.call(padded[k], sizes[k]))), strict=True
             ):
                 np.testing.assert_array_equal(x[k], y)
-
-
-def test_without_flatbuffers_the_extra_is_named(weights, monkeypatch):
-    def missing(*_):
-        raise ImportError("No module named 'flatbuffers'")
-
-    monkeypatch.setattr(exported, "_exported", missing)
-    with pytest.raises(UserError, match=r"pip install 'jaxsfm\[export\]'"):
-        export_programs(weights, SIZE, config=preset("paper"))

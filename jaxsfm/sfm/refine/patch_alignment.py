@@ -13,6 +13,10 @@ import numpy as np
 from jaxsfm.config import Refinement
 from jaxsfm.core import align as align_core
 from jaxsfm.core.align import Aligned, Patch, Templates
+from jaxsfm.io.traced_programs import Traced
+
+_make_templates = Traced(align_core.make_templates, Patch, Templates)
+_align = Traced(align_core.align, Patch, Templates, Aligned)
 
 
 class AlignmentLimits(NamedTuple):
@@ -57,7 +61,7 @@ class PaddedImage(NamedTuple):
 
 def make_templates(image: PaddedImage, xy: np.ndarray, patch: Patch) -> Templates:
     """Reference patches around keypoints (n, 2) of an image; on the device, without waiting."""
-    return align_core.make_templates(*image, jax.device_put(np.float32(xy)), patch)
+    return _make_templates(*image, jax.device_put(np.float32(xy)), patch)
 
 
 def align_patches(
@@ -77,7 +81,7 @@ def align_patches(
       iterations: number of steps.
     """
     start, affine = jax.device_put((np.float32(start), np.float32(affine)))
-    return align_core.align(*image, templates, start, affine, patch, iterations=iterations)
+    return _align(*image, templates, start, affine, patch, iterations=iterations)
 
 
 def to_host(calls: Sequence[tuple[int, Aligned]]) -> Aligned:

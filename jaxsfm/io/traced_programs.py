@@ -1,0 +1,156 @@
+"""Traced programs are kept between runs, beside the compiled ones (`jaxsfm.io.compiled_programs`).
+
+JAX finds a compiled program by the code that it was compiled from. To have this code, each process
+traces the Python function and lowers the result. This takes as long as a photo's features, for each
+size of photos or of views (docs/decisions/accelerators.md#programs-between-runs).
+
+A traced program is kept as an exported one (`jax.export`). Such a file holds the code of operations
+and names of containers, and nothing is unpickled.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+from collections.abc import Callable, Hashable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Generic, ParamSpec, TypeVar
+
+import jax
+from jax import export
+from jax.sharding import Mesh
+
+import jaxsfm.core
+from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import atomic_file
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+FOLDER, ENTRY = "traced", "{}.jaxexport"
+"""The folder inside the one of compiled programs, and a file in it."""
+_DIGEST = hashlib.sha256
+_SWITCHES = (
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_numpy_dtype_promotion",
+)
+"""Settings of JAX that change what a function is traced to."""
+
+
+class Traced(Generic[P, T]):
+    """A jitted function of `jaxsfm.core` whose traced programs are kept.
+
+    It is called as the function is: arrays by position, static arguments by name. The result is the
+    same, bit for bit, because the same code is compiled.
+
+    Programs are kept if compiled ones are, and on one CPU only. Whether the programs of several
+    devices and of accelerators can be kept in the same way has not been tried.
+    """
+
+    def __init__(self, function: Callable[P, T], *containers: type) -> None:
+        """Keep the programs of `function`.
+
+        Args:
+          containers: the NamedTuples among its arguments and its result, which files name.
+        """
+        self._function = function
+        self._containers = containers
+        self._programs: dict[Hashable, Callable[..., T]] = {}
+
+    def __call__(self, *args: P.args, **static: P.kwargs) -> T:
+        """The result of the function."""
+        folder = _folder()
+        if folder is None:
+            return self._function(*args, **static)
+        known = (_shapes(args), tuple(sorted(static.items())), _switches())
+        if known not in self._programs:
+            self._programs[known] = self._program(folder, args, static)
+        return self._programs[known](*args)
+
+    def _program(self, folder: Path, args: Sequence[object], static: dict) -> Callable[..., T]:
+        """The program for such arguments, from its file if there is one."""
+        for each in self._containers:
+            _name_in_files(each)
+        path = folder / ENTRY.format(self._key(args, static))
+        code = _read(path)
+        if code is None:
+            function = jax.jit(functools.partial(self._function, **static))
+            code = bytes(export.export(function)(*args).serialize())
+            with contextlib.suppress(OSError, UserError):  # the next process traces it again
+                _write(path, code)
+        exported = export.deserialize(bytearray(code))
+
+        def program(*args: object) -> T:
+            return exported.call(*args)  # pyright: ignore[reportReturnType]
+
+        program.__name__ = self._function.__name__  # for JAX's logs and profiles
+        return jax.jit(program)
+
+    def _key(self, args: Sequence[object], static: dict) -> str:
+        """What fixes a program: its function, the arguments, the code and the packages.
+
+        A mesh is left out, because there is one device.
+        """
+        settings = {name: x for name, x in sorted(static.items()) if not isinstance(x, Mesh)}
+        names = self._function.__module__, self._function.__qualname__
+        parts = (*names, repr(_shapes(args)), repr(settings), repr(_switches()), *_made_by())
+        return _DIGEST("\n".join(parts).encode()).hexdigest()
+
+
+def _folder() -> Path | None:
+    """Where traced programs are kept; None if they are not."""
+    compiled = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
+    if not compiled or "://" in compiled:
+        return None
+    if jax.config.jax_disable_jit or not jax.config.jax_enable_compilation_cache:  # pyright: ignore
+        return None
+    one_cpu = jax.default_backend() == "cpu" and jax.local_device_count() == 1
+    return Path(compiled) / FOLDER if one_cpu else None
+
+
+def _shapes(args: Sequence[object]) -> Hashable:
+    """The structure of arguments, and the shape and the type of each array."""
+    leaves, tree = jax.tree.flatten(args)
+    kinds = [(each.shape, str(each.dtype)) for each in map(jax.typeof, leaves)]
+    return tree, tuple(kinds)
+
+
+def _switches() -> tuple[object, ...]:
+    return tuple(getattr(jax.config, name) for name in _SWITCHES)
+
+
+@functools.cache
+def _made_by() -> tuple[str, ...]:
+    """The code of the core, and the packages that trace it."""
+    code = _DIGEST()
+    for path in sorted(Path(jaxsfm.core.__path__[0]).rglob("*.py")):
+        code.update(path.read_bytes())
+    return code.hexdigest(), *(f"{name} {version(name)}" for name in ("jax", "jaxlib", "flax"))
+
+
+@functools.cache
+def _name_in_files(container: type) -> None:
+    """Say by which name a NamedTuple is found again in a file."""
+    name = f"{container.__module__}.{container.__qualname__}"
+    export.register_namedtuple_serialization(container, serialized_name=name)
+
+
+def _read(path: Path) -> bytes | None:
+    """The code in a file that begins with its digest; None if it is not there or not whole."""
+    try:
+        written = path.read_bytes()
+    except OSError:
+        return None
+    size = _DIGEST().digest_size
+    digest, code = written[:size], written[size:]
+    return code if _DIGEST(code).digest() == digest else None
+
+
+def _write(path: Path, code: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as file:
+        file.write(_DIGEST(code).digest() + code)
