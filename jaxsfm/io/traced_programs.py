@@ -11,22 +11,25 @@ and names of containers, and nothing is unpickled.
 import contextlib
 import functools
 import hashlib
-import os
+import logging
 from collections.abc import Callable, Hashable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Generic, ParamSpec, TypeVar
 
 import jax
+import numpy as np
 from jax import export
 from jax.sharding import Mesh
 
 import jaxsfm.core
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import atomic_file
+from jaxsfm.io.versions import package_versions
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+logger = logging.getLogger("jaxsfm")
 
 FOLDER, ENTRY = "traced", "{}.jaxexport"
 """The folder inside the one of compiled programs, and a file in it."""
@@ -37,18 +40,23 @@ _SWITCHES = (
     "jax_default_prng_impl",
     "jax_threefry_partitionable",
     "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
 )
-"""Settings of JAX that change what a function is traced to."""
+"""Settings of JAX that change what a function is traced to, or whether it can be traced."""
 
 
 class Traced(Generic[P, T]):
     """A jitted function of `jaxsfm.core` whose traced programs are kept.
 
     It is called as the function is: arrays by position, static arguments by name. The result is the
-    same, bit for bit, because the same code is compiled.
+    same, bit for bit.
 
     Programs are kept if compiled ones are, and on one CPU only. Whether the programs of several
-    devices and of accelerators can be kept in the same way has not been tried.
+    devices and of accelerators can be kept in the same way has not been tried. A program that
+    cannot be kept is traced as if there was no folder.
+
+    What is changed in the modules of the core after they were imported, as tests do, goes unseen if
+    the program has been kept.
     """
 
     def __init__(self, function: Callable[P, T], *containers: type) -> None:
@@ -68,7 +76,11 @@ class Traced(Generic[P, T]):
             return self._function(*args, **static)
         known = (_shapes(args), tuple(sorted(static.items())), _switches())
         if known not in self._programs:
-            self._programs[known] = self._program(folder, args, static)
+            try:
+                self._programs[known] = self._program(folder, args, static)
+            except Exception as error:  # whatever it is, the function itself may not have it
+                logger.debug("%s: its program is not kept: %s", self._function.__name__, error)
+                self._programs[known] = functools.partial(self._function, **static)
         return self._programs[known](*args)
 
     def _program(self, folder: Path, args: Sequence[object], static: dict) -> Callable[..., T]:
@@ -80,8 +92,10 @@ class Traced(Generic[P, T]):
         if code is None:
             function = jax.jit(functools.partial(self._function, **static))
             code = bytes(export.export(function)(*args).serialize())
-            with contextlib.suppress(OSError, UserError):  # the next process traces it again
-                _write(path, code)
+            # An edit of the core since it was imported is not in this program, but in later ones.
+            if code_of_core() == _CODE:
+                with contextlib.suppress(OSError, UserError):  # the next process traces it again
+                    _write(path, code)
         exported = export.deserialize(bytearray(code))
 
         def program(*args: object) -> T:
@@ -103,10 +117,11 @@ class Traced(Generic[P, T]):
 
 def _folder() -> Path | None:
     """Where traced programs are kept; None if they are not."""
-    compiled = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
-    if not compiled or "://" in compiled:
+    config = jax.config
+    compiled = config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if not compiled or "://" in compiled or _CODE is None:
         return None
-    if jax.config.jax_disable_jit or not jax.config.jax_enable_compilation_cache:  # pyright: ignore
+    if config.jax_disable_jit or not config.jax_enable_compilation_cache:  # pyright: ignore
         return None
     one_cpu = jax.default_backend() == "cpu" and jax.local_device_count() == 1
     return Path(compiled) / FOLDER if one_cpu else None
@@ -115,21 +130,32 @@ def _folder() -> Path | None:
 def _shapes(args: Sequence[object]) -> Hashable:
     """The structure of arguments, and the shape and the type of each array."""
     leaves, tree = jax.tree.flatten(args)
-    kinds = [(each.shape, str(each.dtype)) for each in map(jax.typeof, leaves)]
-    return tree, tuple(kinds)
+    return tree, tuple((np.shape(each), getattr(each, "dtype", type(each))) for each in leaves)
 
 
 def _switches() -> tuple[object, ...]:
     return tuple(getattr(jax.config, name) for name in _SWITCHES)
 
 
+def code_of_core() -> str | None:
+    """A digest of all modules of the core as they are on the disk; None if they are not there."""
+    folder, digest = Path(jaxsfm.core.__path__[0]), _DIGEST()
+    modules = sorted(folder.rglob("*.py"))
+    for path in modules:
+        code = path.read_bytes()
+        digest.update(f"{path.relative_to(folder).as_posix()} {len(code)}\n".encode())
+        digest.update(code)
+    return digest.hexdigest() if modules else None
+
+
+_CODE = code_of_core()
+"""That of the modules that are imported: they have just been, or will be now."""
+
+
 @functools.cache
 def _made_by() -> tuple[str, ...]:
     """The code of the core, and the packages that trace it."""
-    code = _DIGEST()
-    for path in sorted(Path(jaxsfm.core.__path__[0]).rglob("*.py")):
-        code.update(path.read_bytes())
-    return code.hexdigest(), *(f"{name} {version(name)}" for name in ("jax", "jaxlib", "flax"))
+    return str(_CODE), *(f"{name} {number}" for name, number in package_versions().items())
 
 
 @functools.cache

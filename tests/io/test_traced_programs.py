@@ -7,15 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from core_calls import calls
 
-from jaxsfm.config import preset
-from jaxsfm.core.sharded import extract_batch
-from jaxsfm.core.types import DenseFeatures
+import jaxsfm.core
+from jaxsfm.core.align import Aligned, Patch, Templates
+from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart, PairMatches, Thresholds
 from jaxsfm.io import traced_programs
-from jaxsfm.io.features import feature_capacity, padded_size
-from jaxsfm.io.traced_programs import FOLDER, Traced
-from jaxsfm.matching.execution import ONE_AT_A_TIME, select_devices
-from jaxsfm.matching.extraction import extraction_settings
+from jaxsfm.io.traced_programs import FOLDER, Traced, code_of_core
 
 
 class Both(NamedTuple):
@@ -37,13 +35,28 @@ def noisy(key: jax.Array, both: Both, *, times: int = 1) -> Both:
     return Both(both.noise + noise, times * both.scaled)
 
 
+class Unnamed(NamedTuple):
+    """A container that is not declared."""
+
+    x: jax.Array
+
+
+@jax.jit
+def unnamed(given: Unnamed) -> Unnamed:
+    """A function of it."""
+    return Unnamed(2 * given.x)
+
+
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """The folder of compiled programs; `noisy` has not been traced."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+def folder(tmp_path):
+    """The folder of traced programs; `noisy` has not been traced."""
+    option = "jax_compilation_cache_dir"
+    before = getattr(jax.config, option)
+    jax.config.update(option, str(tmp_path))
     traced.clear()
     jax.clear_caches()
-    return tmp_path / FOLDER
+    yield tmp_path / FOLDER
+    jax.config.update(option, before)
 
 
 def both(rows: int = 3) -> Both:
@@ -131,13 +144,16 @@ def test_a_folder_that_cannot_be_written_loses_nothing(folder):
 
 
 @pytest.mark.parametrize(
-    "without", ["a folder", "a local folder", "one device", "a CPU", "jit", "compiled programs"]
+    "without",
+    ["a folder", "a local folder", "one device", "a CPU", "jit", "compiled programs", "sources"],
 )
 def test_nothing_is_kept_without(folder, monkeypatch, without):
     if without == "a folder":
-        monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+        jax.config.update("jax_compilation_cache_dir", None)
     elif without == "a local folder":
-        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "gs://bucket/programs")
+        jax.config.update("jax_compilation_cache_dir", "gs://bucket/programs")
+    elif without == "sources":
+        monkeypatch.setattr(traced_programs, "_CODE", None)
     elif without == "one device":
         monkeypatch.setattr(jax, "local_device_count", lambda: 2)
     elif without == "a CPU":
@@ -149,40 +165,67 @@ def test_nothing_is_kept_without(folder, monkeypatch, without):
     finally:
         jax.config.update("jax_enable_compilation_cache", True)
     np.testing.assert_array_equal(found.scaled, [0, 2, 4])
-    assert not folder.exists() and traced == [2]
+    assert not folder.exists() and set(traced) == {2}
 
 
-def test_kept_extraction_gives_the_features_of_the_function(folder, weights, photos):
-    config, mesh, size = preset("paper"), select_devices(ONE_AT_A_TIME), (96, 64)
-    images = np.zeros((1, *padded_size(size), 3), np.uint8)
-    images[0, :64, :96] = photos[0][:64, :96]
-    sizes = np.asarray([[64, 96]], np.int32)
-    settings = extraction_settings(weights, config, feature_capacity(size).num_coarse)
-    arguments = weights.params, weights.scores(config), images, sizes
-    expected = extract_batch(*arguments, mesh=mesh, settings=settings)
-    for _ in range(2):
-        kept = Traced(extract_batch, DenseFeatures)
-        found = kept(*arguments, mesh=mesh, settings=settings)
+KEPT = {
+    "align.make_templates": (Patch, Templates),
+    "align.align": (Patch, Templates, Aligned),
+    "sharded.extract_batch": (DenseFeatures,),
+    "sharded.join_everywhere": (DenseFeatures, JoinedFeatures, OctavePart),
+    "sharded.match_batch": (JoinedFeatures, OctavePart, Thresholds, PairMatches),
+}
+"""The functions whose programs are kept, and their containers."""
+
+
+SLOW = "sharded.extract_batch", "sharded.match_batch"
+"""Compiling these takes seconds."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in KEPT]
+)
+def test_a_kept_program_of_the_core_gives_what_its_function_gives(folder, monkeypatch, name):
+    """Bit for bit; the second time without tracing it."""
+    call = calls()[name]
+    function = getattr(call.function, "func", call.function)
+    static = getattr(call.function, "keywords", {})
+    expected = call.function(*call.args)
+    for turn in range(2):
+        if turn:
+            monkeypatch.setattr(traced_programs.export, "export", None)
+        found = Traced(function, *KEPT[name])(*call.args, **static)
+        assert type(found) is type(expected)
         jax.tree.map(np.testing.assert_array_equal, found, expected)
-    assert len(list(folder.iterdir())) == 1
+        assert len(list(folder.iterdir())) == 1
+
+
+def test_a_program_that_cannot_be_kept_is_traced(folder):
+    """Its container has no name in files."""
+    for _ in range(2):
+        found = Traced(unnamed)(Unnamed(np.ones(2, np.float32)))
+        np.testing.assert_array_equal(found.x, 2 * np.ones(2))
+    assert not folder.exists()
+
+
+def test_a_program_traced_before_the_core_was_edited_is_not_kept(folder, monkeypatch):
+    monkeypatch.setattr(traced_programs, "code_of_core", lambda: "edited since")
+    found = in_a_new_process()(jax.random.key(0), both(), times=2)
+    np.testing.assert_array_equal(found.scaled, [0, 2, 4])
+    assert not folder.exists()
 
 
 def test_the_code_of_every_module_of_the_core_fixes_a_program(tmp_path, monkeypatch):
-    """A change anywhere in the core, or a new module, gives new programs."""
-    import jaxsfm.core
-
-    def made_by() -> tuple[str, ...]:
-        traced_programs._made_by.cache_clear()
-        return traced_programs._made_by()
-
-    before = made_by()
-    (tmp_path / "deep").mkdir()
+    """A change anywhere in the core, a new name or a new module gives new programs."""
     monkeypatch.setattr(jaxsfm.core, "__path__", [str(tmp_path)])
-    (tmp_path / "deep" / "module.py").write_text("A = 1")
-    first = made_by()
-    (tmp_path / "deep" / "module.py").write_text("A = 2")
-    assert len({before, first, made_by()}) == 3
-    traced_programs._made_by.cache_clear()
+    assert code_of_core() is None
+    (tmp_path / "deep").mkdir()
+    seen = set()
+    for name, code in (("a", "A = 1"), ("a", "A = 2"), ("b", "A = 2")):
+        (tmp_path / "deep" / f"{name}.py").write_text(code)
+        seen.add(code_of_core())
+    (tmp_path / "deep" / "a.py").unlink()
+    assert len(seen | {code_of_core()}) == 4
 
 
 def test_64_bits_are_another_program(folder):

@@ -340,7 +340,7 @@ def test_matches_are_computed_from_descriptors_of_the_type_that_the_config_says(
         seen.append(found)
         return found
 
-    monkeypatch.setattr(device_cache, "join_everywhere", noted)
+    monkeypatch.setattr(device_cache, "_join", noted)
     bare = [
         each._replace(
             dense=each.dense._replace(coarse=each.dense.coarse[:1], fine=each.dense.fine[:1])

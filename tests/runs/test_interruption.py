@@ -100,7 +100,7 @@ def test_an_interrupt_that_a_callback_swallowed_still_ends_the_run(
 @pytest.mark.parametrize("error, code", [(KeyboardInterrupt, 130), (UserError("gone"), 2)])
 def test_what_has_been_started_is_saved(scene, tmp_path, monkeypatch, owner, stage, error, code):
     """Ctrl-C reaches Python when a batch has just been computed; so does what fails next."""
-    name = {"features": "extract_batch", "matches": "match_batch"}[stage]
+    name = {"features": "_extract", "matches": "_match"}[stage]
     original, calls = getattr(owner, name), [0]
 
     def failing(*args, **kwargs):

@@ -215,7 +215,7 @@ class Unread:
 def test_an_image_is_read_once_and_after_the_next_has_been_started(
     rendered, in_blocks, monkeypatch
 ):
-    events, get, aligned = [], jax.device_get, patch_alignment.align_core.align
+    events, get, aligned = [], jax.device_get, patch_alignment._align
     images = images_of(rendered)
     take = images.take
 
@@ -233,7 +233,7 @@ def test_an_image_is_read_once_and_after_the_next_has_been_started(
 
     monkeypatch.setattr(padding, "CHUNK", 32)  # several calls for each image
     monkeypatch.setattr(images, "take", watched)
-    monkeypatch.setattr(patch_alignment.align_core, "align", unread)
+    monkeypatch.setattr(patch_alignment, "_align", unread)
     monkeypatch.setattr(jax, "device_get", read)
     blocks = blocks_of(rendered, images)
     assert len(blocks) == 3
