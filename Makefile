@@ -18,7 +18,7 @@ demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare it with the
 	rm -rf demo
 	$(BIN)/jaxsfm demo --out demo
 
-test: $(VENV)/.dev ## run the quick tests: at most 8 minutes on two cores
+test: $(VENV)/.dev ## run the quick tests: 8 to 12 minutes on two cores
 	$(PYTEST) -m "not slow"
 
 test-all: $(VENV)/.dev ## run all tests, the slow ones too
