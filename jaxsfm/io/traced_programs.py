@@ -23,7 +23,7 @@ from jax.sharding import Mesh
 
 import jaxsfm.core
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import atomic_file
+from jaxsfm.io.atomic import load_arrays, save_arrays
 from jaxsfm.io.versions import package_versions
 
 P = ParamSpec("P")
@@ -31,9 +31,8 @@ T = TypeVar("T")
 
 logger = logging.getLogger("jaxsfm")
 
-FOLDER, ENTRY = "traced", "{}.jaxexport"
-"""The folder inside the one of compiled programs, and a file in it."""
-_DIGEST = hashlib.sha256
+FOLDER, ENTRY, CODE = "traced", "{}.safetensors", "code"
+"""The folder inside the one of compiled programs, a file in it, and its array."""
 _SWITCHES = (
     "jax_enable_x64",
     "jax_default_matmul_precision",
@@ -88,14 +87,16 @@ class Traced(Generic[P, T]):
         for each in self._containers:
             _name_in_files(each)
         path = folder / ENTRY.format(self._key(args, static))
-        code = _read(path)
-        if code is None:
+        kept = load_arrays(path)
+        if kept:
+            code = kept[CODE].tobytes()
+        else:
             function = jax.jit(functools.partial(self._function, **static))
             code = bytes(export.export(function)(*args).serialize())
             # An edit of the core since it was imported is not in this program, but in later ones.
             if code_of_core() == _CODE:
-                with contextlib.suppress(OSError, UserError):  # the next process traces it again
-                    _write(path, code)
+                with contextlib.suppress(UserError):  # the next process traces it again
+                    save_arrays(path, {CODE: np.frombuffer(code, np.uint8)})
         exported = export.deserialize(bytearray(code))
 
         def program(*args: object) -> T:
@@ -112,7 +113,7 @@ class Traced(Generic[P, T]):
         settings = {name: x for name, x in sorted(static.items()) if not isinstance(x, Mesh)}
         names = self._function.__module__, self._function.__qualname__
         parts = (*names, repr(_shapes(args)), repr(settings), repr(_switches()), *_made_by())
-        return _DIGEST("\n".join(parts).encode()).hexdigest()
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def _folder() -> Path | None:
@@ -139,7 +140,7 @@ def _switches() -> tuple[object, ...]:
 
 def code_of_core() -> str | None:
     """A digest of all modules of the core as they are on the disk; None if they are not there."""
-    folder, digest = Path(jaxsfm.core.__path__[0]), _DIGEST()
+    folder, digest = Path(jaxsfm.core.__path__[0]), hashlib.sha256()
     modules = sorted(folder.rglob("*.py"))
     for path in modules:
         code = path.read_bytes()
@@ -163,20 +164,3 @@ def _name_in_files(container: type) -> None:
     """Say by which name a NamedTuple is found again in a file."""
     name = f"{container.__module__}.{container.__qualname__}"
     export.register_namedtuple_serialization(container, serialized_name=name)
-
-
-def _read(path: Path) -> bytes | None:
-    """The code in a file that begins with its digest; None if it is not there or not whole."""
-    try:
-        written = path.read_bytes()
-    except OSError:
-        return None
-    size = _DIGEST().digest_size
-    digest, code = written[:size], written[size:]
-    return code if _DIGEST(code).digest() == digest else None
-
-
-def _write(path: Path, code: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(path) as file:
-        file.write(_DIGEST(code).digest() + code)

@@ -10,10 +10,10 @@ import pytest
 from core_calls import calls
 
 import jaxsfm.core
-from jaxsfm.core.align import Aligned, Patch, Templates
-from jaxsfm.core.types import DenseFeatures, JoinedFeatures, OctavePart, PairMatches, Thresholds
 from jaxsfm.io import traced_programs
 from jaxsfm.io.traced_programs import FOLDER, Traced, code_of_core
+from jaxsfm.matching import device_cache, extraction, pair_matching
+from jaxsfm.sfm.refine import patch_alignment
 
 
 class Both(NamedTuple):
@@ -171,13 +171,13 @@ def test_nothing_is_kept_without(folder, monkeypatch, without):
 
 
 KEPT = {
-    "align.make_templates": (Patch, Templates),
-    "align.align": (Patch, Templates, Aligned),
-    "sharded.extract_batch": (DenseFeatures,),
-    "sharded.join_everywhere": (DenseFeatures, JoinedFeatures, OctavePart),
-    "sharded.match_batch": (JoinedFeatures, OctavePart, Thresholds, PairMatches),
+    "align.make_templates": patch_alignment._make_templates,
+    "align.align": patch_alignment._align,
+    "sharded.extract_batch": extraction._extract,
+    "sharded.join_everywhere": device_cache._join,
+    "sharded.match_batch": pair_matching._match,
 }
-"""The functions whose programs are kept, and their containers."""
+"""The functions whose programs are kept."""
 
 
 SLOW = "sharded.extract_batch", "sharded.match_batch"
@@ -190,13 +190,12 @@ SLOW = "sharded.extract_batch", "sharded.match_batch"
 def test_a_kept_program_of_the_core_gives_what_its_function_gives(folder, monkeypatch, name):
     """Bit for bit; the second time without tracing it."""
     call = calls()[name]
-    function = getattr(call.function, "func", call.function)
-    static = getattr(call.function, "keywords", {})
+    kept, static = KEPT[name], getattr(call.function, "keywords", {})
     expected = call.function(*call.args)
     for turn in range(2):
         if turn:
             monkeypatch.setattr(traced_programs.export, "export", None)
-        found = Traced(function, *KEPT[name])(*call.args, **static)
+        found = Traced(kept._function, *kept._containers)(*call.args, **static)
         assert type(found) is type(expected)
         jax.tree.map(np.testing.assert_array_equal, found, expected)
         assert len(list(folder.iterdir())) == 1
