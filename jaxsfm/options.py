@@ -176,12 +176,14 @@ class NewPhotosChoice:
       shortlist: With how many photos a new photo is matched. The most similar ones are taken.
       keep_features: Keep the features of the run's photos in its folder (25 MB for a photo of
         1536 x 1024), so that the next call need not compute them again.
+      threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
     """
 
     images: Path | None = None
     intrinsics: str | None = None
     shortlist: int = 20
     keep_features: bool = False
+    threads: int = -1
 
 
 def check_seed(seed: int) -> None:

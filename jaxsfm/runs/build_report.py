@@ -34,7 +34,7 @@ from jaxsfm.runs.working_model import CameraPrior
 from jaxsfm.sfm.evaluation import of_photos
 from jaxsfm.sfm.georeference.georeference import Georeference
 from jaxsfm.sfm.reconstruction import Reconstructed
-from jaxsfm.sfm.register.grow import ExtendedModel
+from jaxsfm.sfm.register.grow import ExtendedModels
 from jaxsfm.sfm.view_graph import Verdict
 
 if TYPE_CHECKING:
@@ -74,8 +74,8 @@ class NewPhotos(NamedTuple):
     """The photos that were added to the folder of a run since."""
 
     images: dict[str, ImageFile]
-    cameras: dict[str, CameraPrior]
-    """The cameras that `images` start with."""
+    cameras: dict[str, list[CameraPrior]]
+    """The cameras that `images` start with, in each model of the run."""
     skipped: dict[str, str]
     """Why a new file cannot be used, by name."""
 
@@ -140,7 +140,7 @@ def _turned(images: Sequence[ImageFile], orientations: Mapping[str, int]) -> dic
 def extended_report(
     run: FinishedRun,
     models: "list[pycolmap.Reconstruction]",
-    grown: ExtendedModel,
+    grown: ExtendedModels,
     new: NewPhotos,
     matches: SavedMatches,
     verified: Mapping[Pair, int],
@@ -188,8 +188,8 @@ def extended_report(
             ),
         ),
         models=[_model_row(model) for model in models],
-        # The model has other photos and points now, which no check has seen.
-        checks=[],
+        # A model with new photos has points now that no check has seen.
+        checks=[None if k in grown.placed.values() else c for k, c in enumerate(old.checks)],
         extended=[*(old.extended or ()), extension],
         evaluation=None,
         evaluation_failed=None,

@@ -1,8 +1,9 @@
 """Extension of a finished run by photos that were added to its folder of photos since.
 
-New photos are matched with their shortlists only. They are registered in the model, whose poses and
-points do not change, and add points of their own (`jaxsfm.sfm.register.grow`). Their matches are
-kept in the run's folder, so a later reconstruction of all photos continues from them.
+New photos are matched with their shortlists only. Each is registered in the model that it fits
+best. The poses and points of the models do not change, and new photos add points of their own
+(`jaxsfm.sfm.register.grow`). Their matches are kept in the run's folder, so a later reconstruction
+of all photos continues from them.
 """
 
 import dataclasses
@@ -31,7 +32,8 @@ from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
     camera_prior,
     photos_of_run,
-    read_working_model,
+    read_working_models,
+    views_for,
     weights_of_run,
 )
 from jaxsfm.runs.write_extension import write_extension
@@ -81,14 +83,16 @@ def _extend(
     images = {name: finished.photos.with_own_mask(image) for name, image in images.items()}
     if not images and not skipped:
         return None
-    seed = finished.report.options.seed
-    model = read_working_model(run / "sparse" / "0", finished.config, seed=seed)
-    names = [view.name for view in model.views]
+    models = read_working_models(finished)
+    names = sorted({view.name for model in models for view in model.views})
     files = _unchanged_photos(finished, usable, names) | images
     intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     taken_with = finished.photos.taken_with
     cameras = {
-        name: camera_prior(image, model.views, intrinsics, taken_with)
+        name: [
+            camera_prior(image, views_for(models, k), intrinsics, taken_with)
+            for k in range(len(models))
+        ]
         for name, image in images.items()
     }
     identity = identity.with_images(images.values())
@@ -96,10 +100,10 @@ def _extend(
     job = Job(
         store=folder,
         weights=weights,
-        config=model.config,
+        config=finished.config,
         engine=engine,
         execution=options.execution,
-        seed=model.seed,
+        seed=finished.report.options.seed,
         progress=options.progress,
     )
     shortlist = shortlist or similar_photos(
@@ -110,11 +114,9 @@ def _extend(
         raise UserError(lost[min(lost_by_run)])
     images = {name: image for name, image in images.items() if name not in lost}
     new = NewPhotos(images, cameras, skipped | lost)
-    photos = Photos(files.values(), model.config)
+    photos = Photos(files.values(), finished.config)
     with folder.publish() as target:
-        report = write_extension(
-            target, finished, model, new, photos, matches, progress=options.progress
-        )
+        report = write_extension(target, finished, models, new, photos, matches, options)
         took = report.seconds.get("extension", 0.0) + time.monotonic() - start
         seconds = report.seconds | {"extension": took}
         report = dataclasses.replace(report, identity=identity, seconds=seconds)
@@ -173,7 +175,7 @@ def _match_new(
 
     Args:
       files: the run's photos and the new ones.
-      names: the photos that may be on a shortlist: those of the model, and the new ones.
+      names: the photos that may be on a shortlist: those of the models, and the new ones.
     """
     shortlists, lost = {}, {}
     for name, image in added.items():

@@ -57,6 +57,23 @@ def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> Workin
     return WorkingModel(Model.from_colmap(model, sizes), config, seed)
 
 
+def read_working_models(run: FinishedRun) -> list[WorkingModel]:
+    """All models of a run, the first one first; UserError if one is missing or cannot be read."""
+    seed = run.report.options.seed
+    return [
+        read_working_model(run.folder / "sparse" / str(k), run.config, seed=seed)
+        for k in range(len(run.report.models))
+    ]
+
+
+def views_for(models: Sequence[WorkingModel], one: int) -> list[View]:
+    """The views of all models, each photo once. Those of one model come last: each model has
+    refined the cameras for itself, and a new photo of it starts with its own (`camera_prior`).
+    """
+    others = [model for k, model in enumerate(models) if k != one]
+    return list({v.name: v for model in [*others, models[one]] for v in model.views}.values())
+
+
 def camera_prior(
     image: ImageFile,
     views: Sequence[View],
@@ -70,6 +87,7 @@ def camera_prior(
     taken with another one. Else it comes from EXIF, or is a guess.
 
     Args:
+      views: of several that share a camera, it is taken from the last one.
       taken_with: what EXIF says of the camera of a photo of the model, by name.
 
     Raises:

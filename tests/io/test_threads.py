@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from jaxsfm.cli.main import BENCHMARKS
 from jaxsfm.io.threads import READ_ONCE, limit_threads
 
 CODE = """
@@ -28,6 +29,8 @@ print(processors, cv2.getNumThreads(), *(os.environ.get(v, -1) for v in %s))
 """
 COMMANDS = {
     "reconstruct": ["no-folder", "--out", "out"],
+    "localize": ["no-photo", "--model", "no-folder"],
+    "extend": ["no-folder"],
     "strecha": ["--root", "no-folder"],
     "daynight": ["--root", "no-folder"],
     "ambiguous": ["--root", "no-folder"],
@@ -37,7 +40,7 @@ COMMANDS = {
 def ran(command: str, threads: int, folder: Path) -> list[float]:
     """Processors that JAX uses, OpenCV's threads, and the variables' values, -1 for none."""
     environment = {k: v for k, v in os.environ.items() if k not in READ_ONCE.values()}
-    before = [] if command == "reconstruct" else ["bench"]
+    before = ["bench"] if command in BENCHMARKS else []
     args = [*before, command, *COMMANDS[command], "--threads", str(threads)]
     found = subprocess.run(
         [sys.executable, "-c", CODE % [*READ_ONCE.values()], *args],

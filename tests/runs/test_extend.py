@@ -14,6 +14,8 @@ from test_localize import POSE, POSITION, SIZE, RecordingEngine, contents, write
 from jaxsfm.bench.synthetic import render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.database import read_matches
+from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.colmap.model_images import part_of
 from jaxsfm.colmap.poses import model_poses, read_model, read_poses
 from jaxsfm.io.work_folder import RESULTS, lock_folder
 from jaxsfm.options import EngineChoice
@@ -100,7 +102,7 @@ def test_a_new_photo_stands_where_it_was_taken(extended, scene):
 def test_the_report_says_what_was_added_and_what_was_lost(extended, plain):
     report = extended.report
     (row,) = report["extended"]
-    assert len(plain[1]["checks"]) == 1 and report["checks"] == []  # another model now
+    assert len(plain[1]["checks"]) == 1 and report["checks"] == [None]  # another model now
     assert row["added"] == ["elsewhere.png", "new.png"] and row["placed"] == ["new.png"]
     assert report["models"][0]["registered"] == 4
     (lost,) = report["lost"]
@@ -191,6 +193,37 @@ def test_extend_asks_the_engine_that_was_chosen(copied, monkeypatch):
     assert main(["extend", str(run), "--engine", "ray", "--workers", "3"]) == 0
     assert choices == [EngineChoice(engine="ray", workers=3)]
     assert engine.calls == [("extract", 4), ("match", 3)]
+
+
+@pytest.mark.slow
+def test_a_photo_comes_into_the_model_that_it_fits_best_and_others_stay(copied, capsys):
+    """The first model has a third of the points of the second, and one photo less."""
+    run, photos = copied
+    whole, sparse = read_model(run / "sparse" / "0"), run / "sparse"
+    few = part_of(whole, [OLD[0], OLD[2]])
+    for k, number in enumerate(sorted(few.points3D)):
+        if k % 3:
+            few.delete_point3D(number)
+    write_models([few, whole], sparse)
+    rows = [{"images": sorted(i.name for i in m.images.values())} for m in (few, whole)]
+
+    def two_models(report: dict) -> None:
+        ours = report["models"][0]
+        report["models"] = [ours | rows[0] | {"registered": 2}, ours | rows[1]]
+        report["checks"] = [None, *report["checks"]]
+
+    change_report(run, two_models)
+    before = {name: each for name, each in contents(run).items() if "/sparse/0/" in name}
+    write(photos / "new.png", render(room(), POSE, SIZE))
+    assert main(["extend", str(run)]) == 0
+    text = capsys.readouterr().out
+    assert "placed     1 of 1 new photos in 1 rounds" in text
+    assert "sparse/1   1 new photos: 4 images" in text and "sparse/0" not in text
+    assert [len(each["images"]) for each in read_report(run).to_json()["models"]] == [2, 4]
+    assert "new.png" in model_poses(read_model(sparse / "1"))
+    assert read_model(sparse / "0").num_reg_images() == 2
+    after = contents(run)
+    assert before and all(after[name] == each for name, each in before.items())
 
 
 @pytest.mark.slow

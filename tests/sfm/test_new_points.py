@@ -131,19 +131,49 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
     tracks = exact_tracks(rendered, use=use)
     every = {view.name: view for view in rendered.views}
     unregistered = {
-        NEW: UnregisteredView(every[NEW], False, ["0.png", "1.png", "2.png", "4.png"]),
-        "4.png": UnregisteredView(every["4.png"], False, [NEW]),
+        NEW: UnregisteredView([every[NEW]], False, ["0.png", "1.png", "2.png", "4.png"]),
+        "4.png": UnregisteredView([every["4.png"]], False, [NEW]),
     }
     grown = grow(
-        Model(rendered.views[:3], tracks),
+        [Model(rendered.views[:3], tracks)],
         unregistered,
         all_matches(rendered),
         images_of(rendered),
         refinement=Refinement(),
     )
-    assert grown.placed == [NEW, "4.png"] and grown.rounds == 2
-    points = grown.model.tracks.points
+    assert [*grown.placed] == [NEW, "4.png"] and grown.rounds == 2
+    (model,) = grown.models
+    points = model.tracks.points
     np.testing.assert_array_equal(points[: len(tracks.points)], tracks.points)
     assert len(points) > len(tracks.points)
-    for view, truth in zip(grown.model.views, rendered.views, strict=True):
+    for view, truth in zip(model.views, rendered.views, strict=True):
         np.testing.assert_allclose(view.centre, truth.centre, atol=0.02)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_view_gets_its_place_in_the_model_of_which_it_shows_most_points(rendered, swapped):
+    """It could be placed in the model of fewer points, too, which stays as it is."""
+    use = rendered.visible.copy()
+    use[:, 3:] = False
+    fewer = use.copy()
+    fewer[::2] = False
+    models = [Model(rendered.views[:3], exact_tracks(rendered, use=u)) for u in (fewer, use)]
+    every = {view.name: view for view in rendered.views}
+    order = [1, 0] if swapped else [0, 1]
+
+    def grown(chosen: list[Model]):
+        view = UnregisteredView([every[NEW]] * len(chosen), False, ["0.png", "1.png", "2.png"])
+        return grow(
+            chosen,
+            {NEW: view},
+            all_matches(rendered),
+            images_of(rendered),
+            refinement=Refinement(),
+        )
+
+    assert grown(models[:1]).placed == {NEW: 0}
+    both = grown([models[k] for k in order])
+    assert both.placed == {NEW: order.index(1)}
+    assert both.models[order.index(0)] is models[0]
+    assert len(both.models[order.index(1)].views) == 4
+    assert both.located[NEW].agreed > grown(models[:1]).located[NEW].agreed
