@@ -6,6 +6,10 @@ from pathlib import Path
 
 import pycolmap
 
+from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.colmap.model_images import part_of, registered
+from jaxsfm.colmap.poses import read_model
+
 HOSTILE = "<img src=x onerror=document.title='owned'><b>&amp;.png"
 """A file name that would do harm or look wrong if it were not escaped."""
 
@@ -17,6 +21,24 @@ def change_report(out: Path, change) -> Path:
     change(report)
     path.write_text(json.dumps(report))
     return out
+
+
+def with_two_models(out: Path) -> Path:
+    """Put a model before the first one: the same without one photo and two thirds of its points."""
+    whole = read_model(out / "sparse" / "0")
+    names = sorted(registered(whole))
+    few = part_of(whole, [names[0], names[-1]])
+    for k, number in enumerate(sorted(few.points3D)):
+        if k % 3:
+            few.delete_point3D(number)
+    write_models([few, whole], out / "sparse")
+
+    def change(report: dict) -> None:
+        (ours,) = report["models"]
+        report["models"] = [ours | {"images": sorted(registered(few)), "registered": 2}, ours]
+        report["checks"] = [None, *report["checks"]]
+
+    return change_report(out, change)
 
 
 def renamed(out: Path, images: Path, to: Path, old: str, new: str) -> tuple[Path, Path]:

@@ -19,7 +19,7 @@ def localize(
     network: WeightsChoice,
     engine: EngineChoice,
 ) -> int:
-    """Find where photos were taken, with the model of a finished run. The model does not change.
+    """Find where photos were taken, with the models of a finished run, which do not change.
 
     The exit status is 1 if no photo could be localized.
 

@@ -1,8 +1,8 @@
-"""Localization of photos in a finished run, whose model does not change.
+"""Localization of photos in a finished run, whose models do not change.
 
-Each photo is matched with photos of the run, and its pose is found in the model
-(`jaxsfm.sfm.register.locate_view`). The result of a photo depends on its content, the run and the
-options. It does not depend on the other photos of the same call, nor on the photo's name,
+Each photo is matched with photos of the run, and its pose is found in the model of which it shows
+most (`jaxsfm.sfm.register.locate_view`). The result of a photo depends on its content, the run and
+the options. It does not depend on the other photos of the same call, nor on the photo's name,
 unless a list of known cameras names it.
 """
 
@@ -18,7 +18,7 @@ from tqdm import tqdm
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import Store
@@ -37,16 +37,17 @@ from jaxsfm.runs.queries import Query, cameras_of_query, match_queries, open_que
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
-    CameraPrior,
     WorkingModel,
     camera_prior,
     photos_of_run,
-    read_working_model,
+    read_working_models,
     view_without_pose,
+    views_for,
     weights_of_run,
 )
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.register.locate_view import Localization, locate
+from jaxsfm.sfm.register.grow import Place, best_place, matches_with
+from jaxsfm.sfm.register.locate_view import locate
 
 MANY_INLIERS = 100
 """A pose that so many matches agree with is not looked for again. A photo of a sixth of the size
@@ -76,17 +77,19 @@ def localize_photos(
     finished = read_run(run, images=options.images, reference=options.reference)
     if finished.model is None:
         raise UserError(f"{run}: this run has no model to localize photos in")
-    seed = finished.report.options.seed
-    model = read_working_model(finished.folder / "sparse" / "0", finished.config, seed=seed)
+    models = read_working_models(finished)
     intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     usable, unusable = open_queries(photos)
     cameras = {
-        path: camera_prior(
-            dataclasses.replace(image, name=path),
-            model.views,
-            cameras_of_query(path, intrinsics),
-            finished.photos.taken_with,
-        )
+        path: [
+            camera_prior(
+                dataclasses.replace(image, name=path),
+                views_for(models, k),
+                cameras_of_query(path, intrinsics),
+                finished.photos.taken_with,
+            )
+            for k in range(len(models))
+        ]
         for path, image in usable.items()
     }
     weights = weights_of_run(finished, options.network)
@@ -97,7 +100,7 @@ def localize_photos(
     queries = []
     for path, image in usable.items():
         own = finished.photos.name_of(image.sha256)
-        names = [view.name for view in model.views if view.name != own]
+        names = sorted({v.name for model in models for v in model.views} - {own})
         try:
             queries.append(Query(path, image, cameras[path], shortlist(image, names)))
         except ImageError as error:
@@ -112,15 +115,15 @@ def localize_photos(
             store=finished.store if options.keep_features else temporary,
             earlier=(finished.store,),
             weights=weights,
-            config=model.config,
+            config=finished.config,
             engine=engine,
             execution=options.execution,
-            seed=model.seed,
+            seed=finished.report.options.seed,
             progress=options.progress,
         )
         if lost := job.extract_missing(files.values()):
             raise UserError(lost[min(lost)])
-        readable = Photos([*files.values(), *(q.image for q in queries)], model.config)
+        readable = Photos([*files.values(), *(q.image for q in queries)], finished.config)
         images = DeviceImages(readable.gray)
         bar = tqdm(total=len(queries), desc="localizing", unit="photo", disable=not job.progress)
         with bar:
@@ -128,7 +131,7 @@ def localize_photos(
                 closer = functools.partial(
                     look_closer, job, {**files, query.image.name: query.image}
                 )
-                rows.append(_localize_query(query, matches, finished, model, images, closer))
+                rows.append(_localize_query(query, matches, finished, models, images, closer))
                 bar.update()
     return LocalizationReport(
         version=importlib.metadata.version("jaxsfm"),
@@ -138,31 +141,41 @@ def localize_photos(
 
 
 def locate_photo(
-    image: ImageFile,
-    camera: CameraPrior,
-    model: WorkingModel,
-    shortlist: Sequence[str],
+    query: Query,
+    models: Sequence[WorkingModel],
     matches: Mapping[Pair, PairResult],
     images: DeviceImages,
-) -> Localization:
-    """Find the pose of a photo from its matches with the shortlisted photos of a model."""
-    part, _ = model.model.part(shortlist)
-    return locate(
-        view_without_pose(image, camera, model.config),
-        part,
-        matches,
-        images,
-        refinement=model.config.refinement or Refinement(),
-        own_camera=camera.estimated,
-        seed=model.seed,
-    )
+) -> Place:
+    """Find the pose of a photo in the model of which it shows most (`Localization.support`).
+
+    It is looked for in each model that has photos of its shortlist, from its matches with these.
+    """
+    places = []
+    for k, (model, camera) in enumerate(zip(models, query.cameras, strict=True)):
+        names = {view.name for view in model.views}
+        around = [name for name in query.shortlist if name in names]
+        # The first model is tried in any case, so that each photo has an outcome.
+        if not around and k > 0:
+            continue
+        part, rows = model.model.part(around)
+        found = locate(
+            view_without_pose(query.image, camera, model.config),
+            part,
+            matches_with(query.image.name, around, matches),
+            images,
+            refinement=model.config.refinement or Refinement(),
+            own_camera=camera.estimated,
+            seed=model.seed,
+        )
+        places.append(Place(k, found, rows))
+    return best_place(places)
 
 
 def _localize_query(
     query: Query,
     matches: dict[Pair, PairResult] | str,
     run: FinishedRun,
-    model: WorkingModel,
+    models: Sequence[WorkingModel],
     images: DeviceImages,
     closer: Callable[[Iterable[Pair]], dict[Pair, PairResult]],
 ) -> LocalizedPhoto | UnusablePhoto:
@@ -174,31 +187,31 @@ def _localize_query(
     try:
         if isinstance(matches, str):
             raise ImageError(matches)
-        found = locate_photo(query.image, query.camera, model, query.shortlist, matches, images)
-        if not found.trusted and found.inliers < MANY_INLIERS and model.config.closer_looks:
+        place, config = locate_photo(query, models, matches, images), models[0].config
+        found = place.found
+        if not found.trusted and found.inliers < MANY_INLIERS and config.closer_looks:
             counts = {pair: result.counts for pair, result in matches.items()}
-            least = model.config.min_inliers
+            least = config.min_inliers
             pairs = pairs_to_look_at([query.image.name], query.shortlist, counts, least=least)
             likely = closer(pairs)
             every = matches | likely
             if likely:
-                again = locate_photo(
-                    query.image, query.camera, model, query.shortlist, every, images
-                )
-                if again.trusted or not found.view:
-                    found, matches = again, every
+                again = locate_photo(query, models, every, images)
+                if again.found.trusted or not found.view:
+                    place, matches = again, every
     except ImageError as error:
         return UnusablePhoto(photo=query.path, shortlist=query.shortlist, why=str(error))
-    error = None
-    if found.view is not None and run.reference is not None:
+    error, view = None, place.found.view
+    if view is not None and run.reference is not None:
         name, reference = Path(query.path).name, run.reference.poses
-        error = error_against(name, found.view, model.views, reference)
+        error = error_against(name, view, models[place.model].views, reference)
     return LocalizedPhoto(
         photo=query.path,
         in_run=run.photos.name_of(query.image.sha256),
         shortlist=query.shortlist,
         matches=sum(result.num_inliers for result in matches.values()),
-        source=query.camera.source,
-        found=found,
+        source=query.cameras[place.model].source,
+        model=place.model,
+        found=place.found,
         error=error,
     )

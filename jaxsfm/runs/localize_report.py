@@ -49,6 +49,8 @@ class LocalizedPhoto:
     """The number of all its matches."""
     source: str
     """Where its camera comes from: `given`, `run`, `exif` or `guess`."""
+    model: int
+    """The number N of the model sparse/N that the pose is in."""
     found: Localization
     error: PoseError | None = None
     """The error against the reference poses."""
@@ -66,6 +68,7 @@ class LocalizedPhoto:
         row: dict[str, Json] = {
             "photo": self.photo,
             "in_run": self.in_run,
+            "model": self.model,
             "shortlist": sorted(self.shortlist),
             "status": self.status,
             "why": found.why,
@@ -178,9 +181,11 @@ def _photo_lines(row: LocalizedPhoto | UnusablePhoto) -> Iterator[str]:
         yield f"{start}{found.why}"
         return
     x, y, z = found.view.centre
+    where = f"in sparse/{row.model}, " if row.model else ""
     yield (
-        f"{start}centre {x:.4f} {y:.4f} {z:.4f}, {found.inliers} of {found.on_surface} matches "
-        f"agree, {found.agreed} of {found.candidates} points agree"
+        f"{start}{where}centre {x:.4f} {y:.4f} {z:.4f}, "
+        f"{found.inliers} of {found.on_surface} matches agree, "
+        f"{found.agreed} of {found.candidates} points agree"
     )
     if found.why:
         yield indent + found.why

@@ -28,7 +28,8 @@ class Query:
     """Its path, as it was given."""
     image: ImageFile
     """Its name is made of its content, so that it is no name of a photo of the run."""
-    camera: CameraPrior
+    cameras: Sequence[CameraPrior]
+    """The camera that it starts with, in each model of the run."""
     shortlist: Sequence[str]
     """Names of the photos of the run that it is matched with."""
 

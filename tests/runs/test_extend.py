@@ -8,14 +8,12 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 import pytest
-from kept_runs import change_report
+from kept_runs import change_report, with_two_models
 from test_localize import POSE, POSITION, SIZE, RecordingEngine, contents, write
 
 from jaxsfm.bench.synthetic import render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.database import read_matches
-from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.model_images import part_of
 from jaxsfm.colmap.poses import model_poses, read_model, read_poses
 from jaxsfm.io.work_folder import RESULTS, lock_folder
 from jaxsfm.options import EngineChoice
@@ -197,22 +195,8 @@ def test_extend_asks_the_engine_that_was_chosen(copied, monkeypatch):
 
 @pytest.mark.slow
 def test_a_photo_comes_into_the_model_that_it_fits_best_and_others_stay(copied, capsys):
-    """The first model has a third of the points of the second, and one photo less."""
     run, photos = copied
-    whole, sparse = read_model(run / "sparse" / "0"), run / "sparse"
-    few = part_of(whole, [OLD[0], OLD[2]])
-    for k, number in enumerate(sorted(few.points3D)):
-        if k % 3:
-            few.delete_point3D(number)
-    write_models([few, whole], sparse)
-    rows = [{"images": sorted(i.name for i in m.images.values())} for m in (few, whole)]
-
-    def two_models(report: dict) -> None:
-        ours = report["models"][0]
-        report["models"] = [ours | rows[0] | {"registered": 2}, ours | rows[1]]
-        report["checks"] = [None, *report["checks"]]
-
-    change_report(run, two_models)
+    sparse = with_two_models(run) / "sparse"
     before = {name: each for name, each in contents(run).items() if "/sparse/0/" in name}
     write(photos / "new.png", render(room(), POSE, SIZE))
     assert main(["extend", str(run)]) == 0

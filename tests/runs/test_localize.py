@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from kept_runs import change_report
+from kept_runs import change_report, with_two_models
 
 from jaxsfm.bench.synthetic import camera_matrix, look_at, render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.poses import read_model
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, inspect_image
@@ -26,7 +27,7 @@ from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.runs import localize as localize_module
 from jaxsfm.runs.localize import localize_photos
-from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto
+from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto, localize_lines
 from jaxsfm.runs.queries import cameras_of_query
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import similar_photos
@@ -300,6 +301,23 @@ def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, phot
     assert camera_prior(named, model.views, None, lambda _: "phone").source == "run"
 
 
+def test_a_photo_is_localized_in_the_model_of_which_it_shows_most(
+    plain, photos, localized, tmp_path
+):
+    """Its camera is the one of that model. The first model has a third of the points."""
+    run = with_two_models(Path(shutil.copytree(plain[0], tmp_path / "run")))
+    first = read_model(run / "sparse" / "0")
+    for camera in first.cameras.values():
+        camera.params = 1.01 * camera.params
+    first.write(run / "sparse" / "0")
+    result = localize_photos([photos / "photos" / "new.png"], run, options=LocalizeOptions())
+    (row,) = result.to_json()["photos"]
+    assert row["model"] == 1 and localized["new.png"]["model"] == 0
+    for name in ("centre", "camera", "agreed", "shortlist"):
+        assert row[name] == localized["new.png"][name]
+    assert "in sparse/1, centre" in "\n".join(localize_lines(result))
+
+
 @pytest.mark.slow
 def test_an_empty_folder_keeps_no_photo_from_its_pose(plain, photos, tmp_path):
     (tmp_path / "empty").mkdir()
@@ -336,7 +354,7 @@ def test_nothing_localized_ends_with_1(plain, photos, capsys, monkeypatch):
     errors |= dict.fromkeys(("centre_error", "rotation_error_deg"))
     found = Localization(view=None, trusted=False, why="no plane", **numbers, **errors)
     row = LocalizedPhoto(
-        photo="a.png", in_run=None, shortlist=[], matches=0, source="run", found=found
+        photo="a.png", in_run=None, shortlist=[], matches=0, source="run", model=0, found=found
     )
     result = LocalizationReport(version="1", model=str(plain[0]), photos=[row])
     monkeypatch.setattr(localize_module, "localize_photos", lambda *args, **kwargs: result)

@@ -3,12 +3,14 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from pair_results import result
 
 from jaxsfm.config import preset
 from jaxsfm.runs import localize
 from jaxsfm.runs.localize_report import LocalizedPhoto
+from jaxsfm.sfm.register.grow import Place
 from jaxsfm.sfm.register.locate_view import Localization
 
 SOME_VIEW: Any = SimpleNamespace(centre=None)
@@ -28,8 +30,9 @@ def localized(monkeypatch):
         ours = {("a", "q"): result(("a", "q"), 3), ("b", "q"): result(("b", "q"), 4)}
         closer = {("b", "q"): result(("b", "q"), 30)}
 
-        def locate_photo(image: Any, camera: Any, model: Any, names: Any, matches: dict, _: Any):
-            return second if matches["b", "q"].num_inliers == 30 else first
+        def locate_photo(query: Any, models: Any, matches: dict, images: Any):
+            found = second if matches["b", "q"].num_inliers == 30 else first
+            return Place(0, found, np.zeros(0, int))
 
         def look(pairs: Any) -> dict:
             asked.extend(pairs)
@@ -40,7 +43,7 @@ def localized(monkeypatch):
         query: Any = SimpleNamespace(
             path="q.png",
             image=SimpleNamespace(name="q", sha256="0"),
-            camera=SimpleNamespace(source="given"),
+            cameras=[SimpleNamespace(source="given")],
             shortlist=["a", "b"],
         )
         run: Any = SimpleNamespace(
@@ -48,7 +51,7 @@ def localized(monkeypatch):
         )
         model: Any = SimpleNamespace(config=config, views=[])
         images: Any = None
-        found = localize._localize_query(query, ours, run, model, images, look)
+        found = localize._localize_query(query, ours, run, [model], images, look)
         assert isinstance(found, LocalizedPhoto)
         return found, asked
 

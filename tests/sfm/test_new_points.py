@@ -10,6 +10,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.sfm.register import grow as grow_module
 from jaxsfm.sfm.register import triangulate
 from jaxsfm.sfm.register.grow import UnregisteredView, grow
 from jaxsfm.sfm.register.triangulate import matched_tracks, new_points, triangulated
@@ -177,3 +178,30 @@ def test_a_view_gets_its_place_in_the_model_of_which_it_shows_most_points(render
     assert both.models[order.index(0)] is models[0]
     assert len(both.models[order.index(1)].views) == 4
     assert both.located[NEW].agreed > grown(models[:1]).located[NEW].agreed
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_a_view_that_too_few_points_hold_is_not_placed(rendered, monkeypatch, missing):
+    """Later rounds would place views on the points that it adds."""
+    use = rendered.visible.copy()
+    use[:, 3:] = False
+    model = Model(rendered.views[:3], exact_tracks(rendered, use=use))
+    view = {view.name: view for view in rendered.views}[NEW]
+    unregistered = {NEW: UnregisteredView([view], False, ["0.png", "1.png", "2.png"])}
+
+    def grown():
+        return grow(
+            [model],
+            unregistered,
+            all_matches(rendered),
+            images_of(rendered),
+            refinement=Refinement(),
+        )
+
+    points = grown().located[NEW].points
+    assert points is not None
+    monkeypatch.setattr(grow_module, "MIN_COUNT", len(points.rows) + missing)
+    found = grown()
+    assert bool(found.placed) == (missing == 0)
+    why = found.located[NEW].why
+    assert why is None if not missing else f"only {len(points.rows)} of them hold it" in (why or "")

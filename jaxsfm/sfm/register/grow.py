@@ -35,7 +35,7 @@ class UnregisteredView(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The outcome of a view's last attempt to find its place in a model."""
+    """The outcome of an attempt to find a view's place in a model."""
 
     model: int
     """Index of the model."""
@@ -43,15 +43,6 @@ class Place(NamedTuple):
     rows: np.ndarray
     """int: for each point of the part of the model in which the view was looked for, the index of
     that point in the model."""
-
-    @property
-    def support(self) -> tuple[bool, int, int]:
-        """What speaks for the place; of two places, the one with the larger support is taken.
-
-        A photo that shows a part of one model often resembles a part of another one, too, where
-        walls repeat. It shows more points of the model that it belongs to.
-        """
-        return self.found.trusted, self.found.agreed, self.found.inliers
 
 
 class ExtendedModels(NamedTuple):
@@ -115,13 +106,13 @@ def grow(
                 # The first model is tried in any case, so that each view has an outcome.
                 if (around or k == 0) and (k not in known or set(around) & latest):
                     known[k] = attempt(name, k, around)
-            best = _best(known.values())
+            best = best_place(known.values())
             if best.found.trusted:
                 fresh[best.model][name] = best
                 on_view()
         latest = {name for places in fresh for name in places}
         if not latest:
-            located = {name: _best(known.values()).found for name, known in tried.items()}
+            located = {name: best_place(known.values()).found for name, known in tried.items()}
             return ExtendedModels(models, placed, located, rounds)
         rounds += 1
         placed |= {name: k for k, places in enumerate(fresh) for name in sorted(places)}
@@ -149,9 +140,9 @@ def _held(located: Localization) -> Localization:
     return dataclasses.replace(located, trusted=False, why=why)
 
 
-def _best(places: Iterable[Place]) -> Place:
+def best_place(places: Iterable[Place]) -> Place:
     """The place with most support; of equals, the one in the first model."""
-    return max(places, key=lambda place: (place.support, -place.model))
+    return max(places, key=lambda place: (place.found.support, -place.model))
 
 
 def matches_with(

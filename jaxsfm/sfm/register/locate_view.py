@@ -64,6 +64,16 @@ class Localization:
     points: AlignedPoints | None = None
     """The points that it shows, if the pose is trusted; working pixels."""
 
+    @property
+    def support(self) -> tuple[bool, int]:
+        """What speaks for this outcome; of the outcomes in several models, the one with the largest
+        support is taken.
+
+        Where walls repeat, a photo of one model often resembles a part of another one. It shows
+        more points of the model that it belongs to (docs/decisions/finished-models.md).
+        """
+        return self.trusted, self.agreed if self.trusted else self.inliers
+
 
 def locate(
     image: View,
