@@ -165,7 +165,7 @@ class ReconstructionChoice:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NewPhotosChoice:
-    """How new photos find their place in the model of a finished run.
+    """How new photos find their place in the models of a finished run.
 
     Attributes:
       images: Folder with the run's photos; for extend, also with the new ones. Without it, the

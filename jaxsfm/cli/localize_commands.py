@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxsfm.cli.run_commands import Positional, check_writable
 from jaxsfm.io.threads import limit_threads
-from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice, check_threads
+from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice
 
 
 def localize(
@@ -36,7 +36,6 @@ def localize(
       network: The files of the network's parameters. They must be those of the run.
     """
     check_writable(out, "--out", (".json",))
-    check_threads(new_photos.threads)
     limit_threads(new_photos.threads)
     from jaxsfm.io.atomic import write_atomic
     from jaxsfm.runs.localize import localize_photos
@@ -77,7 +76,6 @@ def extend(
       run: The folder of a finished run.
       network: The files of the network's parameters. They must be those of the run.
     """
-    check_threads(new_photos.threads)
     limit_threads(new_photos.threads)
     from jaxsfm.io.images import shown_name
     from jaxsfm.runs.extend import extend_run
@@ -93,7 +91,7 @@ def extend(
     for name in last.skipped:
         print(f"skipped    {report.images.skipped[name]}")
     for photo in report.lost:
-        if photo.image in last.added:
+        if photo.image in set(last.added) - set(last.placed):
             print(f"lost       {shown_name(photo.image)}: {photo.detail}")
     print(f"placed     {len(last.placed)} of {len(last.added)} new photos in {last.rounds} rounds")
     for k, model in enumerate(report.models):

@@ -91,8 +91,7 @@ class RunReport:
     refinement: list[RefinementFigures | None] = field(default_factory=list)
     """One for each model; None for a model that was not refined."""
     checks: list[ModelCheck | None] = field(default_factory=list)
-    """One for each model; None for a model that was not checked, and for one that `jaxsfm extend`
-    has added photos to since."""
+    """One for each model; None for a model that was not checked. Empty after `jaxsfm extend`."""
     georeference: Georeference | None = field(default=None, metadata=OMITTED)
     """How the models were moved into metres; None if nothing was measured, or it was not asked
     for."""

@@ -188,8 +188,9 @@ def extended_report(
             ),
         ),
         models=[_model_row(model) for model in models],
-        # A model with new photos has points now that no check has seen.
-        checks=[None if k in grown.placed.values() else c for k, c in enumerate(old.checks)],
+        # A model with new photos has points now that no check has seen. The checks of the others
+        # are left out, too: alone, they would look like the verdict on all models.
+        checks=[],
         extended=[*(old.extended or ()), extension],
         evaluation=None,
         evaluation_failed=None,

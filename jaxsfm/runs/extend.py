@@ -21,6 +21,7 @@ from jaxsfm.io.versions import versions
 from jaxsfm.io.work_folder import RECORD, lock_folder, open_locked_folder
 from jaxsfm.matching.engines import Engine, chosen_engine
 from jaxsfm.matching.pipeline import open_images
+from jaxsfm.options import check_threads
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.page.after_run import page_after_run
 from jaxsfm.report.run_report import RunReport, write_report
@@ -30,10 +31,9 @@ from jaxsfm.runs.job import Job, images_of, pairs_without
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
-    camera_prior,
+    camera_priors,
     photos_of_run,
     read_working_models,
-    views_for,
     weights_of_run,
 )
 from jaxsfm.runs.write_extension import write_extension
@@ -57,6 +57,7 @@ def extend_run(
       UserError: there is no finished run with a model, or its photos or weights are not there.
     """
     engine = chosen_engine(options.engine)
+    check_threads(options.threads)
     if not (run / RECORD).exists():
         raise UserError(f"{run}: no finished run here ({RECORD} is missing)")
     with lock_folder(run):  # before anything is read: another process may be publishing
@@ -89,11 +90,7 @@ def _extend(
     intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     taken_with = finished.photos.taken_with
     cameras = {
-        name: [
-            camera_prior(image, views_for(models, k), intrinsics, taken_with)
-            for k in range(len(models))
-        ]
-        for name, image in images.items()
+        name: camera_priors(image, models, intrinsics, taken_with) for name, image in images.items()
     }
     identity = identity.with_images(images.values())
     folder = open_locked_folder(run, to_json(identity))

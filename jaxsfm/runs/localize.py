@@ -1,7 +1,7 @@
 """Localization of photos in a finished run, whose models do not change.
 
 Each photo is matched with photos of the run, and its pose is found in the model of which it shows
-most (`jaxsfm.sfm.register.locate_view`). The result of a photo depends on its content, the run and
+most (`jaxsfm.sfm.register.place`). The result of a photo depends on its content, the run and
 the options. It does not depend on the other photos of the same call, nor on the photo's name,
 unless a list of known cameras names it.
 """
@@ -23,6 +23,7 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import Store
 from jaxsfm.matching.engines import chosen_engine
+from jaxsfm.options import check_threads
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.closer_looks import look_closer, pairs_to_look_at
@@ -38,16 +39,14 @@ from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import Shortlist, similar_photos
 from jaxsfm.runs.working_model import (
     WorkingModel,
-    camera_prior,
+    camera_priors,
     photos_of_run,
     read_working_models,
     view_without_pose,
-    views_for,
     weights_of_run,
 )
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.register.grow import Place, best_place, matches_with
-from jaxsfm.sfm.register.locate_view import locate
+from jaxsfm.sfm.register.place import Place, UnregisteredView, best_place, place_in
 
 MANY_INLIERS = 100
 """A pose that so many matches agree with is not looked for again. A photo of a sixth of the size
@@ -74,6 +73,7 @@ def localize_photos(
         usable photo was given.
     """
     engine = chosen_engine(options.engine)
+    check_threads(options.threads)
     finished = read_run(run, images=options.images, reference=options.reference)
     if finished.model is None:
         raise UserError(f"{run}: this run has no model to localize photos in")
@@ -81,15 +81,12 @@ def localize_photos(
     intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     usable, unusable = open_queries(photos)
     cameras = {
-        path: [
-            camera_prior(
-                dataclasses.replace(image, name=path),
-                views_for(models, k),
-                cameras_of_query(path, intrinsics),
-                finished.photos.taken_with,
-            )
-            for k in range(len(models))
-        ]
+        path: camera_priors(
+            dataclasses.replace(image, name=path),
+            models,
+            cameras_of_query(path, intrinsics),
+            finished.photos.taken_with,
+        )
         for path, image in usable.items()
     }
     weights = weights_of_run(finished, options.network)
@@ -146,29 +143,17 @@ def locate_photo(
     matches: Mapping[Pair, PairResult],
     images: DeviceImages,
 ) -> Place:
-    """Find the pose of a photo in the model of which it shows most (`Localization.support`).
-
-    It is looked for in each model that has photos of its shortlist, from its matches with these.
-    """
-    places = []
-    for k, (model, camera) in enumerate(zip(models, query.cameras, strict=True)):
-        names = {view.name for view in model.views}
-        around = [name for name in query.shortlist if name in names]
-        # The first model is tried in any case, so that each photo has an outcome.
-        if not around and k > 0:
-            continue
-        part, rows = model.model.part(around)
-        found = locate(
-            view_without_pose(query.image, camera, model.config),
-            part,
-            matches_with(query.image.name, around, matches),
-            images,
-            refinement=model.config.refinement or Refinement(),
-            own_camera=camera.estimated,
-            seed=model.seed,
-        )
-        places.append(Place(k, found, rows))
-    return best_place(places)
+    """Find the pose of a photo in the model of which it shows most (`Localization.support`)."""
+    views = [
+        view_without_pose(query.image, camera, model.config)
+        for model, camera in zip(models, query.cameras, strict=True)
+    ]
+    wanted = UnregisteredView(views, query.cameras[0].estimated, query.shortlist)
+    refinement, seed = models[0].config.refinement or Refinement(), models[0].seed
+    return best_place(
+        place_in((k, each.model), wanted, matches, images, refinement=refinement, seed=seed)
+        for k, each in enumerate(models)
+    )
 
 
 def _localize_query(

@@ -68,7 +68,7 @@ class LocalizedPhoto:
         row: dict[str, Json] = {
             "photo": self.photo,
             "in_run": self.in_run,
-            "model": self.model,
+            "in_model": self.model,
             "shortlist": sorted(self.shortlist),
             "status": self.status,
             "why": found.why,

@@ -1,4 +1,4 @@
-"""What `localize` and `extend` need of a finished run: its model, its weights and its photos."""
+"""What `localize` and `extend` need of a finished run: its models, its weights and its photos."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class WorkingModel(NamedTuple):
-    """The best model of a run in working pixels, and the settings of the run."""
+    """A model of a run in working pixels, and the settings of the run."""
 
     model: Model
     config: Config
@@ -66,12 +66,24 @@ def read_working_models(run: FinishedRun) -> list[WorkingModel]:
     ]
 
 
-def views_for(models: Sequence[WorkingModel], one: int) -> list[View]:
-    """The views of all models, each photo once. Those of one model come last: each model has
-    refined the cameras for itself, and a new photo of it starts with its own (`camera_prior`).
+def camera_priors(
+    image: ImageFile,
+    models: Sequence[WorkingModel],
+    intrinsics: KnownCameras | None,
+    taken_with: Callable[[str], str] = lambda _: "",
+) -> list[CameraPrior]:
+    """The camera that a photo starts with in each model (`camera_prior`).
+
+    What is known is asked of all models together, so it is the same in all of them. But each model
+    has refined the cameras of the run for itself, and a photo starts with those of the model.
     """
-    others = [model for k, model in enumerate(models) if k != one]
-    return list({v.name: v for model in [*others, models[one]] for v in model.views}.values())
+    views = {view.name: view for model in reversed(models) for view in model.views}
+    prior = camera_prior(image, list(views.values()), intrinsics, taken_with)
+    if prior.source != "run":
+        return [prior] * len(models)
+    own = [{view.camera.camera_id: view.camera for view in model.views} for model in models]
+    number = prior.camera.camera_id
+    return [prior._replace(camera=cameras.get(number, prior.camera)) for cameras in own]
 
 
 def camera_prior(
@@ -87,7 +99,6 @@ def camera_prior(
     taken with another one. Else it comes from EXIF, or is a guess.
 
     Args:
-      views: of several that share a camera, it is taken from the last one.
       taken_with: what EXIF says of the camera of a photo of the model, by name.
 
     Raises:

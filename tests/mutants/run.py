@@ -82,6 +82,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "refine/weak_views": (WEAK,),
     "register/grow": ("tests/sfm/test_new_points.py", "tests/runs/test_extend.py"),
     "register/locate_view": ("tests/sfm/test_single_view.py", "tests/sfm/test_new_points.py"),
+    "register/place": ("tests/sfm/test_new_points.py", "tests/runs/test_localize.py"),
     "register/triangulate": ("tests/sfm/test_new_points.py",),
     "sfm/view_graph": ("tests/sfm/test_viewgraph.py", "tests/sfm/test_placing.py"),
 }

@@ -31,7 +31,12 @@ from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto, loca
 from jaxsfm.runs.queries import cameras_of_query
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.similar_photos import similar_photos
-from jaxsfm.runs.working_model import camera_prior, read_working_model
+from jaxsfm.runs.working_model import (
+    WorkingModel,
+    camera_prior,
+    camera_priors,
+    read_working_model,
+)
 from jaxsfm.sfm.register.locate_view import Localization
 
 SIZE, WIDE = (320, 240), (368, 248)
@@ -312,10 +317,37 @@ def test_a_photo_is_localized_in_the_model_of_which_it_shows_most(
     first.write(run / "sparse" / "0")
     result = localize_photos([photos / "photos" / "new.png"], run, options=LocalizeOptions())
     (row,) = result.to_json()["photos"]
-    assert row["model"] == 1 and localized["new.png"]["model"] == 0
+    assert row["in_model"] == 1 and localized["new.png"]["in_model"] == 0
     for name in ("centre", "camera", "agreed", "shortlist"):
         assert row[name] == localized["new.png"][name]
     assert "in sparse/1, centre" in "\n".join(localize_lines(result))
+
+
+def test_a_photo_starts_with_the_camera_as_each_model_has_refined_it(plain, photos):
+    """Whether a camera of the run is known is asked of all models together."""
+    model = read_working_model(plain[0] / "sparse" / "0", preset("default"))
+    new = inspect_image(photos / "photos" / "new.png", name="photo")
+
+    def refined(names: list[str], focal: float) -> WorkingModel:
+        views = [view for view in model.views if view.name in names]
+        camera = pycolmap.Camera(views[0].camera.todict())
+        camera.params = [focal, *camera.params[1:]]
+        views = [dataclasses.replace(view, camera=camera) for view in views]
+        return model._replace(model=model.model.with_views(views))
+
+    names = [view.name for view in model.views]
+    both = [refined(names, 310.0), refined(names[:1], 320.0)]  # its photo is in both
+    for models in (both, both[::-1]):
+        found = camera_priors(new, models, None)
+        assert [prior.source for prior in found] == ["run", "run"]
+        assert [prior.camera.params[0] for prior in found] == [
+            each.views[0].camera.params[0] for each in models
+        ]
+        told = camera_priors(new, models, None, lambda name: "phone" if name == names[0] else "")
+        assert len({prior.source for prior in told}) == 1
+    alone = [refined(names[:1], 310.0), refined(names[1:2], 320.0)]
+    assert [prior.source for prior in camera_priors(new, alone, None)] == ["run", "run"]
+    assert [prior.source for prior in camera_priors(new, alone[:1], None)] == ["guess"]
 
 
 @pytest.mark.slow

@@ -1,48 +1,24 @@
 """Registration of new views in finished models, whose poses and points stay as they are.
 
-It works in rounds. In a round, each view is located in every model that has views like it
-(`jaxsfm.sfm.register.locate_view`), and gets its place in the model of which it shows most points.
+It works in rounds. In a round, each view is looked for in every model that has views like it, and
+gets its place in the model of which it shows most points (`jaxsfm.sfm.register.place`).
 What it shows beyond the model's points becomes new points (`jaxsfm.sfm.register.triangulate`), in
 which the next round locates further views.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
-
-import numpy as np
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
-from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
-from jaxsfm.sfm.register.locate_view import Localization, locate
+from jaxsfm.sfm.register.locate_view import Localization
+from jaxsfm.sfm.register.place import Place, UnregisteredView, best_place, place_in
 from jaxsfm.sfm.register.triangulate import new_points
-
-
-class UnregisteredView(NamedTuple):
-    """A view that is in no model."""
-
-    views: Sequence[View]
-    """The view with the camera that it starts with in each model. Their poses play no part."""
-    own_camera: bool
-    """Its focal length is estimated."""
-    shortlist: Sequence[str]
-    """Names of the views that it is matched with."""
-
-
-class Place(NamedTuple):
-    """The outcome of an attempt to find a view's place in a model."""
-
-    model: int
-    """Index of the model."""
-    found: Localization
-    rows: np.ndarray
-    """int: for each point of the part of the model in which the view was looked for, the index of
-    that point in the model."""
 
 
 class ExtendedModels(NamedTuple):
@@ -79,33 +55,25 @@ def grow(
       on_view: called for every view that is registered.
     """
     models, placed = list(models), dict[str, int]()
-    tried: dict[str, dict[int, Place]] = {name: {} for name in unregistered}
+    tried: dict[str, dict[int, Place | None]] = {name: {} for name in unregistered}
     rounds, latest = 0, set[str]()
-
-    def attempt(name: str, k: int, around: Sequence[str]) -> Place:
-        each = unregistered[name]
-        part, rows = models[k].part(around)
-        located = locate(
-            each.views[k],
-            part,
-            matches_with(name, around, matches),
-            images,
-            refinement=refinement or Refinement(),
-            own_camera=each.own_camera,
-            seed=seed,
-        )
-        return Place(k, _held(located), rows)
-
     while True:
         fresh: list[dict[str, Place]] = [{} for _ in models]
-        names = [{view.name for view in model.views} for model in models]
+        now = [latest & {view.name for view in model.views} for model in models]
         for name in sorted(unregistered.keys() - placed.keys()):
-            known = tried[name]
-            for k in range(len(models)):
-                around = [other for other in unregistered[name].shortlist if other in names[k]]
-                # The first model is tried in any case, so that each view has an outcome.
-                if (around or k == 0) and (k not in known or set(around) & latest):
-                    known[k] = attempt(name, k, around)
+            each, known = unregistered[name], tried[name]
+            for k, model in enumerate(models):
+                if k in known and not now[k].intersection(each.shortlist):
+                    continue  # nothing new since the last attempt
+                place = place_in(
+                    (k, model),
+                    each,
+                    matches,
+                    images,
+                    refinement=refinement or Refinement(),
+                    seed=seed,
+                )
+                known[k] = place and place._replace(found=_held(place.found))
             best = best_place(known.values())
             if best.found.trusted:
                 fresh[best.model][name] = best
@@ -137,20 +105,7 @@ def _held(located: Localization) -> Localization:
         f"alignment finds {located.agreed} of the {located.candidates} points that it would show "
         f"there, but only {count} of them hold it (needed: {MIN_COUNT})"
     )
-    return dataclasses.replace(located, trusted=False, why=why)
-
-
-def best_place(places: Iterable[Place]) -> Place:
-    """The place with most support; of equals, the one in the first model."""
-    return max(places, key=lambda place: (place.found.support, -place.model))
-
-
-def matches_with(
-    name: str, others: Sequence[str], matches: Mapping[Pair, PairResult]
-) -> dict[Pair, PairResult]:
-    """The matches of one image with others, by pair."""
-    pairs = [make_pair(name, other) for other in others]
-    return {pair: matches[pair] for pair in pairs if pair in matches}
+    return dataclasses.replace(located, trusted=False, why=why, octave_px=None, points=None)
 
 
 def _with_placed(model: Model, fresh: Mapping[str, Place]) -> Model:

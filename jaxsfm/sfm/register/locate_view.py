@@ -65,14 +65,14 @@ class Localization:
     """The points that it shows, if the pose is trusted; working pixels."""
 
     @property
-    def support(self) -> tuple[bool, int]:
+    def support(self) -> tuple[bool, int, int]:
         """What speaks for this outcome; of the outcomes in several models, the one with the largest
         support is taken.
 
         Where walls repeat, a photo of one model often resembles a part of another one. It shows
         more points of the model that it belongs to (docs/decisions/finished-models.md).
         """
-        return self.trusted, self.agreed if self.trusted else self.inliers
+        return self.trusted, self.agreed if self.trusted else self.inliers, self.on_surface
 
 
 def locate(
@@ -95,7 +95,7 @@ def locate(
         was known before (`has_prior_focal_length`).
     """
     if not len(model.tracks.points):
-        return _nowhere(0, matches)
+        return nowhere(0, matches)
     normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     xy, points = matched_points(image, model, normal, matches)
     found = find_view(
@@ -107,11 +107,11 @@ def locate(
         seed=seed,
     )
     if found is None:
-        return _nowhere(len(xy), matches)
+        return nowhere(len(xy), matches)
     errors = np.linalg.norm(found.project(points)[0] - xy, axis=1)
     near = np.isfinite(errors) & (errors <= MATCH_ERROR_PX)
     if near.sum() < MIN_POINTS:  # the camera has been refined since RANSAC counted
-        return _nowhere(len(xy), matches)
+        return nowhere(len(xy), matches)
     pose = PoseHypothesis(view=found, own_camera=own_camera)
     if refinement.weak_octaves:
         follow([pose], model, images, refinement)
@@ -149,7 +149,7 @@ def locate(
     )
 
 
-def _nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Localization:
+def nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Localization:
     """The outcome where there is no pose, and why."""
     most = max((result.num_inliers for result in matches.values()), default=0)
     if most == 0:
