@@ -79,8 +79,8 @@ def test_doubt_counts_patches_of_the_octave_that_the_photo_was_aligned_in(render
 )
 def test_a_photo_without_a_pose_is_told_what_was_missing(rendered, on_surface, why):
     matches = night_matches(rendered, right=6, wrong=18).matches
-    assert why in (locate_view._nowhere(on_surface, matches).why or "")
-    assert "no plane in common" in (locate_view._nowhere(on_surface, {}).why or "")
+    assert why in (locate_view.nowhere(on_surface, matches).why or "")
+    assert "no plane in common" in (locate_view.nowhere(on_surface, {}).why or "")
 
 
 @pytest.mark.parametrize(
