@@ -88,14 +88,15 @@ def extend(
         return 0
     assert report.extended is not None
     last = report.extended[-1]
+    placed, without = set(last.placed), set(last.added) - set(last.placed)
     for name in last.skipped:
         print(f"skipped    {report.images.skipped[name]}")
     for photo in report.lost:
-        if photo.image in set(last.added) - set(last.placed):
+        if photo.image in without:
             print(f"lost       {shown_name(photo.image)}: {photo.detail}")
     print(f"placed     {len(last.placed)} of {len(last.added)} new photos in {last.rounds} rounds")
     for k, model in enumerate(report.models):
-        if grown := set(model.images) & set(last.placed):
+        if grown := placed.intersection(model.images):
             print(
                 f"sparse/{k}   {len(grown)} new photos: {model.registered} images, "
                 f"{model.points} points"

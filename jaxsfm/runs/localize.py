@@ -150,9 +150,10 @@ def locate_photo(
     ]
     wanted = UnregisteredView(views, query.cameras[0].estimated, query.shortlist)
     refinement, seed = models[0].config.refinement or Refinement(), models[0].seed
+    every = [each.model for each in models]
     return best_place(
-        place_in((k, each.model), wanted, matches, images, refinement=refinement, seed=seed)
-        for k, each in enumerate(models)
+        place_in(every, k, wanted, matches, images, refinement=refinement, seed=seed)
+        for k in range(len(every))
     )
 
 

@@ -59,9 +59,9 @@ def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> Workin
 
 def read_working_models(run: FinishedRun) -> list[WorkingModel]:
     """All models of a run, the first one first; UserError if one is missing or cannot be read."""
-    seed = run.report.options.seed
+    config, seed = run.config, run.report.options.seed
     return [
-        read_working_model(run.folder / "sparse" / str(k), run.config, seed=seed)
+        read_working_model(run.folder / "sparse" / str(k), config, seed=seed)
         for k in range(len(run.report.models))
     ]
 

@@ -51,6 +51,15 @@ def half_known(scene: Room) -> Model:
     return model.select(known[model.tracks.point] & (model.tracks.view != 3))
 
 
+def of_three_views(scene: Room, *, every: int = 1) -> Model:
+    """The model of the first three views, with each so-many-th of its points."""
+    use = scene.visible.copy()
+    use[:, 3:] = False
+    use[np.arange(len(use)) % every > 0] = False
+    use[use.sum(1) < 2] = False
+    return Model(scene.views[:3], exact_tracks(scene, use=use))
+
+
 def test_rays_meet_where_the_points_are(rendered):
     model = exact_model(rendered)
     nowhere = model.tracks._replace(points=np.zeros_like(model.tracks.points))
@@ -127,17 +136,15 @@ def _nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
     """View 4 is matched with view 3 alone, which is new itself."""
-    use = rendered.visible.copy()
-    use[:, 3:] = False
-    use[use.sum(1) < 2] = False
-    tracks = exact_tracks(rendered, use=use)
+    known = of_three_views(rendered)
+    tracks = known.tracks
     every = {view.name: view for view in rendered.views}
     unregistered = {
         NEW: UnregisteredView([every[NEW]], False, ["0.png", "1.png", "2.png", "4.png"]),
         "4.png": UnregisteredView([every["4.png"]], False, [NEW]),
     }
     grown = grow(
-        [Model(rendered.views[:3], tracks)],
+        [known],
         unregistered,
         all_matches(rendered),
         images_of(rendered),
@@ -155,11 +162,7 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
 @pytest.mark.parametrize("swapped", [False, True])
 def test_a_view_gets_its_place_in_the_model_of_which_it_shows_most_points(rendered, swapped):
     """It could be placed in the model of fewer points, too, which stays as it is."""
-    use = rendered.visible.copy()
-    use[:, 3:] = False
-    fewer = use.copy()
-    fewer[::2] = False
-    models = [Model(rendered.views[:3], exact_tracks(rendered, use=u)) for u in (fewer, use)]
+    models = [of_three_views(rendered, every=2), of_three_views(rendered)]
     every = {view.name: view for view in rendered.views}
     order = [1, 0] if swapped else [0, 1]
 
@@ -184,9 +187,7 @@ def test_a_view_gets_its_place_in_the_model_of_which_it_shows_most_points(render
 @pytest.mark.parametrize("missing", [0, 1])
 def test_a_view_that_too_few_points_hold_is_not_placed(rendered, monkeypatch, missing):
     """Later rounds would place views on the points that it adds."""
-    use = rendered.visible.copy()
-    use[:, 3:] = False
-    model = Model(rendered.views[:3], exact_tracks(rendered, use=use))
+    model = of_three_views(rendered)
     view = {view.name: view for view in rendered.views}[NEW]
     unregistered = {NEW: UnregisteredView([view], False, ["0.png", "1.png", "2.png"])}
 

@@ -58,15 +58,16 @@ def grow(
     tried: dict[str, dict[int, Place | None]] = {name: {} for name in unregistered}
     rounds, latest = 0, set[str]()
     while True:
-        fresh: list[dict[str, Place]] = [{} for _ in models]
+        fresh: dict[str, Place] = {}
         now = [latest & {view.name for view in model.views} for model in models]
         for name in sorted(unregistered.keys() - placed.keys()):
             each, known = unregistered[name], tried[name]
-            for k, model in enumerate(models):
+            for k in range(len(models)):
                 if k in known and not now[k].intersection(each.shortlist):
                     continue  # nothing new since the last attempt
                 place = place_in(
-                    (k, model),
+                    models,
+                    k,
                     each,
                     matches,
                     images,
@@ -76,19 +77,18 @@ def grow(
                 known[k] = place and place._replace(found=_held(place.found))
             best = best_place(known.values())
             if best.found.trusted:
-                fresh[best.model][name] = best
+                fresh[name] = best
                 on_view()
-        latest = {name for places in fresh for name in places}
-        if not latest:
+        if not fresh:
             located = {name: best_place(known.values()).found for name, known in tried.items()}
             return ExtendedModels(models, placed, located, rounds)
-        rounds += 1
-        placed |= {name: k for k, places in enumerate(fresh) for name in sorted(places)}
-        for k, places in enumerate(fresh):
-            if places:
-                models[k] = _with_placed(models[k], places)
-                more = new_points(models[k], places, matches, images, refinement=refinement)
-                models[k] = models[k].with_tracks(models[k].tracks.joined(more))
+        rounds, latest = rounds + 1, set(fresh)
+        placed |= {name: place.model for name, place in fresh.items()}
+        for k in {place.model for place in fresh.values()}:
+            own = {name: place for name, place in fresh.items() if place.model == k}
+            model = _with_placed(models[k], own)
+            more = new_points(model, own, matches, images, refinement=refinement)
+            models[k] = model.with_tracks(model.tracks.joined(more))
 
 
 def _held(located: Localization) -> Localization:

@@ -36,7 +36,8 @@ class Place(NamedTuple):
 
 
 def place_in(
-    model: tuple[int, Model],
+    models: Sequence[Model],
+    k: int,
     wanted: UnregisteredView,
     matches: Mapping[Pair, PairResult],
     images: DeviceImages,
@@ -44,22 +45,21 @@ def place_in(
     refinement: Refinement,
     seed: int,
 ) -> Place | None:
-    """Look for a view in a model, from its matches with the views of its shortlist.
+    """Look for a view in one of the models, from its matches with the views of its shortlist.
 
     Args:
-      model: its index, and itself.
+      k: index of the model.
       matches: original pixels.
       images: those of the view and of its shortlist, in working pixels.
 
     Returns:
       None if no view of its shortlist is in the model.
     """
-    index, whole = model
-    names, view = {each.name for each in whole.views}, wanted.views[index]
+    names, view = {each.name for each in models[k].views}, wanted.views[k]
     around = [name for name in wanted.shortlist if name in names]
     if not around:
         return None
-    part, rows = whole.part(around)
+    part, rows = models[k].part(around)
     pairs = [make_pair(view.name, name) for name in around]
     found = locate(
         view,
@@ -70,7 +70,7 @@ def place_in(
         own_camera=wanted.own_camera,
         seed=seed,
     )
-    return Place(index, found, rows)
+    return Place(k, found, rows)
 
 
 def best_place(places: Iterable[Place | None]) -> Place:
