@@ -75,6 +75,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "refine/padding": (DEVICE, "tests/sfm/test_pair_alignment.py", REFINE),
     "refine/patch_alignment": (DEVICE, REFINE, WEAK),
     "refine/pose_doubt": ("tests/sfm/test_placing.py",),
+    "refine/pose_search": ("tests/sfm/test_pose_search.py",),
     "refine/one_pass": (REFINE, WEAK),
     "refine/passes": (REFINE, WEAK),
     "refine/plane_geometry": (REFINE, WEAK),

@@ -84,15 +84,15 @@ def test_a_photo_without_a_pose_is_told_what_was_missing(rendered, on_surface, w
 
 
 @pytest.mark.parametrize(
-    ("best", "share", "why"),
+    ("best", "stands_out", "why"),
     [
-        (None, 0.0, "alignment finds 3 of the 40 points"),
-        (SimpleNamespace(doubt_px=2.5), 0.001, "at most 0.1 % of the points"),
-        (SimpleNamespace(doubt_px=2.5), 0.9, "leaves 2.50 px of doubt"),
+        (None, None, "alignment finds 3 of the 40 points"),
+        (SimpleNamespace(doubt_px=0.5), None, "not many more points there than beside it"),
+        (SimpleNamespace(doubt_px=0.5), SimpleNamespace(doubt_px=2.5), "leaves 2.50 px of doubt"),
     ],
 )
-def test_a_pose_that_is_not_trusted_says_what_was_missing(best, share, why):
-    pose = SimpleNamespace(best=best, share=share, agreed=3, candidates=40)
+def test_a_pose_that_is_not_trusted_says_what_was_missing(best, stands_out, why):
+    pose = SimpleNamespace(best=best, stands_out=stands_out, agreed=3, candidates=40)
     assert why in locate_view._doubtful(pose, 12, 30)  # pyright: ignore[reportArgumentType]
 
 

@@ -311,7 +311,7 @@ def test_an_image_of_something_else_is_not_registered(rendered):
 def test_matches_bring_a_lost_view_back(rendered):
     """From where alignment alone does not find home."""
     night = by_night(rendered)
-    before = lost_view(night, turn_deg=15.0, shift=0.3)
+    before = lost_view(night, turn_deg=25.0, shift=0.3)
     assert place(before, night)[1][0].octave_px is None
     after, (placed,) = place(
         before, night, evidence=night_matches(night, right=20, wrong=20)._replace(unmapped=())

@@ -28,6 +28,7 @@ from jaxsfm.sfm.refine.octave_pose import (
     follow,
     trusted,
 )
+from jaxsfm.sfm.refine.pose_search import search
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,6 +107,8 @@ def place_weak_views(
     if len(rows) and refinement.weak_octaves:
         poses = _starts(every, structure, wanted, evidence, refinement, refine_intrinsics)
         follow([pose for mine in poses.values() for pose in mine], structure, images, refinement)
+        lost = [mine for mine in poses.values() if not any(map(trusted, mine))]
+        search([pose for mine in lost for pose in mine], structure, images, refinement)
     placements, best = [], {}
     for k, mine in poses.items():
         right = [pose for pose in map(trusted, mine) if pose is not None]

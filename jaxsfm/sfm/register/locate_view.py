@@ -19,15 +19,15 @@ from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.refine.octave_pose import (
-    MAX_DOUBT_PX,
+    MAX_SEARCHED_DOUBT_PX,
     MIN_COUNT,
-    MIN_SHARE,
     AlignedPoints,
     PoseHypothesis,
     follow,
     trusted,
 )
 from jaxsfm.sfm.refine.pose_doubt import pose_doubt
+from jaxsfm.sfm.refine.pose_search import STANDS_OUT, search
 
 CELL_PX = 8
 """Side of a fine cell, working pixels. Matches that share a cell are not independent."""
@@ -115,6 +115,8 @@ def locate(
     pose = PoseHypothesis(view=found, own_camera=own_camera)
     if refinement.weak_octaves:
         follow([pose], model, images, refinement)
+        if trusted(pose) is None:
+            search([pose], model, images, refinement)
     best = trusted(pose)
     if best is None and near.sum() < MIN_COUNT:
         return Localization(
@@ -173,12 +175,12 @@ def _doubtful(pose: PoseHypothesis, inliers: int, on_surface: int) -> str:
             f"{start}alignment finds {pose.agreed} of the {pose.candidates} points that it would "
             f"show there (needed: {MIN_COUNT})"
         )
-    if pose.share < MIN_SHARE:
+    if pose.stands_out is None:
         return (
-            f"{start}alignment finds at most {100 * pose.share:.1f} % of the points that it would "
-            f"show there (needed: {100 * MIN_SHARE:.0f} %)"
+            f"{start}alignment finds not many more points there than beside it "
+            f"(needed: {STANDS_OUT:g} times as many)"
         )
     return (
-        f"{start}what alignment finds leaves {pose.best.doubt_px:.2f} px of doubt "
-        f"(at most {MAX_DOUBT_PX:g})"
+        f"{start}what alignment finds leaves {pose.stands_out.doubt_px:.2f} px of doubt "
+        f"(at most {MAX_SEARCHED_DOUBT_PX:g})"
     )
