@@ -119,7 +119,7 @@ def test_a_pose_is_trusted_with_little_doubt_and_enough_that_agrees(
 ):
     view = rendered.views[NIGHT]
     seen = observed(rendered, np.arange(40), 1.0)
-    best = OctavePose(view, 2, seen, 40, 1.0, doubt_px)
+    best = OctavePose(view, 2, seen, 40, 1.0, doubt_px, 30)
     pose = PoseHypothesis(view=view, own_camera=False, octaves={2: best}, share=share)
     assert trusted(pose) is (best if right else None)
     assert trusted(dataclasses.replace(pose, octaves={})) is None
@@ -139,7 +139,7 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
         began.append([(name, poses[name].view) for name in names])
         for name in names:
             doubt_px = found[name]
-            best = OctavePose(end, 2, seen, 40, 1.0, doubt_px) if doubt_px else None
+            best = OctavePose(end, 2, seen, 40, 1.0, doubt_px, 30) if doubt_px else None
             poses[name].view, poses[name].octaves = last, {2: best} if best else {}
 
     monkeypatch.setattr(octave_pose, "_descend", descend)

@@ -21,7 +21,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
-from jaxsfm.sfm.refine.pose_doubt import projection_doubt
+from jaxsfm.sfm.refine.pose_doubt import distinct_patches, projection_doubt
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
 MIN_COUNT = 30
@@ -92,6 +92,8 @@ class OctavePose(NamedTuple):
     doubt_px: float
     """How far off the view's projections are expected to be, working pixels
     (`jaxsfm.sfm.refine.pose_doubt.projection_doubt`)."""
+    patches: int
+    """How many patches without overlap the points that agreed amount to."""
 
 
 @dataclasses.dataclass(kw_only=True, eq=False)
@@ -183,7 +185,15 @@ def _step(
         near = errors <= refinement.max_error_px
         xy = Pixels.octave(px).to_original(seen.xy[near])
         points = AlignedPoints(seen.rows[near], seen.points[near], xy, seen.candidates)
-        pose.octaves[px] = OctavePose(pose.view, px, points, pose.agreed, error_px * px, doubt_px)
+        pose.octaves[px] = OctavePose(
+            view=pose.view,
+            octave_px=px,
+            points=points,
+            agreed=pose.agreed,
+            error_px=error_px * px,
+            doubt_px=doubt_px,
+            patches=distinct_patches(seen.xy, side),
+        )
     way = moved.project(seen.points)[0] - view.project(seen.points)[0]
     return bool(np.median(np.linalg.norm(way, axis=1)) > STILL_PX)
 

@@ -46,10 +46,20 @@ def _reach(view: View, points: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(points - view.centre, axis=1)))
 
 
+def distinct_patches(xy: np.ndarray, side: float) -> int:
+    """How many patches without overlap the observations (n, 2) amount to. Patches that overlap see
+    the same photons, and so have the same errors.
+
+    Args:
+      side: side of a patch, pixels.
+    """
+    return len(np.unique(np.floor(xy / side), axis=0))
+
+
 def _covariance(own: np.ndarray, xy: np.ndarray, error_px: float, side: float) -> np.ndarray | None:
     """Covariance of least squares over observations, or None if they determine no pose.
 
-    Patches that overlap see the same photons, and so have the same errors: they count as one.
+    Patches that overlap count as one.
 
     Args:
       own: Jacobian (n, 2, parameters) at the observations.
@@ -57,8 +67,7 @@ def _covariance(own: np.ndarray, xy: np.ndarray, error_px: float, side: float) -
       error_px: their median error.
       side: side of a patch, pixels.
     """
-    distinct = len(np.unique(np.floor(xy / side), axis=0))
-    variance = (error_px / MEDIAN_RADIUS) ** 2 * len(xy) / distinct
+    variance = (error_px / MEDIAN_RADIUS) ** 2 * len(xy) / distinct_patches(xy, side)
     information = np.einsum("nia,nib->ab", own, own)
     if np.linalg.cond(information) > MAX_CONDITION:
         return None
