@@ -5,15 +5,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from room_scene import SIZE, Room, exact_model, images_of
+from room_scene import SIZE, Room, exact_model, images_of, sizes
 from scipy.spatial.transform import Rotation
+from wall_scene import matched
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
+from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.refine import octave_pose, pose_search
+from jaxsfm.sfm.refine.evidence import NO_EVIDENCE
 from jaxsfm.sfm.refine.octave_pose import AlignedPoints, OctavePose, PoseHypothesis, follow, trusted
-from jaxsfm.sfm.refine.pose_search import BESIDE, MIN_PATCHES, STANDS_OUT, search
+from jaxsfm.sfm.refine.pose_search import MIN_PATCHES, search
+from jaxsfm.sfm.refine.weak_views import place_weak_views
+from jaxsfm.sfm.register import locate_view
+from jaxsfm.sfm.register.locate_view import Localization, locate
 
 NIGHT, NIGHT_NAME = 2, "2.png"
 DAYS = [f"{k}.png" for k in range(5) if k != NIGHT]
@@ -102,7 +108,7 @@ def test_what_a_descent_found_is_forgotten_when_a_pose_climbs_away(rendered, mon
 
 
 @pytest.mark.parametrize(
-    ("own", "beside", "climbs"), [(31, 34, False), (31, 35, True), (0, 30, False), (0, 31, True)]
+    ("own", "beside", "climbs"), [(31, 34, False), (31, 35, True), (0, 29, False), (0, 30, True)]
 )
 def test_a_pose_climbs_only_for_a_tenth_more_and_enough(rendered, monkeypatch, own, beside, climbs):
     pose = PoseHypothesis(view=rendered.views[NIGHT], own_camera=False)
@@ -119,41 +125,87 @@ def test_a_pose_climbs_only_for_a_tenth_more_and_enough(rendered, monkeypatch, o
     # The fifth of eight directions is opposite to the first: the photo's middle moves to the left.
     way = pose.view.project(rendered.points)[0] - rendered.views[NIGHT].project(rendered.points)[0]
     side = 2 * REFINEMENT.radius + 1
-    assert np.median(way[:, 0]) == pytest.approx(-side if climbs else 0, abs=0.1 * side)
+    assert np.median(way[:, 0]) == pytest.approx(-0.8 * side if climbs else 0, abs=0.1 * side)
 
 
 def _octave(view: View, px: int, *, doubt_px: float, patches: int = MIN_PATCHES) -> OctavePose:
-    return OctavePose(view, px, AlignedPoints.joined([]), 40, 1.0, doubt_px, patches)
+    """A pose at which 40 of 100 points agree."""
+    offsets = np.random.default_rng(0).uniform(-1, 1, (100, 3))
+    could = view.centre + 5 * view.rotation[2] + offsets
+    seen = AlignedPoints(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), could)
+    return OctavePose(view, px, seen, 40, 1.0, doubt_px, patches)
+
+
+def _shown(count: int, could: int = 100) -> SimpleNamespace:
+    return SimpleNamespace(rows=range(count), candidates=range(could))
+
+
+def _compared(monkeypatch, rendered: Room, poses: list[PoseHypothesis], beside, octaves=2) -> None:
+    """Compare poses; `beside` gives what a view beside them shows, of its number and octave."""
+
+    def shown_from(views, structure, images, refinement, px):
+        return [(view, beside(k, px)) for k, view in enumerate(views)]
+
+    monkeypatch.setattr(pose_search, "shown_from", shown_from)
+    settings = Refinement(weak_octaves=octaves)
+    pose_search._compare(poses, by_day(rendered), images_of(rendered), settings)
+
+
+def _hypothesis(view: View, *octaves: OctavePose) -> PoseHypothesis:
+    own = {each.octave_px: each for each in octaves}
+    return PoseHypothesis(view=view, own_camera=False, octaves=own)
 
 
 @pytest.mark.parametrize(
-    ("beside", "patches", "right"),
-    [(8, 20, True), (9, 20, False), (0, 20, True), (8, 19, False)],
+    ("beside", "could", "patches", "right"),
+    [
+        (8, 100, 20, True),
+        (9, 100, 20, False),
+        (0, 100, 20, True),
+        (8, 100, 19, False),
+        (5, 50, 20, False),  # a tenth of what it could show
+        (4, 50, 20, True),
+        (9, 49, 20, True),  # it could show too little to say anything
+    ],
 )
 def test_a_pose_stands_out_with_five_times_what_is_beside_it_in_enough_patches(
-    rendered, monkeypatch, beside, patches, right
+    rendered, monkeypatch, beside, could, patches, right
 ):
     view = rendered.views[NIGHT]
-    assert STANDS_OUT * 8 == 40
     one = _octave(view, 2, doubt_px=9.0, patches=patches)
-    ways = []
+    pose = _hypothesis(view, one)
+    shown = [_shown(0), _shown(0), _shown(beside, could), _shown(0)]
+    _compared(monkeypatch, rendered, [pose], lambda k, _: shown[k])
+    assert pose.stands_out is (one if right else None)
+
+
+def test_a_pose_of_which_nothing_can_be_said_beside_it_does_not_stand_out(rendered, monkeypatch):
+    pose = _hypothesis(rendered.views[NIGHT], _octave(rendered.views[NIGHT], 2, doubt_px=0.1))
+    _compared(monkeypatch, rendered, [pose], lambda *_: _shown(0, 49))
+    assert pose.searched and pose.stands_out is None
+
+
+def test_poses_beside_are_turned_by_two_patches_to_four_sides(rendered, monkeypatch):
+    view, ways = rendered.views[NIGHT], []
+    middle = view.centre[None] + 5 * view.rotation[2]
 
     def shown_from(views, *_):
-        middle = view.centre + 5 * view.rotation[2]
-        ways.extend(
-            each.project(middle[None])[0][0] - view.project(middle[None])[0][0] for each in views
-        )
-        counts = [0, 0, beside, 0]
-        return [
-            (each, SimpleNamespace(rows=range(n))) for each, n in zip(views, counts, strict=True)
-        ]
+        ways.extend(each.project(middle)[0][0] - view.project(middle)[0][0] for each in views)
+        return [(each, _shown(0)) for each in views]
 
     monkeypatch.setattr(pose_search, "shown_from", shown_from)
-    pose = PoseHypothesis(view=view, own_camera=False, octaves={2: one})
+    pose = _hypothesis(view, _octave(view, 2, doubt_px=0.1))
     pose_search._compare([pose], by_day(rendered), images_of(rendered), REFINEMENT)
-    assert pose.stands_out is (one if right else None)
-    far = BESIDE * 2 * (2 * REFINEMENT.radius + 1)
-    np.testing.assert_allclose(np.linalg.norm(ways, axis=1), far, rtol=0.1)
+    np.testing.assert_allclose(ways, [[60, 0], [-60, 0], [0, 60], [0, -60]], atol=2)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_a_turn_moves_what_the_middle_shows_by_working_pixels(rendered, scale):
+    view = rendered.views[NIGHT]
+    view = dataclasses.replace(view, pixels=Pixels((scale, scale)))
+    middle = view.centre[None] + 5 * view.rotation[2]
+    way = pose_search._turned(view, np.asarray([9.0, -6.0])).project(middle)[0][0]
+    np.testing.assert_allclose(way - view.project(middle)[0][0], [9, -6], atol=0.1)
 
 
 @pytest.mark.parametrize(
@@ -163,19 +215,61 @@ def test_the_coarsest_octave_stands_out_and_of_those_that_do_the_surest_counts(
     rendered, monkeypatch, beside, best
 ):
     view = rendered.views[NIGHT]
-    doubts = {4: 1.5, 2: 1.2, 1: 0.9}
-    octaves = {px: _octave(view, px, doubt_px=doubt) for px, doubt in doubts.items()}
+    octaves = [_octave(view, px, doubt_px=d) for px, d in ((4, 1.5), (2, 1.2), (1, 0.9))]
+    for order in (octaves, octaves[::-1]):
+        pose = _hypothesis(view, *order)
+        _compared(monkeypatch, rendered, [pose], lambda _, px: _shown(beside.get(px, 0)), 3)
+        found = pose.stands_out
+        assert (found and found.octave_px) == best
 
-    def shown_from(views, structure, images, refinement, px):
-        return [(each, SimpleNamespace(rows=range(beside.get(px, 0)))) for each in views]
 
-    monkeypatch.setattr(pose_search, "shown_from", shown_from)
-    for order in ((4, 2, 1), (1, 2, 4)):
-        own = {px: octaves[px] for px in order}
-        pose = PoseHypothesis(view=view, own_camera=False, octaves=own)
-        three = Refinement(weak_octaves=3)
-        pose_search._compare([pose], by_day(rendered), images_of(rendered), three)
-        assert pose.stands_out is (octaves[best] if best else None)
+def test_an_octave_that_gives_another_place_does_not_count(rendered, monkeypatch):
+    view = rendered.views[NIGHT]
+    coarse, elsewhere = _octave(view, 2, doubt_px=1.5), _octave(turned(view, 25), 1, doubt_px=0.1)
+    pose = _hypothesis(view, coarse, elsewhere)
+    _compared(monkeypatch, rendered, [pose], lambda *_: _shown(0))
+    assert pose.stands_out is coarse
+
+
+def test_a_pose_is_judged_by_itself(rendered, monkeypatch):
+    view = rendered.views[NIGHT]
+    one = _octave(view, 2, doubt_px=0.1)
+    for first in (True, False):
+        good, bad = _hypothesis(view, one), _hypothesis(view, one)
+        poses = [good, bad] if first else [bad, good]
+        wrong = range(4, 8) if first else range(4)
+        _compared(monkeypatch, rendered, poses, lambda k, _: _shown(9 if k in wrong else 0))  # noqa: B023
+        assert good.stands_out is one and bad.stands_out is None
+
+
+def test_a_climb_has_four_steps_in_eight_directions(rendered, monkeypatch):
+    tried = []
+
+    def settle(poses, *_):
+        tried.append([each.view for each in poses])
+        for k, each in enumerate(poses):
+            each.agreed = (30 * 2 ** len(tried)) * (
+                k == 3
+            )  # the third direction is better each time
+
+    monkeypatch.setattr(pose_search, "settle", settle)
+    view = rendered.views[NIGHT]
+    pose = PoseHypothesis(view=view, own_camera=False)
+    assert pose_search._climb([pose], by_day(rendered), images_of(rendered), REFINEMENT) == [pose]
+    assert len(tried) == 4 and pose.view is tried[-1][3]
+    middle = view.centre[None] + 5 * view.rotation[2]
+    ways = [each.project(middle)[0][0] - view.project(middle)[0][0] for each in tried[0]]
+    angles = np.arange(8) * np.pi / 4
+    expected = 12 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    np.testing.assert_allclose(ways, [[0, 0], *expected], atol=0.5)
+
+
+def test_small_photos_are_not_searched_around(rendered):
+    """At an eighth of their size there is no room for twenty patches."""
+    view = rendered.views[NIGHT]
+    pose = PoseHypothesis(view=view, own_camera=False, octaves={1: _octave(view, 1, doubt_px=0.1)})
+    search([pose], by_day(rendered), images_of(rendered), Refinement(weak_octaves=4))
+    assert not pose.searched
 
 
 def test_after_a_search_a_pose_has_to_stand_out(rendered):
@@ -188,3 +282,55 @@ def test_after_a_search_a_pose_has_to_stand_out(rendered):
         found = _octave(view, 2, doubt_px=doubt_px)
         after = dataclasses.replace(pose, searched=True, stands_out=found, share=0.01)
         assert trusted(after) is (found if right else None)
+
+
+def test_the_refinement_searches_around_views_that_it_cannot_place(rendered, much_is_asked):
+    """The view starts half a patch's side off, and a corner of it is lit."""
+    scene = lit_in_a_corner(rendered)
+    whole = exact_model(scene)
+    views = list(whole.views)
+    views[NIGHT] = turned(views[NIGHT], 2.0)
+    model, (placed,) = place_weak_views(
+        whole.with_views(views),
+        [NIGHT_NAME],
+        images_of(scene),
+        sizes(scene),
+        refinement=REFINEMENT,
+        refine_intrinsics=False,
+        evidence=NO_EVIDENCE,
+    )
+    assert placed.octave_px is not None and off_px(model.views[NIGHT], scene) < 0.5
+
+
+def localized(scene: Room, shift: float) -> Localization:
+    """From forty matches that put the view at a turned pose."""
+    view, day = turned(scene.views[NIGHT], shift), scene.views[1]
+    rows = np.flatnonzero(scene.visible[:, [1, NIGHT]].all(1))[::5][:40]
+    at, there = (each.project(scene.points[rows])[0] for each in (day, view))
+    matches = {("1.png", NIGHT_NAME): matched(("1.png", NIGHT_NAME), at, there)}
+    return locate(
+        view,
+        by_day(scene),
+        matches,
+        images_of(scene),
+        refinement=REFINEMENT,
+        own_camera=False,
+    )
+
+
+def test_a_photo_of_which_a_corner_is_lit_is_localized(rendered, much_is_asked):
+    found = localized(lit_in_a_corner(rendered), 1.0)
+    assert found.trusted and found.view is not None
+    assert off_px(found.view, rendered) < 0.5
+
+
+def test_a_search_does_not_leave_many_matches_that_agree(rendered, much_is_asked):
+    """Two steps of the climb away, the photo shows more."""
+    scene = lit_in_a_corner(rendered)
+    found = localized(scene, 2.0)
+    assert found.trusted
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(locate_view, "LEAVES", 1.0)
+        patch.setattr(locate_view, "MATCH_ERROR_PX", 3.0)
+        found = localized(scene, 2.0)
+    assert not found.trusted and "most of these matches contradict" in str(found.why)

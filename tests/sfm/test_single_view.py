@@ -86,13 +86,21 @@ def test_a_photo_without_a_pose_is_told_what_was_missing(rendered, on_surface, w
 @pytest.mark.parametrize(
     ("best", "stands_out", "why"),
     [
-        (None, None, "alignment finds 3 of the 40 points"),
-        (SimpleNamespace(doubt_px=0.5), None, "not many more points there than beside it"),
-        (SimpleNamespace(doubt_px=0.5), SimpleNamespace(doubt_px=2.5), "leaves 2.50 px of doubt"),
+        (None, None, "alignment finds 3 of the 40 points that it would show there (needed: 30)"),
+        (
+            0.5,
+            None,
+            "does not stand out (needed: 5 times as many points as beside it, in 20 patches)",
+        ),
+        (0.5, 2.5, "leaves 2.50 px of doubt (at most 2)"),
+        (0.5, 1.5, "alignment finds another pose, which most of these matches contradict"),
     ],
 )
 def test_a_pose_that_is_not_trusted_says_what_was_missing(best, stands_out, why):
-    pose = SimpleNamespace(best=best, stands_out=stands_out, agreed=3, candidates=40)
+    first, second = (each and SimpleNamespace(doubt_px=each) for each in (best, stands_out))
+    pose = SimpleNamespace(
+        best=first, stands_out=second, searched=True, agreed=3, candidates=40, share=0.0
+    )
     assert why in locate_view._doubtful(pose, 12, 30)  # pyright: ignore[reportArgumentType]
 
 

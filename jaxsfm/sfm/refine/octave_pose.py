@@ -27,7 +27,8 @@ from jaxsfm.sfm.refine.track_alignment import align_blocks
 MIN_COUNT = 30
 """An octave's pose counts only if at least so many points agree."""
 MIN_SHARE = 0.05
-"""At one octave at least, this share of the points that a view could show must agree. At wrong
+"""At one octave at least, this share of the points that a view could show must agree, or the pose
+is searched around (`jaxsfm.sfm.refine.pose_search`). At wrong
 poses up to 7 % agree, at right ones 8 to 70 % at an eighth of the size
 (docs/decisions/weak-views.md)."""
 MAX_DOUBT_PX = 1.0
@@ -36,8 +37,8 @@ followed from wrong starts (castle-P19 0016) one ends at 0.95, with 1.5 % of the
 and the others end above 1.6 or without any point."""
 MAX_SEARCHED_DOUBT_PX = 2.0
 """Largest doubt about a pose that stands out after a search, working pixels. Of right ones, which
-are 0.5 to 3.3 px off (nights of fountain-P11 and castle-P19), the doubt is 0.4 to 1.9; two that are
-40 and 78 px off have 2.5 and 4.2."""
+are 0.5 to 3.3 px off (nights of fountain-P11 and castle-P19), the doubt is 0.4 to 1.9; wrong ones
+that are 16, 40 and 78 px off have 1.9, 2.5 and 4.2."""
 MAX_DESCENTS, SURE_PX = 2, 0.5
 """A pose that ends in more doubt than SURE_PX (working pixels) is followed over all octaves once
 more, from where it was best. A pose that was right only at the last octave finds more points at the
@@ -127,10 +128,12 @@ class PoseHypothesis:
 def trusted(pose: PoseHypothesis) -> OctavePose | None:
     """The pose of the best octave, or after a search the one that stands out; None if the evidence
     for it is not enough."""
-    best, most, share = pose.best, MAX_DOUBT_PX, pose.share
     if pose.searched:
-        best, most, share = pose.stands_out, MAX_SEARCHED_DOUBT_PX, 1.0
-    return best if best and share >= MIN_SHARE and best.doubt_px <= most else None
+        found = pose.stands_out
+        return found if found and found.doubt_px <= MAX_SEARCHED_DOUBT_PX else None
+    best = pose.best
+    enough = best is not None and pose.share >= MIN_SHARE and best.doubt_px <= MAX_DOUBT_PX
+    return best if enough else None
 
 
 def _aligned_points(

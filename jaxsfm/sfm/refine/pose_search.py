@@ -19,6 +19,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.octave_pose import (
     MIN_COUNT,
+    AlignedPoints,
     OctavePose,
     PoseHypothesis,
     follow,
@@ -26,24 +27,31 @@ from jaxsfm.sfm.refine.octave_pose import (
     shown_from,
 )
 
-DIRECTIONS, REACH = 8, 0.5
+DIRECTIONS, REACH = 8, 0.4
 """A step of the climb tries poses that are turned in so many directions, by this share of a patch's
-side at the coarsest octave. Alignment finds a point from a quarter of a side off."""
+side at the coarsest octave. Alignment finds a point from a quarter of a side off, so poses between
+the tried ones are found too."""
 MORE = 1.1
 """A pose climbs to another one if so many times as many points agree there."""
 MAX_CLIMB = 4
 """The largest number of steps of a climb."""
 BESIDE = 2.0
 """The poses beside a pose are turned by so many sides of a patch, to four sides."""
+ENOUGH_BESIDE = 0.5
+"""A pose beside counts if it could show this share of the points that the pose could show."""
 STANDS_OUT = 5.0
-"""An octave stands out if so many times as many points agree as at any pose beside it. The coarsest
-one has to, because on a facade a pose that is off by a window agrees with details as well: on
-castle-P19 such a pose has 39 points and 9 beside it at half the size, but 665 and 295 at an eighth.
+"""An octave stands out if so many times as large a share of the points agrees as at any pose beside
+it. The coarsest one has to, because on a facade a pose that is off by a window agrees with details
+as well: on castle-P19 such a pose has 39 points and 9 beside it at half the size, but 665 and 295
+at an eighth.
 """
 MIN_PATCHES = 20
 """At the coarsest octave, the points that agree must amount to so many patches without overlap. In
 a model with many points, they may lie in a few corners: at a pose of fountain-P11 0010 that is 42
 degrees off, 137 points agree and 13 beside it, in 13 patches. At right ones it is 12 to 70."""
+ROOM = 2
+"""A view is searched around if its coarsest octave has room for so many times `MIN_PATCHES`: 1000
+working pixels on the longer side, about. On smaller ones next to no pose could be trusted."""
 
 
 def search(
@@ -58,9 +66,17 @@ def search(
       poses: of views that are not among those of the structure, followed over all octaves.
       structure, images, refinement: as in `jaxsfm.sfm.refine.octave_pose.follow`.
     """
-    moved = _climb(poses, structure, images, refinement)
+    large = [pose for pose in poses if _has_room(pose.view, refinement)]
+    if not large:
+        return
+    moved = _climb(large, structure, images, refinement)
     follow(moved, structure, images, refinement)
-    _compare(poses, structure, images, refinement)
+    _compare(large, structure, images, refinement)
+
+
+def _has_room(view: View, refinement: Refinement) -> bool:
+    side = _coarsest(refinement) * (2 * refinement.radius + 1)
+    return view.size[0] * view.size[1] >= ROOM * MIN_PATCHES * side**2
 
 
 def _climb(
@@ -76,15 +92,16 @@ def _climb(
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     ways = way_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     climbing, moved = list(poses), dict[PoseHypothesis, None]()
-    for pose in climbing:
-        pose.view = pose.octaves[max(pose.octaves)].view if pose.octaves else pose.view
+    start = {
+        pose: pose.octaves[max(pose.octaves)].view if pose.octaves else pose.view for pose in poses
+    }
     for _ in range(MAX_CLIMB):
         if not climbing:
             break
         tried = [
             [
                 PoseHypothesis(view=view, own_camera=pose.own_camera)
-                for view in [pose.view, *(_turned(pose.view, way) for way in ways)]
+                for view in [start[pose], *(_turned(start[pose], way) for way in ways)]
             ]
             for pose in climbing
         ]
@@ -92,8 +109,8 @@ def _climb(
         higher = []
         for pose, own in zip(climbing, tried, strict=True):
             best = max(own, key=lambda each: each.agreed)
-            if best.agreed > max(MORE * own[0].agreed, MIN_COUNT):
-                pose.view = best.view
+            if best.agreed >= MIN_COUNT and best.agreed > MORE * own[0].agreed:
+                start[pose] = pose.view = best.view
                 higher.append(pose)
         moved |= dict.fromkeys(higher)
         climbing = higher
@@ -116,16 +133,33 @@ def _compare(
         ways = way_px * np.asarray([[1, 0], [-1, 0], [0, 1], [0, -1]])
         own = [(pose, each) for pose, each in every if each.octave_px == px]
         views = [_turned(each.view, way) for _, each in own for way in ways]
-        shown = shown_from(views, structure, images, refinement, px)
-        counts = np.reshape([len(seen.rows) for _, seen in shown], (len(own), len(ways)))
-        for (pose, each), beside in zip(own, counts.max(1).tolist(), strict=True):
-            if each.agreed >= STANDS_OUT * beside:
+        shown = [seen for _, seen in shown_from(views, structure, images, refinement, px)]
+        for k, (pose, each) in enumerate(own):
+            if _stands_out(each, shown[k * len(ways) : (k + 1) * len(ways)]):
                 ahead[pose].append(each)
     for pose, found in ahead.items():
         pose.searched = True
-        ground = [each for each in found if each.octave_px == _coarsest(refinement)]
-        if any(each.patches >= MIN_PATCHES for each in ground):
-            pose.stands_out = min(found, key=lambda each: each.doubt_px)
+        ground = next((each for each in found if each.octave_px == _coarsest(refinement)), None)
+        if ground is not None and ground.patches >= MIN_PATCHES:
+            near_px = ground.octave_px * (2 * refinement.radius + 1)
+            there = [each for each in found if _apart_px(each, ground) <= near_px]
+            pose.stands_out = min(there, key=lambda each: each.doubt_px)
+
+
+def _stands_out(pose: OctavePose, beside: Sequence[AlignedPoints]) -> bool:
+    """Whether far more agrees at a pose than at the poses beside it that say something."""
+    could = len(pose.points.candidates)
+    telling = [seen for seen in beside if len(seen.candidates) >= ENOUGH_BESIDE * could]
+    most = max((len(seen.rows) / len(seen.candidates) for seen in telling), default=np.inf)
+    return pose.agreed / could >= STANDS_OUT * most
+
+
+def _apart_px(first: OctavePose, second: OctavePose) -> float:
+    """How far apart two poses put the points that the second could show: the median, working
+    pixels."""
+    points = second.points.candidates
+    way = first.view.project(points)[0] - second.view.project(points)[0]
+    return float(np.median(np.nan_to_num(np.linalg.norm(way, axis=1), nan=np.inf)))
 
 
 def _coarsest(refinement: Refinement) -> int:

@@ -27,8 +27,10 @@ from jaxsfm.sfm.refine.octave_pose import (
     trusted,
 )
 from jaxsfm.sfm.refine.pose_doubt import pose_doubt
-from jaxsfm.sfm.refine.pose_search import STANDS_OUT, search
+from jaxsfm.sfm.refine.pose_search import MIN_PATCHES, STANDS_OUT, search
 
+LEAVES = 2.0
+"""A match counts as left if it is off by more than this many times the error of an inlier."""
 CELL_PX = 8
 """Side of a fine cell, working pixels. Matches that share a cell are not independent."""
 
@@ -118,6 +120,8 @@ def locate(
         if trusted(pose) is None:
             search([pose], model, images, refinement)
     best = trusted(pose)
+    if best is not None and pose.searched and _leaves(best.view, xy, points, near):
+        best = None
     if best is None and near.sum() < MIN_COUNT:
         return Localization(
             why=_doubtful(pose, int(near.sum()), len(xy)),
@@ -151,6 +155,17 @@ def locate(
     )
 
 
+def _leaves(view: View, xy: np.ndarray, points: np.ndarray, near: np.ndarray) -> bool:
+    """Whether a search has left most of the matches that gave the pose, if these are many.
+
+    A few matches of a night are often wrong. Many that agree with one pose are not, and then a
+    search has found a repetition.
+    """
+    errors = np.linalg.norm(view.project(points)[0] - xy, axis=1)
+    kept = near & np.isfinite(errors) & (errors <= LEAVES * MATCH_ERROR_PX)
+    return bool(near.sum() >= MIN_COUNT and kept.sum() < near.sum() / 2)
+
+
 def nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Localization:
     """The outcome where there is no pose, and why."""
     most = max((result.num_inliers for result in matches.values()), default=0)
@@ -175,10 +190,12 @@ def _doubtful(pose: PoseHypothesis, inliers: int, on_surface: int) -> str:
             f"{start}alignment finds {pose.agreed} of the {pose.candidates} points that it would "
             f"show there (needed: {MIN_COUNT})"
         )
+    if trusted(pose) is not None:
+        return f"{start}alignment finds another pose, which most of these matches contradict"
     if pose.stands_out is None:
         return (
-            f"{start}alignment finds not many more points there than beside it "
-            f"(needed: {STANDS_OUT:g} times as many)"
+            f"{start}what alignment finds there does not stand out (needed: {STANDS_OUT:g} times "
+            f"as many points as beside it, in {MIN_PATCHES} patches)"
         )
     return (
         f"{start}what alignment finds leaves {pose.stands_out.doubt_px:.2f} px of doubt "
