@@ -18,7 +18,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
-if "PYTEST_XDIST_WORKER" in os.environ and hasattr(os, "sched_setaffinity"):
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ and hasattr(os, "sched_setaffinity"):
     # Each worker keeps to its share of the cores: two that each use all of them wait for each other
     # (the tests of sfm take 138 s instead of 152 s on two cores).
     workers, own = (os.environ[f"PYTEST_XDIST_WORKER{end}"] for end in ("_COUNT", ""))
