@@ -223,12 +223,15 @@ def test_the_coarsest_octave_stands_out_and_of_those_that_do_the_surest_counts(
         assert (found and found.octave_px) == best
 
 
-def test_an_octave_that_gives_another_place_does_not_count(rendered, monkeypatch):
+@pytest.mark.parametrize(("px", "same"), [(27.0, True), (33.0, False), (200.0, False)])
+def test_an_octave_that_gives_another_place_does_not_count(rendered, monkeypatch, px, same):
+    """Off by more than a patch's side of 2 x 15 pixels."""
     view = rendered.views[NIGHT]
-    coarse, elsewhere = _octave(view, 2, doubt_px=1.5), _octave(turned(view, 25), 1, doubt_px=0.1)
-    pose = _hypothesis(view, coarse, elsewhere)
+    away = pose_search._turned(view, np.asarray([px, 0.0]))
+    coarse, other = _octave(view, 2, doubt_px=1.5), _octave(away, 1, doubt_px=0.1)
+    pose = _hypothesis(view, coarse, other)
     _compared(monkeypatch, rendered, [pose], lambda *_: _shown(0))
-    assert pose.stands_out is coarse
+    assert pose.stands_out is (other if same else coarse)
 
 
 def test_a_pose_is_judged_by_itself(rendered, monkeypatch):
@@ -270,6 +273,9 @@ def test_small_photos_are_not_searched_around(rendered):
     pose = PoseHypothesis(view=view, own_camera=False, octaves={1: _octave(view, 1, doubt_px=0.1)})
     search([pose], by_day(rendered), images_of(rendered), Refinement(weak_octaves=4))
     assert not pose.searched
+    for width, has_room in ((1200, True), (1199, False)):  # forty patches of 120 x 120 pixels
+        some = dataclasses.replace(view, size=(width, 480))
+        assert pose_search._has_room(some, Refinement(weak_octaves=4)) is has_room
 
 
 def test_after_a_search_a_pose_has_to_stand_out(rendered):
