@@ -80,6 +80,11 @@ class Refinement:
     weak_min_score: float = 0.6
     """`min_score` in weak views."""
 
+    @property
+    def patch_side(self) -> int:
+        """The side of a patch, pixels."""
+        return 2 * self.radius + 1
+
     def in_all_views(self) -> "Refinement":
         """The same settings, but points are looked for in all views that could see them."""
         return dataclasses.replace(self, most_views=0)

@@ -63,6 +63,11 @@ class View:
         """Original pixels per working pixel, the mean over x and y."""
         return float(np.mean(self.pixels.scale))
 
+    @property
+    def focal_px(self) -> float:
+        """The focal length in working pixels, the mean over x and y."""
+        return self.camera.mean_focal_length() / self.mean_scale
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points (n, 3).
 

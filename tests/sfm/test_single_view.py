@@ -84,6 +84,21 @@ def test_a_photo_without_a_pose_is_told_what_was_missing(rendered, on_surface, w
 
 
 @pytest.mark.parametrize(
+    ("best", "share", "why"),
+    [
+        (0.5, 0.001, "at most 0.1 % of the points that it would show there (needed: 5 %)"),
+        (2.5, 0.9, "leaves 2.50 px of doubt (at most 1)"),
+    ],
+)
+def test_a_small_photos_pose_that_is_not_trusted_says_what_was_missing(best, share, why):
+    """It is not searched around."""
+    pose = SimpleNamespace(
+        best=SimpleNamespace(doubt_px=best), stands_out=None, searched=False, share=share
+    )
+    assert why in locate_view._doubtful(pose, 12, 30)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
     ("best", "stands_out", "why"),
     [
         (None, None, "alignment finds 3 of the 40 points that it would show there (needed: 30)"),

@@ -28,9 +28,8 @@ MIN_COUNT = 30
 """An octave's pose counts only if at least so many points agree."""
 MIN_SHARE = 0.05
 """At one octave at least, this share of the points that a view could show must agree, or the pose
-is searched around (`jaxsfm.sfm.refine.pose_search`). At wrong
-poses up to 7 % agree, at right ones 8 to 70 % at an eighth of the size
-(docs/decisions/weak-views.md)."""
+is searched around (`jaxsfm.sfm.refine.pose_search`). At wrong poses up to 7 % agree, at right ones
+8 to 70 % at an eighth of the size (docs/decisions/weak-views.md)."""
 MAX_DOUBT_PX = 1.0
 """Largest doubt about a trusted pose, working pixels. Right poses have 0.2 to 0.7. Of 24 poses
 followed from wrong starts (castle-P19 0016) one ends at 0.95, with 1.5 % of the points agreeing,
@@ -181,7 +180,7 @@ def _step(
     errors = np.linalg.norm(moved.project(seen.points)[0] - seen.xy, axis=1)
     errors = np.where(np.isfinite(errors), errors, np.inf)
     error_px = float(np.median(errors))
-    side = 2 * refinement.radius + 1
+    side = refinement.patch_side
     doubt_px = px * projection_doubt(moved, seen.points, seen.xy, seen.candidates, error_px, side)
     before = pose.octaves.get(px)
     if before is None or doubt_px < before.doubt_px:

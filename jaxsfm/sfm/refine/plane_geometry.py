@@ -79,7 +79,7 @@ def seen_by(
       the camera stands in the point, and such a view fits nothing.
     """
     centres = np.stack([view.centre for view in views])
-    focal = np.asarray([view.camera.mean_focal_length() / view.mean_scale for view in views])
+    focal = np.asarray([view.focal_px for view in views])
     ray = centres[which] - points
     distance = np.linalg.norm(ray, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):

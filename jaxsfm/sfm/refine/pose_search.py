@@ -75,7 +75,7 @@ def search(
 
 
 def _has_room(view: View, refinement: Refinement) -> bool:
-    side = _coarsest(refinement) * (2 * refinement.radius + 1)
+    side = _coarsest(refinement) * refinement.patch_side
     return view.size[0] * view.size[1] >= ROOM * MIN_PATCHES * side**2
 
 
@@ -88,7 +88,7 @@ def _climb(
     """Move poses to where the coarsest octave shows most; returns those that have moved, which are
     as if nothing had agreed with them yet."""
     coarsest = _coarsest(refinement)
-    way_px = REACH * coarsest * (2 * refinement.radius + 1)
+    way_px = REACH * coarsest * refinement.patch_side
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     ways = way_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     climbing, moved = list(poses), dict[PoseHypothesis, None]()
@@ -129,7 +129,7 @@ def _compare(
     every = [(pose, each) for pose in poses for each in pose.octaves.values()]
     ahead: dict[PoseHypothesis, list[OctavePose]] = {pose: [] for pose in poses}
     for px in sorted({each.octave_px for _, each in every}):
-        way_px = BESIDE * px * (2 * refinement.radius + 1)
+        way_px = BESIDE * px * refinement.patch_side
         ways = way_px * np.asarray([[1, 0], [-1, 0], [0, 1], [0, -1]])
         own = [(pose, each) for pose, each in every if each.octave_px == px]
         views = [_turned(each.view, way) for _, each in own for way in ways]
@@ -141,7 +141,7 @@ def _compare(
         pose.searched = True
         ground = next((each for each in found if each.octave_px == _coarsest(refinement)), None)
         if ground is not None and ground.patches >= MIN_PATCHES:
-            near_px = ground.octave_px * (2 * refinement.radius + 1)
+            near_px = ground.octave_px * refinement.patch_side
             there = [each for each in found if _apart_px(each, ground) <= near_px]
             pose.stands_out = min(there, key=lambda each: each.doubt_px)
 
@@ -169,6 +169,6 @@ def _coarsest(refinement: Refinement) -> int:
 
 def _turned(view: View, way: np.ndarray) -> View:
     """A view turned so that what its middle shows moves by (x, y) working pixels."""
-    right, down = way * view.mean_scale / view.camera.mean_focal_length()
+    right, down = way / view.focal_px
     turn = Rotation.from_rotvec([-down, right, 0.0]).as_matrix()
     return dataclasses.replace(view, rotation=turn @ view.rotation)

@@ -19,8 +19,10 @@ from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.refine.octave_pose import (
+    MAX_DOUBT_PX,
     MAX_SEARCHED_DOUBT_PX,
     MIN_COUNT,
+    MIN_SHARE,
     AlignedPoints,
     PoseHypothesis,
     follow,
@@ -136,7 +138,7 @@ def locate(
     else:
         error_px, view = best.error_px, best.view
         seen = best.points.points, best.points.xy
-        side = best.octave_px * (2 * refinement.radius + 1)
+        side = best.octave_px * refinement.patch_side
     doubt = pose_doubt(view, *seen, error_px, side, focal=own_camera)
     return Localization(
         view=view,
@@ -192,12 +194,18 @@ def _doubtful(pose: PoseHypothesis, inliers: int, on_surface: int) -> str:
         )
     if trusted(pose) is not None:
         return f"{start}alignment finds another pose, which most of these matches contradict"
-    if pose.stands_out is None:
+    if pose.searched and pose.stands_out is None:
         return (
             f"{start}what alignment finds there does not stand out (needed: {STANDS_OUT:g} times "
             f"as many points as beside it, in {MIN_PATCHES} patches)"
         )
+    if not pose.searched and pose.share < MIN_SHARE:
+        return (
+            f"{start}alignment finds at most {100 * pose.share:.1f} % of the points that it would "
+            f"show there (needed: {100 * MIN_SHARE:.0f} %)"
+        )
+    judged = pose.stands_out or pose.best
+    most = MAX_SEARCHED_DOUBT_PX if pose.searched else MAX_DOUBT_PX
     return (
-        f"{start}what alignment finds leaves {pose.stands_out.doubt_px:.2f} px of doubt "
-        f"(at most {MAX_SEARCHED_DOUBT_PX:g})"
+        f"{start}what alignment finds leaves {judged.doubt_px:.2f} px of doubt (at most {most:g})"
     )
