@@ -7,29 +7,22 @@ there is for alignment to say, as for all photos that the mapper left out.
 
 import dataclasses
 import functools
-import logging
 from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
-from tqdm import tqdm
 
 from jaxsfm.core.types import Status
 from jaxsfm.io import interrupt
 from jaxsfm.io.features import ImageFeatures
-from jaxsfm.io.images import ImageError, ImageFile, named
+from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, PairCounts, PairResult
 from jaxsfm.io.store import Store
 from jaxsfm.matching.extraction import image_features
-from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.job import Job
-from jaxsfm.runs.mapping_looks import MappedLooks
-from jaxsfm.runs.matching_looks import job_of_look, timed
 from jaxsfm.sfm.second_look import closest_pairs
 from jaxsfm.sfm.two_photos.matched import match_photos
 from jaxsfm.sfm.two_photos.pair_looks import HOPELESS
 from jaxsfm.sfm.two_photos.plane_looks import one_match_each
-
-logger = logging.getLogger("jaxsfm")
 
 CLOSER = 3
 """Pairs of a photo that are looked at closer. Each takes up to a minute on two cores."""
@@ -124,29 +117,3 @@ def pairs_to_look_at(
         ]
         found |= dict.fromkeys(own[:CLOSER])
     return list(found)
-
-
-def look_at_lost_photos(
-    job: Job, found: MappedLooks, seconds: dict[str, float]
-) -> dict[Pair, PairResult]:
-    """Likely matches of the photos that are in no model of a run.
-
-    Args:
-      job: that of the run.
-      found: the run after all looks at its photos.
-      seconds: the time is added to that of the stages.
-    """
-    images = {image.name: image for image in found.mapped.given.images}
-    placed = set().union(*found.mapped.photos)
-    lost, least = images.keys() - placed, job.config.min_inliers
-    pairs = pairs_to_look_at(lost, placed, found.matched.counts, least=least)
-    if not (job.config.closer_looks and job.config.refinement and pairs):
-        return {}
-    settings = {**job.config.matching(), "closer_looks": job.config.closer_looks}
-    identity = dataclasses.replace(found.identity, config=settings)
-    store = Store(job.store.path, to_json(identity))
-    job = job_of_look(job, found.identity, job.config)
-    logger.info("looking closer at %s", named(sorted(lost)))
-    bar = tqdm(pairs, desc="closer looks", unit="pair", disable=not job.progress)
-    with timed(seconds, "closer looks"):
-        return look_closer(job, images, bar, store=store)

@@ -31,9 +31,9 @@ from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
-from jaxsfm.runs.closer_looks import look_at_lost_photos
 from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.runs.job import Job, pairs_without
+from jaxsfm.runs.lost_photos import refine_with_closer_looks
 from jaxsfm.runs.mapping_looks import RunPhotos, map_in_looks
 from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.run_options import RunOptions, check_options
@@ -139,9 +139,9 @@ def reconstruct_folder(
             seconds=seconds,
         )
         mapped = map_in_looks(photos.without(lost), matched, stages)
-        closer = look_at_lost_photos(job, mapped, seconds)
         with folder.publish() as target:
-            made, moved = stages.refine(mapped.mapped, target, closer)
+            made = refine_with_closer_looks(job, mapped, stages, target)
+            moved = stages.write(made, target)
             report = run_report(
                 StageResults(
                     folder=images,

@@ -25,6 +25,9 @@ from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.georeference.georeference import Georeference, MeasuredPositions, move_models
 from jaxsfm.sfm.mapping import green
 from jaxsfm.sfm.reconstruction import (
+    ALTERNATIVE,
+    DATABASE,
+    SPARSE,
     MappedStage,
     MatchedPhotos,
     Reconstructed,
@@ -203,34 +206,45 @@ class RunStages:
         return mapped
 
     def refine(
-        self, mapped: MappedRun, target: Path, closer: Mapping[Pair, PairResult]
-    ) -> tuple[Reconstructed, Georeference | None]:
-        """Refine and move the models, and write the database and the models into `target`.
+        self,
+        mapped: MappedRun,
+        target: Path,
+        closer: Mapping[Pair, PairResult],
+        *,
+        again: bool = False,
+    ) -> Reconstructed:
+        """Refine the models, and write the database into `target`.
 
         Args:
-          closer: matches of closer looks at photos that are in no model.
+          closer: matches of closer looks at photos that have no place.
+          again: whether the models have been refined with fewer of these.
         """
         passes = self.config.refinement.passes if self.config.refinement else 0
         quiet = not (self.options.progress and passes)
-        taken: dict[str, float] = {}
         with (
-            timed(taken, "refinement"),
+            timed(self.seconds if passes else {}, "refinement"),
             tqdm(total=passes, desc="refinement", unit="pass", disable=quiet) as turns,
         ):
 
             def on_pass() -> None:
                 turns.update(turns.n < passes)
 
-            database = target / "database.db"
-            made = refine_mapped(
-                mapped.given, mapped.stage, database, mapped.cache, on_pass, closer
+            return refine_mapped(
+                mapped.given,
+                mapped.stage,
+                target / DATABASE,
+                mapped.cache,
+                on_pass,
+                closer,
+                "refined-again" if again else "refined",
             )
-        if passes:
-            self.seconds.update(taken)
-        moved = self._move(made, database)
-        write_models(made.models, target / "sparse")
-        write_models(made.alternative, target / "alternative")
-        return made, moved
+
+    def write(self, made: Reconstructed, target: Path) -> Georeference | None:
+        """Move the models onto the measured positions, and write them into `target`."""
+        moved = self._move(made, target / DATABASE)
+        write_models(made.models, target / SPARSE)
+        write_models(made.alternative, target / ALTERNATIVE)
+        return moved
 
     def _move(self, made: Reconstructed, database: Path) -> Georeference | None:
         """Move the models onto the measured positions, which become COLMAP's pose priors.

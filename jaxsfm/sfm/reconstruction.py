@@ -238,6 +238,7 @@ def refine_mapped(
     kept: StageCache,
     on_pass: Callable[[], None] = lambda: None,
     closer: Mapping[Pair, PairResult] | None = None,
+    name: str = "refined",
 ) -> Reconstructed:
     """Refine the models of the mapper, if asked for, and colour their points.
 
@@ -245,8 +246,9 @@ def refine_mapped(
       mapped: made from what is given.
       database: where to write the COLMAP database; a file there is replaced.
       kept: as in `map_matches`.
-      closer: matches of closer looks at photos that are in no model, original pixels. They say
+      closer: matches of closer looks at photos that have no place, original pixels. They say
         where these photos may stand, instead of the matches of the same pairs.
+      name: of the stage.
     """
     config, matches = given.config, given.matches
     false = mapped.figures.misleading()
@@ -265,7 +267,7 @@ def refine_mapped(
             config=config,
             options=given.options,
             on_pass=on_pass,
-            steps=kept.folder.steps("refined", key),
+            steps=kept.folder.steps(name, key),
         )
         write_models(made.models, folder / SPARSE)
         stage_files.write_refinement(folder, made.figures, made.order)
@@ -276,12 +278,12 @@ def refine_mapped(
         for pair in sorted(closer)
     ]
     key = digest(mapped.key, settings, config.max_size, config.enlarge, looked)
-    refined = kept.folder.stage("refined", key, refine)
+    refined = kept.folder.stage(name, key, refine)
     shutil.copyfile(mapped.database, database)
     refinement, order = stage_files.read_refinement(refined)
     models = read_models(refined / SPARSE, database)
     if config.refinement is not None and None in refinement:
-        kept.folder.forget_stage("refined")  # a photo could not be read; perhaps it can next time
+        kept.folder.forget_stage(name)  # a photo could not be read; perhaps it can next time
     checks = [
         check_refined(mapped.figures.checks[k], done)
         for k, done in zip(order, refinement, strict=True)
