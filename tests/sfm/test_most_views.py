@@ -9,8 +9,9 @@ from strategies import rng_of, seeds
 
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.check import agreement
-from jaxsfm.sfm.refine import octave_pose
+from jaxsfm.sfm.refine import fixed_structure
 from jaxsfm.sfm.refine.candidates import within_most_views
+from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 
@@ -78,7 +79,7 @@ def test_the_refinement_looks_for_a_point_in_so_many_views(aligned):
     np.testing.assert_array_equal(aligned(Refinement(most_views=1).in_all_views()), every)
 
 
-@pytest.mark.parametrize("module", [agreement, octave_pose])
+@pytest.mark.parametrize("module", [agreement, fixed_structure])
 def test_the_check_and_the_placing_look_in_all_views(module, monkeypatch, rendered):
     """What a photo contradicts, and where a photo stands, must not depend on a draw."""
     asked = []
@@ -92,5 +93,5 @@ def test_the_check_and_the_placing_look_in_all_views(module, monkeypatch, render
     if module is agreement:
         agreement._tested(model, images, Refinement(), None, None)
     else:
-        octave_pose._aligned_points(model, images, [0], Refinement())
+        FixedStructure(model, images, Refinement()).shown_from([rendered.views[0]], 1)
     assert asked == [0]

@@ -11,8 +11,8 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine import octave_pose
 from jaxsfm.sfm.refine import pose_doubt as doubts_of_poses
+from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.octave_pose import (
-    AlignedPoints,
     OctavePose,
     PoseHypothesis,
     follow,
@@ -143,7 +143,8 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
             poses[name].view, poses[name].octaves = last, {2: best} if best else {}
 
     monkeypatch.setattr(octave_pose, "_descend", descend)
-    follow(list(poses.values()), exact_model(rendered), images_of(rendered), Refinement())
+    structure = FixedStructure(exact_model(rendered), images_of(rendered), Refinement())
+    follow(list(poses.values()), structure)
     first, second = began
     assert [(name, view is start) for name, view in first] == [(name, True) for name in found]
     assert [(name, view is end) for name, view in second] == [("doubtful", True)]

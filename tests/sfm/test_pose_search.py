@@ -13,9 +13,10 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.sfm.refine import octave_pose, pose_search
+from jaxsfm.sfm.refine import octave_pose, plane_geometry, pose_search
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE
-from jaxsfm.sfm.refine.octave_pose import AlignedPoints, OctavePose, PoseHypothesis, follow, trusted
+from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
+from jaxsfm.sfm.refine.octave_pose import OctavePose, PoseHypothesis, follow, trusted
 from jaxsfm.sfm.refine.pose_search import MIN_PATCHES, search
 from jaxsfm.sfm.refine.weak_views import place_weak_views
 from jaxsfm.sfm.register import locate_view
@@ -42,6 +43,10 @@ def by_day(scene: Room) -> Model:
     return exact_model(known, use=use[seen]).part(DAYS)[0]
 
 
+def structure_of(scene: Room, refinement: Refinement = REFINEMENT) -> FixedStructure:
+    return FixedStructure(by_day(scene), images_of(scene), refinement)
+
+
 def turned(view: View, degrees: float) -> View:
     turn = Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix()
     return dataclasses.replace(view, rotation=turn @ view.rotation)
@@ -50,9 +55,8 @@ def turned(view: View, degrees: float) -> View:
 def followed(scene: Room, degrees: float) -> PoseHypothesis:
     """A start that is turned, followed and searched around."""
     pose = PoseHypothesis(view=turned(scene.views[NIGHT], degrees), own_camera=False)
-    structure, images = by_day(scene), images_of(scene)
-    follow([pose], structure, images, REFINEMENT)
-    search([pose], structure, images, REFINEMENT)
+    follow([pose], structure_of(scene))
+    search([pose], structure_of(scene))
     return pose
 
 
@@ -79,7 +83,7 @@ def test_a_pose_climbs_to_where_most_agrees(rendered):
     """It starts half a patch's side off, from where alignment finds nothing."""
     scene = lit_in_a_corner(rendered)
     alone = PoseHypothesis(view=turned(scene.views[NIGHT], 2.0), own_camera=False)
-    follow([alone], by_day(scene), images_of(scene), REFINEMENT)
+    follow([alone], structure_of(scene))
     assert not alone.octaves
     found = trusted(followed(scene, 2.0))
     assert found is not None and off_px(found.view, scene) < 0.5
@@ -103,7 +107,7 @@ def test_what_a_descent_found_is_forgotten_when_a_pose_climbs_away(rendered, mon
 
     monkeypatch.setattr(pose_search, "settle", settle)
     monkeypatch.setattr(pose_search, "follow", lambda moved, *_: None)
-    search([pose], by_day(rendered), images_of(rendered), REFINEMENT)
+    search([pose], structure_of(rendered))
     assert pose.octaves == {} and pose.share == 0.0 and pose.view is not view
 
 
@@ -120,7 +124,7 @@ def test_a_pose_climbs_only_for_a_tenth_more_and_enough(rendered, monkeypatch, o
         counts[:] = [99, *[0] * 8]  # the next step stays
 
     monkeypatch.setattr(pose_search, "settle", settle)
-    moved = pose_search._climb([pose], by_day(rendered), images_of(rendered), REFINEMENT)
+    moved = pose_search._climb([pose], structure_of(rendered))
     assert bool(moved) is climbs
     # The fifth of eight directions is opposite to the first: the photo's middle moves to the left.
     way = pose.view.project(rendered.points)[0] - rendered.views[NIGHT].project(rendered.points)[0]
@@ -143,12 +147,11 @@ def _shown(count: int, could: int = 100) -> SimpleNamespace:
 def _compared(monkeypatch, rendered: Room, poses: list[PoseHypothesis], beside, octaves=2) -> None:
     """Compare poses; `beside` gives what a view beside them shows, of its number and octave."""
 
-    def shown_from(views, structure, images, refinement, px):
+    def shown_from(_, views, px):
         return [(view, beside(k, px)) for k, view in enumerate(views)]
 
-    monkeypatch.setattr(pose_search, "shown_from", shown_from)
-    settings = Refinement(weak_octaves=octaves)
-    pose_search._compare(poses, by_day(rendered), images_of(rendered), settings)
+    monkeypatch.setattr(FixedStructure, "shown_from", shown_from)
+    pose_search._compare(poses, structure_of(rendered, Refinement(weak_octaves=octaves)))
 
 
 def _hypothesis(view: View, *octaves: OctavePose) -> PoseHypothesis:
@@ -189,13 +192,13 @@ def test_poses_beside_are_turned_by_two_patches_to_four_sides(rendered, monkeypa
     view, ways = rendered.views[NIGHT], []
     middle = view.centre[None] + 5 * view.rotation[2]
 
-    def shown_from(views, *_):
+    def shown_from(_, views, px):
         ways.extend(each.project(middle)[0][0] - view.project(middle)[0][0] for each in views)
         return [(each, _shown(0)) for each in views]
 
-    monkeypatch.setattr(pose_search, "shown_from", shown_from)
+    monkeypatch.setattr(FixedStructure, "shown_from", shown_from)
     pose = _hypothesis(view, _octave(view, 2, doubt_px=0.1))
-    pose_search._compare([pose], by_day(rendered), images_of(rendered), REFINEMENT)
+    pose_search._compare([pose], structure_of(rendered))
     np.testing.assert_allclose(ways, [[60, 0], [-60, 0], [0, 60], [0, -60]], atol=2)
 
 
@@ -258,7 +261,7 @@ def test_a_climb_has_four_steps_in_eight_directions(rendered, monkeypatch):
     monkeypatch.setattr(pose_search, "settle", settle)
     view = rendered.views[NIGHT]
     pose = PoseHypothesis(view=view, own_camera=False)
-    assert pose_search._climb([pose], by_day(rendered), images_of(rendered), REFINEMENT) == [pose]
+    assert pose_search._climb([pose], structure_of(rendered)) == [pose]
     assert len(tried) == 4 and pose.view is tried[-1][3]
     middle = view.centre[None] + 5 * view.rotation[2]
     ways = [each.project(middle)[0][0] - view.project(middle)[0][0] for each in tried[0]]
@@ -271,7 +274,7 @@ def test_small_photos_are_not_searched_around(rendered):
     """At an eighth of their size there is no room for twenty patches."""
     view = rendered.views[NIGHT]
     pose = PoseHypothesis(view=view, own_camera=False, octaves={1: _octave(view, 1, doubt_px=0.1)})
-    search([pose], by_day(rendered), images_of(rendered), Refinement(weak_octaves=4))
+    search([pose], structure_of(rendered, Refinement(weak_octaves=4)))
     assert not pose.searched
     for width, has_room in ((1200, True), (1199, False)):  # forty patches of 120 x 120 pixels
         some = dataclasses.replace(view, size=(width, 480))
@@ -314,14 +317,7 @@ def localized(scene: Room, shift: float) -> Localization:
     rows = np.flatnonzero(scene.visible[:, [1, NIGHT]].all(1))[::5][:40]
     at, there = (each.project(scene.points[rows])[0] for each in (day, view))
     matches = {("1.png", NIGHT_NAME): matched(("1.png", NIGHT_NAME), at, there)}
-    return locate(
-        view,
-        by_day(scene),
-        matches,
-        images_of(scene),
-        refinement=REFINEMENT,
-        own_camera=False,
-    )
+    return locate(view, structure_of(scene), matches, own_camera=False)
 
 
 def test_a_photo_of_which_a_corner_is_lit_is_localized(rendered, much_is_asked):
@@ -340,3 +336,19 @@ def test_a_search_does_not_leave_many_matches_that_agree(rendered, much_is_asked
         patch.setattr(locate_view, "MATCH_ERROR_PX", 3.0)
         found = localized(scene, 2.0)
     assert not found.trusted and "most of these matches contradict" in str(found.why)
+
+
+def test_the_normals_of_a_structure_hold_in_every_octave_and_are_found_once(rendered, monkeypatch):
+    model, calls, normals = by_day(rendered), [], plane_geometry.normals
+
+    def counted(some, **options):
+        calls.append(some)
+        return normals(some, **options)
+
+    monkeypatch.setattr(plane_geometry, "normals", counted)
+    structure = FixedStructure(model, images_of(rendered), REFINEMENT)
+    pose = PoseHypothesis(view=rendered.views[NIGHT], own_camera=False)
+    follow([pose], structure)
+    assert len(pose.octaves) > 1 and calls == [model]
+    more = model.with_views([*model.views, rendered.views[NIGHT]]).in_octave(2)
+    np.testing.assert_array_equal(structure.normals, normals(more, neighbours=16))

@@ -34,6 +34,7 @@ from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import one_pass, plane_geometry, weak_views
 from jaxsfm.sfm.refine.candidates import may_be_candidates
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, matched_points
+from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.one_pass import run_pass
 from jaxsfm.sfm.refine.passes import refine_model
@@ -384,7 +385,7 @@ def test_only_points_that_a_target_may_show_are_looked_at(rendered):
     np.testing.assert_array_equal(some.moved, every.moved[mine])
     assert aligned(turned(180), [len(views)]) == []
     behind = PoseHypothesis(view=turned(180), own_camera=False)
-    follow([behind], model, images_of(rendered), refinement)
+    follow([behind], FixedStructure(model, images_of(rendered), refinement))
     assert behind.best is None and behind.agreed == 0
 
 

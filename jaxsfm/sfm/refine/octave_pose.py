@@ -13,16 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.resection import adjust_view
-from jaxsfm.colmap.tracks import Observations
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
+from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.pose_doubt import distinct_patches, projection_doubt
-from jaxsfm.sfm.refine.track_alignment import align_blocks
 
 MIN_COUNT = 30
 """An octave's pose counts only if at least so many points agree."""
@@ -45,37 +41,6 @@ first (castle-P19 night 0008: 1.84 m off at the start, 0.43 after one descent, 0
 MAX_STEPS, STILL_PX = 4, 0.5
 """The steps of an octave end when the median point moves by less, pixels of the octave. From 6.5 m
 off, 8 % of what a view could show agreed at the first step, 15 % at the second."""
-MAX_SIGMA_PX = 1.0
-"""Largest standard deviation of an observation, pixels of its octave. It may be larger than in the
-refinement, because hundreds of observations determine one pose."""
-
-
-class AlignedPoints(NamedTuple):
-    """Points that one view shows, found by alignment."""
-
-    rows: np.ndarray
-    """int (n,): which points of the structure."""
-    points: np.ndarray
-    """float64 (n, 3), world units."""
-    xy: np.ndarray
-    """float64 (n, 2), where the view shows them, pixels of the octave."""
-    candidates: np.ndarray
-    """float64 (m, 3): all points that the view could show."""
-
-    @classmethod
-    def joined(cls, parts: Sequence["AlignedPoints"]) -> "AlignedPoints":
-        """The points of several blocks, of which there may be none."""
-        nothing = cls(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 3)))
-        return cls(*(np.concatenate(column) for column in zip(nothing, *parts, strict=True)))
-
-    def observations(self, view: int, rows: np.ndarray) -> Observations:
-        """These points as observations of a model.
-
-        Args:
-          view: index of the view in the model.
-          rows: int, for each point of the structure its index in the model.
-        """
-        return Observations(rows[self.rows], np.full(len(self.rows), view), self.xy)
 
 
 class OctavePose(NamedTuple):
@@ -135,28 +100,6 @@ def trusted(pose: PoseHypothesis) -> OctavePose | None:
     return best if enough else None
 
 
-def _aligned_points(
-    model: Model, images: DeviceImages, targets: Sequence[int], refinement: Refinement
-) -> list[AlignedPoints]:
-    """For each of the target views, where it shows the points of the model.
-
-    Args:
-      targets: indices of views, in which the model has no observations.
-    """
-    parts: list[list[AlignedPoints]] = [[] for _ in targets]
-    limits = AlignmentLimits(refinement.weak_min_score, MAX_SIGMA_PX, refinement.max_shift_px)
-    every = refinement.in_all_views()
-    for block in align_blocks(model, images, every, limits, targets=targets):
-        found, points = block.found, block.patches.points
-        for k, part in zip(targets, parts, strict=True):
-            own = found.view == k
-            good = np.flatnonzero(own & block.agrees)
-            at = found.point[good]
-            shown = points[found.point[own]]
-            part.append(AlignedPoints(block.rows[at], points[at], block.moved[good], shown))
-    return [AlignedPoints.joined(part) for part in parts]
-
-
 def _step(
     pose: PoseHypothesis, view: View, seen: AlignedPoints, px: int, refinement: Refinement
 ) -> bool:
@@ -200,18 +143,11 @@ def _step(
     return bool(np.median(np.linalg.norm(way, axis=1)) > STILL_PX)
 
 
-def follow(
-    poses: Sequence[PoseHypothesis],
-    structure: Model,
-    images: DeviceImages,
-    refinement: Refinement,
-) -> None:
+def follow(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None:
     """Follow poses over all octaves, in place. Those that end in doubt are followed once more.
 
     Args:
       poses: of views that are not among those of the structure.
-      structure: views, and points with their observations.
-      images: those of all these views, in working pixels.
     """
     unsure = poses
     for _ in range(MAX_DESCENTS):
@@ -219,28 +155,17 @@ def follow(
             break
         for pose in unsure:
             pose.view = pose.best.view if pose.best else pose.view
-        _descend(unsure, structure, images, refinement)
+        _descend(unsure, structure)
         unsure = [pose for pose in unsure if pose.best and pose.best.doubt_px > SURE_PX]
 
 
-def _descend(
-    poses: Sequence[PoseHypothesis],
-    structure: Model,
-    images: DeviceImages,
-    refinement: Refinement,
-) -> None:
+def _descend(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None:
     """From the coarsest octave to the finest, in place."""
-    for octave in reversed(range(refinement.weak_octaves)):
-        settle(poses, structure, images, refinement, 2**octave)
+    for octave in reversed(range(structure.refinement.weak_octaves)):
+        settle(poses, structure, 2**octave)
 
 
-def settle(
-    poses: Sequence[PoseHypothesis],
-    structure: Model,
-    images: DeviceImages,
-    refinement: Refinement,
-    px: int,
-) -> None:
+def settle(poses: Sequence[PoseHypothesis], structure: FixedStructure, px: int) -> None:
     """Move poses at one octave until they stand still, in place.
 
     Args:
@@ -250,29 +175,9 @@ def settle(
     for _ in range(MAX_STEPS):
         if not moving:
             break
-        views = [pose.view for pose in moving]
-        seen = shown_from(views, structure, images, refinement, px)
+        seen = structure.shown_from([pose.view for pose in moving], px)
         moving = [
             pose
             for pose, (view, each) in zip(moving, seen, strict=True)
-            if _step(pose, view, each, px, refinement)
+            if _step(pose, view, each, px, structure.refinement)
         ]
-
-
-def shown_from(
-    views: Sequence[View],
-    structure: Model,
-    images: DeviceImages,
-    refinement: Refinement,
-    px: int,
-) -> list[tuple[View, AlignedPoints]]:
-    """For each of several views, the view in pixels of an octave, and what it shows there.
-
-    Args:
-      views: in working pixels.
-      px: working pixels per pixel of the octave.
-    """
-    model = structure.with_views([*structure.views, *views]).in_octave(px)
-    targets = range(len(structure.views), len(model.views))
-    seen = _aligned_points(model, images.octave(px), targets, refinement)
-    return [(model.views[k], each) for k, each in zip(targets, seen, strict=True)]

@@ -13,18 +13,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.octave_pose import (
     MIN_COUNT,
-    AlignedPoints,
     OctavePose,
     PoseHypothesis,
     follow,
     settle,
-    shown_from,
 )
 
 DIRECTIONS, REACH = 8, 0.4
@@ -54,24 +51,18 @@ ROOM = 2
 working pixels on the longer side, about. On smaller ones next to no pose could be trusted."""
 
 
-def search(
-    poses: Sequence[PoseHypothesis],
-    structure: Model,
-    images: DeviceImages,
-    refinement: Refinement,
-) -> None:
+def search(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None:
     """Search around poses that have been followed, in place, for what stands out.
 
     Args:
       poses: of views that are not among those of the structure, followed over all octaves.
-      structure, images, refinement: as in `jaxsfm.sfm.refine.octave_pose.follow`.
     """
-    large = [pose for pose in poses if _has_room(pose.view, refinement)]
+    large = [pose for pose in poses if _has_room(pose.view, structure.refinement)]
     if not large:
         return
-    moved = _climb(large, structure, images, refinement)
-    follow(moved, structure, images, refinement)
-    _compare(large, structure, images, refinement)
+    moved = _climb(large, structure)
+    follow(moved, structure)
+    _compare(large, structure)
 
 
 def _has_room(view: View, refinement: Refinement) -> bool:
@@ -79,16 +70,11 @@ def _has_room(view: View, refinement: Refinement) -> bool:
     return view.size[0] * view.size[1] >= ROOM * MIN_PATCHES * side**2
 
 
-def _climb(
-    poses: Sequence[PoseHypothesis],
-    structure: Model,
-    images: DeviceImages,
-    refinement: Refinement,
-) -> list[PoseHypothesis]:
+def _climb(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> list[PoseHypothesis]:
     """Move poses to where the coarsest octave shows most; returns those that have moved, which are
     as if nothing had agreed with them yet."""
-    coarsest = _coarsest(refinement)
-    way_px = REACH * coarsest * refinement.patch_side
+    coarsest = _coarsest(structure.refinement)
+    way_px = REACH * coarsest * structure.refinement.patch_side
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     ways = way_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     climbing, moved = list(poses), dict[PoseHypothesis, None]()
@@ -105,7 +91,7 @@ def _climb(
             ]
             for pose in climbing
         ]
-        settle([each for own in tried for each in own], structure, images, refinement, coarsest)
+        settle([each for own in tried for each in own], structure, coarsest)
         higher = []
         for pose, own in zip(climbing, tried, strict=True):
             best = max(own, key=lambda each: each.agreed)
@@ -119,29 +105,25 @@ def _climb(
     return list(moved)
 
 
-def _compare(
-    poses: Sequence[PoseHypothesis],
-    structure: Model,
-    images: DeviceImages,
-    refinement: Refinement,
-) -> None:
+def _compare(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None:
     """Say of poses, in place, which of their octaves stands out."""
+    side, coarsest = structure.refinement.patch_side, _coarsest(structure.refinement)
     every = [(pose, each) for pose in poses for each in pose.octaves.values()]
     ahead: dict[PoseHypothesis, list[OctavePose]] = {pose: [] for pose in poses}
     for px in sorted({each.octave_px for _, each in every}):
-        way_px = BESIDE * px * refinement.patch_side
+        way_px = BESIDE * px * side
         ways = way_px * np.asarray([[1, 0], [-1, 0], [0, 1], [0, -1]])
         own = [(pose, each) for pose, each in every if each.octave_px == px]
         views = [_turned(each.view, way) for _, each in own for way in ways]
-        shown = [seen for _, seen in shown_from(views, structure, images, refinement, px)]
+        shown = [seen for _, seen in structure.shown_from(views, px)]
         for k, (pose, each) in enumerate(own):
             if _stands_out(each, shown[k * len(ways) : (k + 1) * len(ways)]):
                 ahead[pose].append(each)
     for pose, found in ahead.items():
         pose.searched = True
-        ground = next((each for each in found if each.octave_px == _coarsest(refinement)), None)
+        ground = next((each for each in found if each.octave_px == coarsest), None)
         if ground is not None and ground.patches >= MIN_PATCHES:
-            near_px = ground.octave_px * refinement.patch_side
+            near_px = ground.octave_px * side
             there = [each for each in found if _apart_px(each, ground) <= near_px]
             pose.stands_out = min(there, key=lambda each: each.doubt_px)
 

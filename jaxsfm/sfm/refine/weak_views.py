@@ -17,9 +17,9 @@ from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, Evidence, matched_points
+from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.refine.octave_pose import (
     MIN_COUNT,
     MIN_SHARE,
@@ -102,13 +102,14 @@ def place_weak_views(
     every, count = [*model.views, *outside], len(model.views)
     weak_ones = [k for k, view in enumerate(model.views) if view.name in weak]
     wanted = [*weak_ones, *range(count, len(every))]
-    structure, rows = _structure(model, weak_ones)
+    strong, rows = _structure(model, weak_ones)
     poses: dict[int, list[PoseHypothesis]] = {k: [] for k in wanted}
     if len(rows) and refinement.weak_octaves:
-        poses = _starts(every, structure, wanted, evidence, refinement, refine_intrinsics)
-        follow([pose for mine in poses.values() for pose in mine], structure, images, refinement)
+        structure = FixedStructure(strong, images, refinement)
+        poses = _starts(every, structure, wanted, evidence, refine_intrinsics)
+        follow([pose for mine in poses.values() for pose in mine], structure)
         lost = [mine for mine in poses.values() if not any(map(trusted, mine))]
-        search([pose for mine in lost for pose in mine], structure, images, refinement)
+        search([pose for mine in lost for pose in mine], structure)
     placements, best = [], {}
     for k, mine in poses.items():
         right = [pose for pose in map(trusted, mine) if pose is not None]
@@ -120,10 +121,9 @@ def place_weak_views(
 
 def _starts(
     images: Sequence[View],
-    structure: Model,
+    structure: FixedStructure,
     wanted: Sequence[int],
     evidence: Evidence,
-    refinement: Refinement,
     refine_intrinsics: bool,
 ) -> dict[int, list[PoseHypothesis]]:
     """The poses to follow, for each wanted image (an index).
@@ -131,19 +131,19 @@ def _starts(
     Args:
       images: the views of the structure, and behind them those without a pose.
     """
-    normal = plane_geometry.normals(structure, neighbours=refinement.neighbours)
+    model, normal = structure.model, structure.normals
     cameras = [view.camera.camera_id for view in images]
     starts = {}
     for k in wanted:
         own = refine_intrinsics and cameras.count(cameras[k]) == 1
         found = find_view(
             images[k],
-            *matched_points(images[k], structure, normal, evidence.matches),
+            *matched_points(images[k], model, normal, evidence.matches),
             max_error_px=MATCH_ERROR_PX,
             estimate_focal_length=own and not images[k].camera.has_prior_focal_length,
             seed=evidence.seed,
         )
-        known = [images[k]] if k < len(structure.views) else []
+        known = [images[k]] if k < len(model.views) else []
         starts[k] = [
             PoseHypothesis(view=view, own_camera=own)
             for view in [*known, *([found] if found else [])]

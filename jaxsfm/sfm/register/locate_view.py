@@ -10,20 +10,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.resection import MIN_POINTS, find_view
 from jaxsfm.colmap.view import View
-from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.refine import plane_geometry
-from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.octave_pose import (
     MAX_DOUBT_PX,
     MAX_SEARCHED_DOUBT_PX,
     MIN_COUNT,
     MIN_SHARE,
-    AlignedPoints,
     PoseHypothesis,
     follow,
     trusted,
@@ -81,11 +77,9 @@ class Localization:
 
 def locate(
     image: View,
-    model: Model,
+    structure: FixedStructure,
     matches: Mapping[Pair, PairResult],
-    images: DeviceImages,
     *,
-    refinement: Refinement,
     own_camera: bool,
     seed: int = 0,
 ) -> Localization:
@@ -93,15 +87,14 @@ def locate(
 
     Args:
       image: size, pixels and camera of the photo; its pose plays no part.
+      structure: the views, and the points that they see, which may be none.
       matches: of the photo with the views, original pixels.
-      images: those of the photo and of the views, in working pixels.
       own_camera: estimate the focal length too. It is estimated from nothing, unless the camera's
         was known before (`has_prior_focal_length`).
     """
-    if not len(model.tracks.points):
+    if not len(structure.model.tracks.points):
         return nowhere(0, matches)
-    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
-    xy, points = matched_points(image, model, normal, matches)
+    xy, points = matched_points(image, structure.model, structure.normals, matches)
     found = find_view(
         image,
         xy,
@@ -117,10 +110,10 @@ def locate(
     if near.sum() < MIN_POINTS:  # the camera has been refined since RANSAC counted
         return nowhere(len(xy), matches)
     pose = PoseHypothesis(view=found, own_camera=own_camera)
-    if refinement.weak_octaves:
-        follow([pose], model, images, refinement)
+    if structure.refinement.weak_octaves:
+        follow([pose], structure)
         if trusted(pose) is None:
-            search([pose], model, images, refinement)
+            search([pose], structure)
     best = trusted(pose)
     if best is not None and pose.searched and _leaves(best.view, xy, points, near):
         best = None
@@ -138,7 +131,7 @@ def locate(
     else:
         error_px, view = best.error_px, best.view
         seen = best.points.points, best.points.xy
-        side = best.octave_px * refinement.patch_side
+        side = best.octave_px * structure.refinement.patch_side
     doubt = pose_doubt(view, *seen, error_px, side, focal=own_camera)
     return Localization(
         view=view,

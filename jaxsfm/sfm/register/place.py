@@ -10,6 +10,7 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.register.locate_view import Localization, locate, nowhere
 
 
@@ -63,10 +64,8 @@ def place_in(
     pairs = [make_pair(view.name, name) for name in around]
     found = locate(
         view,
-        part,
+        FixedStructure(part, images, refinement),
         {pair: matches[pair] for pair in pairs if pair in matches},
-        images,
-        refinement=refinement,
         own_camera=wanted.own_camera,
         seed=seed,
     )
