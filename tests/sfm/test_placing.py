@@ -32,25 +32,32 @@ def observed(scene: Room, rows: np.ndarray, sigma: float) -> AlignedPoints:
     return AlignedPoints(rows, points, xy + noise, scene.points[scene.visible[:, NIGHT]])
 
 
-def doubt_of(view: View, seen: AlignedPoints, error_px: float, side: float) -> float:
-    return projection_doubt(view, seen.points, seen.xy, seen.candidates, error_px, side)
+def doubt_of(view: View, seen: AlignedPoints, error_px: float, side: float, focal=False) -> float:
+    return projection_doubt(
+        view, seen.points, seen.xy, seen.candidates, error_px, side, focal=focal
+    )
 
 
-@pytest.mark.parametrize("sigma", [0.3, 2.0])
-def test_doubt_is_how_far_off_projections_are(rendered, sigma):
-    """Over many draws of the noise, where every observation has a patch of its own."""
+@pytest.mark.parametrize(("sigma", "focal"), [(0.3, False), (2.0, False), (0.3, True)])
+def test_doubt_is_how_far_off_projections_are(rendered, sigma, focal):
+    """Over many draws of the noise, where every observation has a patch of its own.
+
+    The focal length is in doubt where observations are in a corner.
+    """
     view = rendered.views[NIGHT]
-    rows = np.flatnonzero(rendered.visible[:, NIGHT])[::9]
+    rows = np.flatnonzero(rendered.visible[:, NIGHT])
+    at = view.project(rendered.points[rows])[0]
+    rows = rows[(at < 200).all(1)][::3] if focal else rows[::9]
     doubts, errors = [], []
     for seed in range(40):
         noise = np.random.default_rng(seed).normal(0, sigma, (len(rows), 2))
         seen = observed(rendered, rows, 0.0)
         seen = seen._replace(xy=seen.xy + noise)
-        found = adjust_view(view, seen.xy, seen.points, refine_focal_length=False)
+        found = adjust_view(view, seen.xy, seen.points, refine_focal_length=focal)
         assert found is not None
         off = found.project(seen.points)[0] - seen.xy
         median = float(np.median(np.linalg.norm(off, axis=1)))
-        doubts.append(doubt_of(found, seen, median, 1))
+        doubts.append(doubt_of(found, seen, median, 1, focal))
         errors.append(found.project(seen.candidates)[0] - view.project(seen.candidates)[0])
     true = np.sqrt(np.mean(np.square(errors)))
     assert 0.6 < np.median(doubts) / true < 1.3

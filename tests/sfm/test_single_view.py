@@ -126,6 +126,8 @@ def test_an_unknown_focal_length_is_found_and_leaves_more_doubt(rendered):
     assert sure.centre_error and unsure.centre_error
     assert sure.centre_error < unsure.centre_error < 0.05
     assert errors(unsure, rendered)[0] < 5 * unsure.centre_error
+    assert sure.doubt_px and unsure.doubt_px
+    assert 1.05 * sure.doubt_px < unsure.doubt_px
 
 
 def test_a_pose_that_the_photo_does_not_show_is_not_trusted(rendered):

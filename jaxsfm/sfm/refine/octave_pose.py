@@ -124,7 +124,15 @@ def _step(
     errors = np.where(np.isfinite(errors), errors, np.inf)
     error_px = float(np.median(errors))
     side = refinement.patch_side
-    doubt_px = px * projection_doubt(moved, seen.points, seen.xy, seen.candidates, error_px, side)
+    doubt_px = px * projection_doubt(
+        moved,
+        seen.points,
+        seen.xy,
+        seen.candidates,
+        error_px,
+        side,
+        focal=pose.own_camera,
+    )
     before = pose.octaves.get(px)
     if before is None or doubt_px < before.doubt_px:
         near = errors <= refinement.max_error_px

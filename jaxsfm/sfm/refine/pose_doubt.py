@@ -81,22 +81,25 @@ def projection_doubt(
     shown: np.ndarray,
     error_px: float,
     side: float,
+    *,
+    focal: bool,
 ) -> float:
     """How far off the projections of what a view could show are expected to be.
 
-    The covariance of the pose is carried over to those points.
+    The covariance of the pose, and of the focal length, is carried over to those points.
 
     Args:
       points, xy: (n, 3) and (n, 2), the observations that determined the pose; pixels of the view.
       shown: (m, 3), the points that the view could show.
       error_px: median error of the observations.
       side: side of a patch, pixels.
+      focal: the focal length was determined with the pose.
 
     Returns:
       root mean square along an axis, pixels; infinite if the observations determine no pose.
     """
     probes = shown[:: -(-len(shown) // MAX_PROBES)]
-    columns = _jacobian(view, np.concatenate([points, probes]))
+    columns = _jacobian(view, np.concatenate([points, probes]), focal=focal)
     own, others = np.split(columns, [len(points)])
     covariance = _covariance(own, xy, error_px, side)
     if covariance is None:
@@ -118,8 +121,7 @@ def pose_doubt(
     """The expected error of a pose. Errors of the model itself come on top.
 
     Args:
-      points, xy, error_px, side: as in `projection_doubt`.
-      focal: the focal length was determined with the pose.
+      points, xy, error_px, side, focal: as in `projection_doubt`.
     """
     covariance = _covariance(_jacobian(view, points, focal=focal), xy, error_px, side)
     if covariance is None:
