@@ -89,7 +89,7 @@ def refinement_lines(refinement: RefinementFigures) -> list[str]:
             lines.append(
                 f"placed           {name}: {at.agreed} points agree at "
                 f"{'full' if px == 1 else f'1/{px}'} size, with a median error of "
-                f"{at.error_px:.1f} px" + ("" if at.registered else "; the mapper had left it out")
+                f"{at.error_px:.1f} px" + ("" if at.registered else "; it had no place before")
             )
         elif at.registered and at.held is None:  # all others are among the lost photos
             lines.append(

@@ -33,7 +33,7 @@ from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.runs.working_model import CameraPrior
 from jaxsfm.sfm.evaluation import of_photos
 from jaxsfm.sfm.georeference.georeference import Georeference
-from jaxsfm.sfm.reconstruction import Reconstructed
+from jaxsfm.sfm.refined_stage import Reconstructed
 from jaxsfm.sfm.register.grow import ExtendedModels
 from jaxsfm.sfm.view_graph import Verdict
 

@@ -1,8 +1,7 @@
 """Closer looks at the photos of a run that are lost, and the refinement that gives them places.
 
 A photo that the mapper has lost is looked at before the models are refined. One that the refinement
-takes out, because next to nothing of it agrees, is looked at then. If this gives matches, the
-models are refined once more.
+takes out, because next to nothing of it agrees, is looked at then.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ from jaxsfm.runs.job import Job
 from jaxsfm.runs.mapping_looks import MappedLooks
 from jaxsfm.runs.matching_looks import job_of_look, timed
 from jaxsfm.runs.run_stages import RunStages
-from jaxsfm.sfm.reconstruction import Reconstructed
+from jaxsfm.sfm.refined_stage import Reconstructed
 
 logger = logging.getLogger("jaxsfm")
 
@@ -35,6 +34,7 @@ def refine_with_closer_looks(
     Args:
       job: that of the run.
       found: the run after all looks at its photos.
+      stages: those of the run.
       target: folder for the database.
     """
     mapped = set().union(*found.mapped.photos)
@@ -42,10 +42,8 @@ def refine_with_closer_looks(
     closer = look_at_lost_photos(job, found, lost, mapped, seconds=stages.seconds)
     made = stages.refine(found.mapped, target, closer)
     placed = {name for model in made.models for name in registered(model)}
-    more = look_at_lost_photos(job, found, mapped - placed, placed, seconds=stages.seconds)
-    if not more:
-        return made
-    return stages.refine(found.mapped, target, {**closer, **more}, again=True)
+    closer = look_at_lost_photos(job, found, mapped - placed, placed, seconds=stages.seconds)
+    return stages.place(found.mapped, made, closer) if closer else made
 
 
 def look_at_lost_photos(
@@ -61,10 +59,15 @@ def look_at_lost_photos(
     Args:
       job: that of the run.
       found: the run after all looks at its photos.
+      lost, placed: names of photos.
       seconds: the time is added to that of the stages.
+
+    Returns:
+      matches of pairs, original pixels. Pairs that the rounds found to be false are not looked at.
     """
-    least = job.config.min_inliers
-    pairs = pairs_to_look_at(lost, placed, found.matched.counts, least=least)
+    least, false = job.config.min_inliers, found.mapped.stage.figures.misleading()
+    counts = {pair: count for pair, count in found.matched.counts.items() if pair not in false}
+    pairs = pairs_to_look_at(lost, placed, counts, least=least)
     if not (job.config.closer_looks and job.config.refinement and pairs):
         return {}
     images = {image.name: image for image in found.mapped.given.images}
@@ -72,7 +75,8 @@ def look_at_lost_photos(
     identity = dataclasses.replace(found.identity, config=settings)
     store = Store(job.store.path, to_json(identity))
     job = job_of_look(job, found.identity, job.config)
-    logger.info("looking closer at %s", named(sorted(lost)))
+    looked_at = {name for pair in pairs for name in pair} & set(lost)
+    logger.info("looking closer at %s", named(sorted(looked_at)))
     bar = tqdm(pairs, desc="closer looks", unit="pair", disable=not job.progress)
     with timed(seconds, "closer looks"):
         return look_closer(job, images, bar, store=store)

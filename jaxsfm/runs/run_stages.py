@@ -23,19 +23,18 @@ from jaxsfm.runs.matching_looks import MatchedPairs, timed
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.georeference.georeference import Georeference, MeasuredPositions, move_models
-from jaxsfm.sfm.mapping import green
-from jaxsfm.sfm.reconstruction import (
+from jaxsfm.sfm.mapped_stage import (
     ALTERNATIVE,
     DATABASE,
     SPARSE,
     MappedStage,
     MatchedPhotos,
-    Reconstructed,
     StageCache,
     map_matches,
     matched_photos,
-    refine_mapped,
 )
+from jaxsfm.sfm.mapping import green
+from jaxsfm.sfm.refined_stage import Reconstructed, place_lost, refine_mapped
 from jaxsfm.sfm.round import nearly_equal
 from jaxsfm.sfm.second_look import SecondLook, second_look
 
@@ -206,18 +205,12 @@ class RunStages:
         return mapped
 
     def refine(
-        self,
-        mapped: MappedRun,
-        target: Path,
-        closer: Mapping[Pair, PairResult],
-        *,
-        again: bool = False,
+        self, mapped: MappedRun, target: Path, closer: Mapping[Pair, PairResult]
     ) -> Reconstructed:
         """Refine the models, and write the database into `target`.
 
         Args:
-          closer: matches of closer looks at photos that have no place.
-          again: whether the models have been refined with fewer of these.
+          closer: matches of closer looks at photos that are in no model.
         """
         passes = self.config.refinement.passes if self.config.refinement else 0
         quiet = not (self.options.progress and passes)
@@ -227,17 +220,26 @@ class RunStages:
         ):
 
             def on_pass() -> None:
-                turns.update(turns.n < passes)
+                # Another model, and a closer size after a first look, make more passes.
+                turns.total = max(turns.total, turns.n + 1)
+                turns.update()
 
+            database = target / DATABASE
             return refine_mapped(
-                mapped.given,
-                mapped.stage,
-                target / DATABASE,
-                mapped.cache,
-                on_pass,
-                closer,
-                "refined-again" if again else "refined",
+                mapped.given, mapped.stage, database, mapped.cache, on_pass, closer
             )
+
+    def place(
+        self, mapped: MappedRun, made: Reconstructed, closer: Mapping[Pair, PairResult]
+    ) -> Reconstructed:
+        """Place photos that the refinement has taken out.
+
+        Args:
+          made: the refined models.
+          closer: matches of closer looks at these photos.
+        """
+        with timed(self.seconds, "refinement"):
+            return place_lost(mapped.given, mapped.stage, made, mapped.cache, closer)
 
     def write(self, made: Reconstructed, target: Path) -> Georeference | None:
         """Move the models onto the measured positions, and write them into `target`."""

@@ -22,7 +22,7 @@ from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.page.write import page
 from jaxsfm.report.scene import shown_scene
 from jaxsfm.runs.georeferencing import measured_positions
-from jaxsfm.sfm import reconstruction
+from jaxsfm.sfm import mapped_stage, refined_stage
 
 METRES = 10.0
 UPRIGHT = np.asarray([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -60,8 +60,9 @@ def placed(plain, scene, tmp_path_factory) -> Placed:
         raise AssertionError("a stage was computed again")
 
     with pytest.MonkeyPatch.context() as patch:
-        for stage in ("verify", "build_checked_models", "refine_models"):
-            patch.setattr(reconstruction, stage, never)
+        for stage in ("verify", "build_checked_models"):
+            patch.setattr(mapped_stage, stage, never)
+        patch.setattr(refined_stage, "refine_models", never)
         options = ["--georeference", str(table), "--reference", str(scene / "reference")]
         assert again(run, scene, *options) == 0
     return Placed(run, table, json.loads((run / "report.json").read_text()))

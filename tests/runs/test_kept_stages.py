@@ -8,7 +8,7 @@ import pytest
 from jaxsfm.cli.main import main
 from jaxsfm.colmap import model_folders
 from jaxsfm.io.store import Store
-from jaxsfm.sfm import reconstruction
+from jaxsfm.sfm import mapped_stage, refined_stage
 
 
 @pytest.fixture
@@ -27,9 +27,9 @@ def counted(monkeypatch) -> dict[str, int]:
 
     count(Store, "save_features", "extract")
     count(Store, "save_matches", "match")
-    count(reconstruction, "verify", "verify")
-    count(reconstruction, "build_checked_models", "map")
-    count(reconstruction, "refine_models", "refine")
+    count(mapped_stage, "verify", "verify")
+    count(mapped_stage, "build_checked_models", "map")
+    count(refined_stage, "refine_models", "refine")
     return counts
 
 
@@ -109,9 +109,9 @@ def test_a_refinement_that_a_lost_photo_prevented_is_tried_again(scene, tmp_path
         patch.setattr("jaxsfm.sfm.refined_models.refine_model", gone)
         assert main([*base, "--out", str(out)]) == 0
     made = []
-    original = reconstruction.refine_models
+    original = refined_stage.refine_models
     again = lambda *a, **k: made.append(1) or original(*a, **k)  # noqa: E731
-    monkeypatch.setattr(reconstruction, "refine_models", again)
+    monkeypatch.setattr(refined_stage, "refine_models", again)
     assert main([*base, "--out", str(out)]) == 0 and made == [1]
     assert main([*base, "--out", str(out)]) == 0 and made == [1]
 

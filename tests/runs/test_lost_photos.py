@@ -10,15 +10,18 @@ import pytest
 from pair_results import counts, job_and_images, result
 
 from jaxsfm.config import preset
+from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs import lost_photos
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.lost_photos import refine_with_closer_looks
-from jaxsfm.sfm import reconstruction
+from jaxsfm.sfm import refined_stage
+from jaxsfm.sfm.mapped_stage import StageCache
 from jaxsfm.sfm.mapping import MappingFigures
-from jaxsfm.sfm.reconstruction import StageCache, refine_mapped
+from jaxsfm.sfm.refined_models import RefinedModels
+from jaxsfm.sfm.refined_stage import Reconstructed, place_lost, refine_mapped
 from jaxsfm.sfm.stage_files import VerificationFigures
 from jaxsfm.sfm.view_graph import Verdict
 
@@ -28,7 +31,7 @@ REFUTED = Verdict(trusted=False, strength=0.0, rotation_error_deg=None, refuted=
 class Run:
     """A run of the photos a, b, c and d, and what is asked of it."""
 
-    def __init__(self, folder: Path, models: list[set[str]], **changes: Any):
+    def __init__(self, folder: Path, models: list[set[str]], false: set[Pair], **changes: Any):
         unused: Any = None
         self.job = Job(
             store=Store(folder, {}),
@@ -40,8 +43,9 @@ class Run:
         )
         _, self.images = job_and_images()
         given = SimpleNamespace(images=list(self.images.values()))
+        stage = SimpleNamespace(figures=SimpleNamespace(misleading=lambda: false))
         self.found: Any = SimpleNamespace(
-            mapped=SimpleNamespace(given=given, photos=models),
+            mapped=SimpleNamespace(given=given, photos=models, stage=stage),
             matched=SimpleNamespace(
                 counts={(a, b): counts(30) for a in "abc" for b in "bcd" if a < b}
             ),
@@ -50,17 +54,22 @@ class Run:
         self.seconds: dict[str, float] = {}
         self.looks: list = []
         self.refined: list = []
+        self.placed: list = []
 
-    def refine(self, folder: Path, *outcomes: list[set[str]]) -> Any:
-        """Refine the models; each refinement leaves these models."""
-        left = iter(outcomes or [self.found.mapped.photos])
+    def refine(self, folder: Path, *left: set[str]) -> Any:
+        """Refine the models, which leaves these, or all of them."""
 
-        def refine(mapped: Any, target: Path, closer: dict, *, again: bool = False) -> Any:
+        def refine(mapped: Any, target: Path, closer: dict) -> Any:
             assert mapped is self.found.mapped and target == folder
-            self.refined.append((sorted(closer), again))
-            return SimpleNamespace(models=next(left))
+            self.refined.append(sorted(closer))
+            return SimpleNamespace(models=list(left) or self.found.mapped.photos)
 
-        stages: Any = SimpleNamespace(refine=refine, seconds=self.seconds)
+        def place(mapped: Any, made: Any, closer: dict) -> str:
+            assert mapped is self.found.mapped and made.models == list(left)
+            self.placed.append(sorted(closer))
+            return "with more photos"
+
+        stages: Any = SimpleNamespace(refine=refine, place=place, seconds=self.seconds)
         return refine_with_closer_looks(self.job, self.found, stages, folder)
 
     def pairs(self) -> list:
@@ -72,8 +81,8 @@ class Run:
 def run_of(monkeypatch, tmp_path):
     """Makes a run of models. A look gives matches of all of its pairs, or of none."""
 
-    def of(*models: set[str], in_vain: bool = False, **changes: Any) -> Run:
-        run = Run(tmp_path, list(models), **changes)
+    def of(*models: set[str], in_vain: bool = False, false: Any = (), **changes: Any) -> Run:
+        run = Run(tmp_path, list(models), set(false), **changes)
 
         def look_closer(job: Job, images: dict, pairs: Any, *, store: Store) -> dict:
             run.looks.append((job, sorted(images), list(pairs), store))
@@ -94,7 +103,7 @@ def test_photos_in_no_model_are_looked_at_with_photos_that_are_in_one(run_of, tm
     assert job.config == preset("default")  # at full size
     assert store.identity["config"]["closer_looks"] == 4
     assert job.store.identity["config"] == preset("default").matching()
-    assert run.refined == [(pairs, False)] and run.seconds.keys() == {"closer looks"}
+    assert run.refined == [pairs] and run.seconds.keys() == {"closer looks"}
     run = run_of({"a", "b"})
     run.refine(tmp_path)
     assert run.pairs() == [[("a", "c"), ("b", "c"), ("a", "d"), ("b", "d")]]
@@ -108,57 +117,111 @@ def test_nothing_is_looked_at_where_nothing_is_lost_or_nothing_can_be_placed(run
         run_of({"a", "b"}, refinement=None),
     ):
         run.refine(tmp_path)
-        assert not run.looks and run.refined == [([], False)] and not run.seconds
+        assert not run.looks and run.refined == [[]] and not run.seconds
 
 
-def test_photos_that_the_refinement_takes_out_are_looked_at_before_they_are_lost(run_of, tmp_path):
+def test_photos_that_the_refinement_takes_out_are_looked_at_with_those_that_stay(run_of, tmp_path):
     run = run_of({"a", "b", "c"})
-    made = run.refine(tmp_path, [{"a", "b"}], [{"a", "b", "c", "d"}])
-    before, after = [("a", "d"), ("b", "d"), ("c", "d")], [("a", "c"), ("b", "c")]
+    assert run.refine(tmp_path, {"a"}) == "with more photos"
+    before, after = [("a", "d"), ("b", "d"), ("c", "d")], [("a", "b"), ("a", "c")]
     assert run.pairs() == [before, after]
-    assert run.refined == [(before, False), (sorted(before + after), True)]
-    assert made.models == [{"a", "b", "c", "d"}]
+    assert run.refined == [before] and run.placed == [after]
 
 
-def test_models_are_refined_again_only_if_a_closer_look_found_something(run_of, tmp_path):
+def test_nothing_is_placed_if_no_closer_look_found_anything(run_of, tmp_path):
     run = run_of({"a", "b", "c", "d"}, in_vain=True)
-    assert run.refine(tmp_path, [{"a", "b", "c"}]).models == [{"a", "b", "c"}]
-    assert run.pairs() == [[("a", "d"), ("b", "d"), ("c", "d")]] and len(run.refined) == 1
+    assert run.refine(tmp_path, {"a", "b", "c"}).models == [{"a", "b", "c"}]
+    assert run.pairs() == [[("a", "d"), ("b", "d"), ("c", "d")]] and not run.placed
+
+
+def test_pairs_that_were_found_to_be_false_are_not_looked_at(run_of, tmp_path):
+    run = run_of({"a", "b", "c"}, false=[("a", "d"), ("a", "c")])
+    run.refine(tmp_path, {"a", "b"})
+    assert run.pairs() == [[("b", "d"), ("c", "d")], [("b", "c")]]
+
+
+@dataclasses.dataclass
+class Stages:
+    """What the stages after the mapping are given, with pairs of which ("b", "d") is false."""
+
+    folder: Path
+    ours: dict[Pair, PairResult]
+
+    def __post_init__(self) -> None:
+        pycolmap.Database.open(self.folder / "mapped.db").close()
+        self.kept = StageCache(WorkFolder(self.folder / "work", {}), "")
+        self.given: Any = SimpleNamespace(
+            config=preset("default"), matches=self.ours, images=[], options=None, described=None
+        )
+        self.mapped: Any = SimpleNamespace(
+            figures=MappingFigures(verdicts={("b", "d"): REFUTED}, attempts=[], checks=[]),
+            models=lambda *_: [],
+            database=self.folder / "mapped.db",
+            verification=VerificationFigures(verified=dict.fromkeys(self.ours, 3), angles={}),
+            key="k",
+        )
+
+
+@pytest.fixture
+def stages(tmp_path) -> Stages:
+    pairs = [("a", "b"), ("a", "c"), ("b", "c"), ("b", "d")]
+    return Stages(tmp_path, {pair: result(pair, 3) for pair in pairs})
+
+
+CLOSER = {pair: result(pair, 9) for pair in [("a", "c"), ("a", "d"), ("b", "d")]}
+BELIEVED = {("a", "b"): 3, ("b", "c"): 3, ("a", "c"): 9, ("a", "d"): 9}
 
 
 def test_matches_of_closer_looks_say_where_photos_stand_unless_their_pair_is_refuted(
-    monkeypatch, tmp_path
+    stages, monkeypatch, tmp_path
 ):
-    ours = {pair: result(pair, 3) for pair in [("a", "b"), ("a", "c"), ("b", "c"), ("b", "d")]}
-    closer = {pair: result(pair, 9) for pair in [("a", "c"), ("a", "d"), ("b", "d")]}
-    figures = MappingFigures(verdicts={("b", "d"): REFUTED}, attempts=[], checks=[])
-    pycolmap.Database.open(tmp_path / "mapped.db").close()
-    given: Any = SimpleNamespace(
-        config=preset("default"), matches=ours, images=[], options=None, described=None
-    )
-    mapped: Any = SimpleNamespace(
-        figures=figures,
-        models=lambda *_: [],
-        database=tmp_path / "mapped.db",
-        verification=VerificationFigures(verified=dict.fromkeys(ours, 3), angles={}),
-        key="k",
-    )
     seen = []
 
-    def refine_models(_: Any, photos: Any, believed: Any, **options: Any) -> SimpleNamespace:
+    def refine_models(_: Any, photos: Any, believed: Any, **options: Any) -> RefinedModels:
         seen.append({pair: each.num_inliers for pair, each in believed.matches.items()})
-        return SimpleNamespace(models=[], figures=[], order=[])
+        return RefinedModels([], [], [])
 
-    monkeypatch.setattr(reconstruction, "refine_models", refine_models)
-    kept = StageCache(WorkFolder(tmp_path / "work", {}), "")
-    for matches in (closer, closer, None):
-        refine_mapped(given, mapped, tmp_path / "new.db", kept, closer=matches)
-    trusted = {("a", "b"): 3, ("b", "c"): 3}
-    assert seen == [
-        trusted | {("a", "c"): 9, ("a", "d"): 9},
-        trusted | {("a", "c"): 3},
-    ]  # the same matches are not refined twice
-    for matches in (None, closer, None, closer):
-        name = "refined-again" if matches else "refined"
-        refine_mapped(given, mapped, tmp_path / "new.db", kept, closer=matches, name=name)
-    assert len(seen) == 3  # one refinement does not replace the other
+    monkeypatch.setattr(refined_stage, "refine_models", refine_models)
+    for matches in (CLOSER, CLOSER, None):
+        new = tmp_path / "new.db"
+        refine_mapped(stages.given, stages.mapped, new, stages.kept, closer=matches)
+    # The same matches are not refined twice.
+    assert seen == [BELIEVED, {("a", "b"): 3, ("b", "c"): 3, ("a", "c"): 3}]
+
+
+def test_photos_without_a_place_are_placed_once_and_each_model_keeps_its_check(stages, monkeypatch):
+    """The second model has most photos then."""
+    seen, calls = [], []
+
+    def place_photos(models: Any, figures: Any, photos: Any, believed: Any, **options: Any) -> Any:
+        seen.append({pair: each.num_inliers for pair, each in believed.matches.items()})
+        calls.append((models, figures, options["lost"]))
+        return RefinedModels([], ["of the second", "of the first"], [1, 0])
+
+    found = ["of the second", "of the first"], [1, 0]
+    monkeypatch.setattr(refined_stage, "place_photos", place_photos)
+    monkeypatch.setattr(refined_stage, "fingerprint", sorted)
+    monkeypatch.setattr(refined_stage, "registered", lambda model: model)
+    monkeypatch.setattr(refined_stage, "read_models", lambda *_: ["second", "first"])
+    monkeypatch.setattr(refined_stage.stage_files, "write_refinement", lambda *_: None)
+    monkeypatch.setattr(refined_stage.stage_files, "read_refinement", lambda _: found)
+    checks: Any = ["first check", "second check"]
+    models: Any = [{"a"}, {"b"}]
+    figures: Any = ["of one", "of two"]
+    before = Reconstructed(
+        verification=stages.mapped.verification,
+        mapping=dataclasses.replace(stages.mapped.figures, checks=checks),
+        models=models,
+        alternative=[],
+        refinement=figures,
+    )
+    for closer in (CLOSER, CLOSER, {("a", "c"): CLOSER["a", "c"]}):
+        made = place_lost(stages.given, stages.mapped, before, stages.kept, closer)
+        assert made.models == ["second", "first"] and made.refinement == found[0]
+        assert made.mapping.checks == ["second check", "first check"]
+    # The same matches place photos once. "d" has one pair that is not false.
+    assert calls == [(models, figures, {"c", "d"}), (models, figures, {"c"})]
+    assert seen == [BELIEVED, {("a", "b"): 3, ("b", "c"): 3, ("a", "c"): 9}]
+    before = dataclasses.replace(before, models=[{"a", "c"}, {"b"}])
+    place_lost(stages.given, stages.mapped, before, stages.kept, CLOSER)
+    assert calls[-1][-1] == {"d"}  # of other models, others are lost

@@ -15,7 +15,7 @@ from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
-from jaxsfm.sfm.refined_models import Believed, refine_models
+from jaxsfm.sfm.refined_models import Believed, RefinedModels, place_photos, refine_models
 
 NAMES = [f"{k}.png" for k in range(5)]
 NEW = NAMES[4]
@@ -182,3 +182,76 @@ def test_a_camera_that_was_held_is_compared_with_the_one_that_the_photos_speak_f
 def test_keypoints_are_aligned_from_the_nearest_power_of_two_of_their_size(ratio, px):
     """After a first look, which reduces photos by a quarter at least, that is never one."""
     assert module.described_px(ratio) == px
+
+
+OUT = placement(registered=True, octave_px=None)
+BEFORE = RefinementFigures(passes=[], placed=[OUT, placement(name="other.png", doubt="a reason")])
+
+
+@pytest.fixture
+def placed(rendered, monkeypatch):
+    """Places the fifth view in models of four and three views, if it may have a place there."""
+
+    def run(
+        where: set[int], *, against: dict | None = None, gone: bool = False, figures: tuple = ()
+    ) -> tuple[RefinedModels, list, list]:
+        models = [part_of(noisy_model(rendered, 0.0), NAMES[:count]) for count in (4, 3)]
+        offered, coloured = [], []
+
+        def place_images(model, read, settings, *, evidence):
+            assert (settings.refine_intrinsics, settings.threads) == (True, 1)
+            offered.append([image.name for image in evidence.unmapped])
+            if gone:
+                raise ImageError("2.png: cannot be read")
+            right = models.index(model) in where
+            new = noisy_model(rendered, 0.0) if right else model
+            return new, [placement(octave_px=1 if right else None)]
+
+        monkeypatch.setattr(module, "read_images", lambda path: dict.fromkeys(NAMES, (1, None)))
+        monkeypatch.setattr(module, "place_images", place_images)
+        monkeypatch.setattr(module, "doubts", lambda *_: against or {})
+        monkeypatch.setattr(module, "colour_points", lambda model, rgb: coloured.append(model))
+        made = place_photos(
+            models,
+            figures or [BEFORE, BEFORE],
+            FakePhotos(rendered),  # pyright: ignore[reportArgumentType]
+            Believed(DATABASE, {}, PAIRS),
+            lost=[NEW],
+            config=Config(refinement=Refinement()),
+            options=MapOptions(refine_intrinsics=True, threads=1),
+        )
+        return made, offered, [coloured, models]
+
+    return run
+
+
+def test_a_lost_photo_gets_a_place_in_the_first_model_that_has_one(placed):
+    made, offered, (coloured, models) = placed({0})
+    assert offered == [[NEW]] and made.order == [0, 1]
+    assert registered(made.models[0]) == set(NAMES) and made.models[1] is models[1]
+    assert coloured == made.models[:1]
+    first, second = made.figures
+    assert first and [at.octave_px for at in first.placed] == [1, 1]
+    assert second is BEFORE
+
+
+def test_the_model_with_most_photos_comes_first_when_photos_were_placed(placed):
+    made, offered, (_, models) = placed({1})
+    assert offered == [[NEW], [NEW]] and made.order == [1, 0]
+    assert made.models[1] is models[0] and made.figures[1] is BEFORE
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"where": set()}, {"where": {0, 1}, "against": {NEW: "why"}}, {"where": {0}, "gone": True}],
+)
+def test_models_that_get_no_photo_stay_and_say_what_they_said(placed, given):
+    made, offered, (coloured, models) = placed(**given)
+    assert offered == [[NEW], [NEW]] and not coloured and made.order == [0, 1]
+    assert all(new is old for new, old in zip(made.models, models, strict=True))
+    assert all(figures is BEFORE for figures in made.figures)
+
+
+def test_a_model_that_was_not_refined_gets_no_photo(placed):
+    made, offered, _ = placed({0, 1}, figures=(None, BEFORE))
+    assert offered == [[NEW]] and made.order == [1, 0] and made.figures[1] is None

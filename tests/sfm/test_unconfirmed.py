@@ -8,10 +8,10 @@ import pytest
 from verdicts import check_of
 
 from jaxsfm.config import preset
-from jaxsfm.sfm import reconstruction
+from jaxsfm.sfm import refined_stage
 from jaxsfm.sfm.mapping import MappingFigures
-from jaxsfm.sfm.reconstruction import check_refined, refine_mapped
 from jaxsfm.sfm.refine.passes import RefinementFigures
+from jaxsfm.sfm.refined_stage import check_refined, refine_mapped
 
 
 def refined(*accepted: bool) -> RefinementFigures:
@@ -48,8 +48,8 @@ def test_each_model_of_a_run_has_the_check_that_follows_from_its_own_refinement(
     """The refinement changes the order of the models if another one has most photos then."""
     whole, part = check_of("green"), dataclasses.replace(check_of("green"), apart=[["a", "b"]])
     done = [refined(True), refined(False)]
-    monkeypatch.setattr(reconstruction.stage_files, "read_refinement", lambda _: (done, [1, 0]))
-    monkeypatch.setattr(reconstruction, "read_models", lambda *_: ["part", "whole"])
+    monkeypatch.setattr(refined_stage.stage_files, "read_refinement", lambda _: (done, [1, 0]))
+    monkeypatch.setattr(refined_stage, "read_models", lambda *_: ["part", "whole"])
     (tmp_path / "mapped.db").touch()
     mapped: Any = SimpleNamespace(
         figures=MappingFigures(verdicts={}, attempts=[], checks=[whole, part]),

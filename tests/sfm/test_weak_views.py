@@ -37,7 +37,7 @@ from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, UnmappedImage, mat
 from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.one_pass import run_pass
-from jaxsfm.sfm.refine.passes import refine_model
+from jaxsfm.sfm.refine.passes import place_images, refine_model
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
 from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views, remove_unconfirmed
@@ -298,6 +298,29 @@ def test_a_photo_that_went_away_is_not_missed(rendered):
     after, figures = refine_model(model, read, settings_of(), evidence=evidence)
     assert after.num_reg_images() == 4 and figures.placed == []
     assert [p.accepted for p in figures.passes] == [True, True]
+
+
+def test_an_image_gets_a_place_in_a_refined_model_or_the_model_stays(rendered):
+    night = by_night(rendered)
+    before, settings = without_night(night), settings_of()
+    evidence = night_matches(night, right=6, wrong=18)
+    after, (placed,) = place_images(before, read_of(night), settings, evidence=evidence)
+    assert placed.octave_px is not None and registered(after) == registered(before) | {NIGHT_NAME}
+    position, rotation = night_error(after, night)
+    assert position < 0.01 and rotation < 0.15
+    nothing = evidence._replace(matches={})
+    after, (placed,) = place_images(before, read_of(night), settings, evidence=nothing)
+    assert placed.octave_px is None and after is before
+
+
+def test_an_image_that_few_observations_hold_leaves_a_refined_model_as_it_was(
+    rendered, monkeypatch
+):
+    monkeypatch.setattr(weak_views, "MIN_COUNT", 10**6)
+    night = by_night(rendered)
+    before, evidence = without_night(night), night_matches(night, right=6, wrong=18)
+    after, (placed,) = place_images(before, read_of(night), settings_of(), evidence=evidence)
+    assert placed.octave_px is not None and placed.doubt and after is before
 
 
 def test_an_image_of_something_else_is_not_registered(rendered):

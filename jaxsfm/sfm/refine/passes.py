@@ -180,6 +180,34 @@ def refine_model(
     return now.reconstruction, RefinementFigures(passes=figures, placed=placed)
 
 
+def place_images(
+    reconstruction: "pycolmap.Reconstruction",
+    read: Reader,
+    settings: PassSettings,
+    *,
+    evidence: Evidence,
+) -> "tuple[pycolmap.Reconstruction, list[Placement]]":
+    """Place unmapped images on a model that has been refined, as its refinement does.
+
+    Args:
+      reconstruction: not changed.
+      read: intensities by image name; may be called several times per image.
+      settings: those of the refinement.
+      evidence: the unmapped images, and matches to place them by.
+
+    Returns:
+      the same model if no image has a place in it; what became of each image.
+
+    Raises:
+      ImageError: an image of the model cannot be read any more.
+    """
+    sizes, evidence = _working_sizes(reconstruction, read, evidence)
+    placing = _Placing(DeviceImages(read), sizes, evidence, settings)
+    now, placed = placing.confirmed(_as_arrays(reconstruction, sizes), [])
+    found = any(at.octave_px is not None and not at.doubt for at in placed)
+    return (now.reconstruction if found else reconstruction), placed
+
+
 def _weak(figures: Sequence[PassFigures]) -> set[str]:
     """The images that were weak in any pass."""
     return {name for done in figures if done.accepted for name in done.weak_views}
