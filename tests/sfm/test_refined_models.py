@@ -217,7 +217,7 @@ def placed(rendered, monkeypatch):
             FakePhotos(rendered),  # pyright: ignore[reportArgumentType]
             Believed(DATABASE, {}, PAIRS),
             lost=[NEW],
-            config=Config(refinement=Refinement()),
+            config=Config(refinement=Refinement(), checked=True),
             options=MapOptions(refine_intrinsics=True, threads=1),
         )
         return made, offered, [coloured, models]
@@ -243,7 +243,11 @@ def test_the_model_with_most_photos_comes_first_when_photos_were_placed(placed):
 
 @pytest.mark.parametrize(
     "given",
-    [{"where": set()}, {"where": {0, 1}, "against": {NEW: "why"}}, {"where": {0}, "gone": True}],
+    [
+        {"where": set()},
+        {"where": {0, 1}, "against": {NEW: "why"}},
+        {"where": {0}, "gone": True},
+    ],
 )
 def test_models_that_get_no_photo_stay_and_say_what_they_said(placed, given):
     made, offered, (coloured, models) = placed(**given)
