@@ -2,7 +2,7 @@
 
 The strongest pairs of such a photo are matched again at other scales, turned, and as seen from one
 place (`jaxsfm.sfm.two_photos`). Their matches say only where the photo may stand. Whether it stands
-there is for alignment to say, as for all photos that the mapper left out.
+there is for alignment to say.
 """
 
 import dataclasses

@@ -74,11 +74,11 @@ def read_mapping(folder: Path) -> MappingFigures:
 def write_refinement(
     folder: Path, figures: Sequence[RefinementFigures | None], order: Sequence[int]
 ) -> None:
-    """Write the figures of the stage `refined` into its folder.
+    """Write the figures of a refinement into the folder of its stage.
 
     Args:
       figures: for each model; None: it was not refined.
-      order: for each model, its index among the models of the stage `mapped`.
+      order: for each model, its index among the models that the stage was given.
     """
     rows = [each and dataclasses.asdict(each) for each in figures]
     plain = {"models": rows, "order": list(order)}

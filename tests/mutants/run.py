@@ -72,7 +72,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "refine/device_templates": (DEVICE,),
     "refine/evidence": (WEAK,),
     "refine/fixed_structure": ("tests/sfm/test_pose_search.py", "tests/sfm/test_most_views.py"),
-    "refine/octave_pose": ("tests/sfm/test_placing.py", WEAK),
+    "refine/octave_pose": ("tests/sfm/test_placing.py", "tests/sfm/test_single_view.py", WEAK),
     "refine/padding": (DEVICE, "tests/sfm/test_pair_alignment.py", REFINE),
     "refine/patch_alignment": (DEVICE, REFINE, WEAK),
     "refine/pose_doubt": ("tests/sfm/test_placing.py",),

@@ -54,7 +54,7 @@ class AlignedPoints(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FixedStructure:
-    """Points that some views see, and what further views are aligned with."""
+    """Points that some views see, with the images and the settings that align further views."""
 
     model: Model
     """The views, and the points with their observations."""
@@ -67,7 +67,8 @@ class FixedStructure:
         """float64 (points, 3): unit normals.
 
         They are the same in all octaves and with all further views. Of 9566 points they take 0.12
-        s, and a pose is aligned up to 32 times.
+        s, and a pose is aligned up to 32 times, or more often if it is searched around. There must
+        be a point.
         """
         return plane_geometry.normals(self.model, neighbours=self.refinement.neighbours)
 
