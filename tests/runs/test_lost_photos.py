@@ -222,6 +222,7 @@ def test_photos_without_a_place_are_placed_once_and_each_model_keeps_its_check(s
     # The same matches place photos once. "d" has one pair that is not false.
     assert calls == [(models, figures, {"c", "d"}), (models, figures, {"c"})]
     assert seen == [BELIEVED, {("a", "b"): 3, ("b", "c"): 3, ("a", "c"): 9}]
-    before = dataclasses.replace(before, models=[{"a", "c"}, {"b"}])
-    place_lost(stages.given, stages.mapped, before, stages.kept, CLOSER)
-    assert calls[-1][-1] == {"d"}  # of other models, others are lost
+    # Of other models, other photos are lost.
+    before = dataclasses.replace(before, models=[{"a"}, {"b", "c"}])
+    place_lost(stages.given, stages.mapped, before, stages.kept, {("a", "c"): CLOSER["a", "c"]})
+    assert len(calls) == 3 and calls[-1][-1] == set()

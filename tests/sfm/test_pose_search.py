@@ -352,3 +352,21 @@ def test_the_normals_of_a_structure_hold_in_every_octave_and_are_found_once(rend
     assert len(pose.octaves) > 1 and calls == [model]
     more = model.with_views([*model.views, rendered.views[NIGHT]]).in_octave(2)
     np.testing.assert_array_equal(structure.normals, normals(more, neighbours=16))
+
+
+def test_what_a_view_shows_are_points_of_the_structure(rendered):
+    """The right half of a photo could show some of them only."""
+    structure, view = structure_of(rendered), rendered.views[NIGHT]
+    points = structure.model.tracks.points
+    at = view.project(points)[0]
+    structure = dataclasses.replace(structure, model=_ordered(structure.model, -at[:, 0]))
+    narrow = dataclasses.replace(view, size=(SIZE[0] // 2, SIZE[1]))
+    ((_, shown),) = structure.shown_from([narrow], 1)
+    assert len(shown.rows) > 30 and shown.rows.min() > 0
+    found = structure.model.tracks.points[shown.rows]
+    assert np.linalg.norm(found - shown.points, axis=1).max() < 0.02
+
+
+def _ordered(model: Model, by: np.ndarray) -> Model:
+    """The same model with its points in another order."""
+    return model.with_tracks(model.tracks.select_points(np.argsort(by)))
