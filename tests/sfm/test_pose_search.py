@@ -355,7 +355,7 @@ def test_the_normals_of_a_structure_hold_in_every_octave_and_are_found_once(rend
 
 
 def test_what_a_view_shows_are_points_of_the_structure(rendered):
-    """The right half of a photo could show some of them only."""
+    """The left half of a photo could show the last of them only."""
     structure, view = structure_of(rendered), rendered.views[NIGHT]
     points = structure.model.tracks.points
     at = view.project(points)[0]
