@@ -91,10 +91,11 @@ def test_second_tries_and_refinement_are_said():
     )
     assert "placed           dusk: 321 points agree at full size" in text
     assert (
-        "late: 321 points agree at 1/4 size, with a median error of 1.3 px; it had no place"
-        in text
+        "late: 321 points agree at 1/4 size, with a median error of 1.3 px; it had no place" in text
     )
-    assert "never" not in text and text.count("it had no place before") == 1 and "doubtful" not in text
+    assert (
+        "never" not in text and text.count("it had no place before") == 1 and "doubtful" not in text
+    )
     assert "camera  " not in text
     back = {"passes": [figures | {"accepted": False}], "placed": []}
     other = {"model": "PINHOLE", "params": [5, 5, 3, 2], "distance_px": 4.52, "halves_px": 0.44}
