@@ -1,7 +1,7 @@
 """The images of COLMAP's models: which ones they have, and models with fewer of them."""
 
 import hashlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 import pycolmap
@@ -26,6 +26,11 @@ def ordered(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstr
 def registered(model: pycolmap.Reconstruction) -> set[str]:
     """Names of the images that have a pose."""
     return {model.image(i).name for i in model.reg_image_ids()}
+
+
+def registered_in_any(models: Iterable[pycolmap.Reconstruction]) -> set[str]:
+    """Names of the images that have a pose in one of the models at least."""
+    return {name for model in models for name in registered(model)}
 
 
 def fingerprint(model: pycolmap.Reconstruction) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.model_images import registered_in_any
 from jaxsfm.io.images import named
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.store import Store
@@ -41,7 +41,7 @@ def refine_with_closer_looks(
     lost = {image.name for image in found.mapped.given.images} - mapped
     closer = look_at_lost_photos(job, found, lost, mapped, seconds=stages.seconds)
     made = stages.refine(found.mapped, target, closer)
-    placed = {name for model in made.models for name in registered(model)}
+    placed = registered_in_any(made.models)
     closer = look_at_lost_photos(job, found, mapped - placed, placed, seconds=stages.seconds)
     return stages.place(found.mapped, made, closer) if closer else made
 

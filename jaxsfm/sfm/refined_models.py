@@ -12,7 +12,7 @@ from jaxsfm.colmap.cameras import pixels_were_turned
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import colour_points
-from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.model_images import registered, registered_in_any
 from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
@@ -98,7 +98,7 @@ def refine_models(
         refined = functools.partial(refining.refined, model, evidence, kept.run_pass)
         return kept.finished(model, refined, [each.name for each in evidence.unmapped])
 
-    unmapped = read_images(believed.database).keys() - _in_a_model(models)
+    unmapped = read_images(believed.database).keys() - registered_in_any(models)
     made = _one_by_one(len(models), refining.evidence(unmapped), refine)
     for model in made.models:
         colour_points(model, photos.rgb)
@@ -136,10 +136,6 @@ def place_photos(
         if model is not models[k]:
             colour_points(model, photos.rgb)
     return made
-
-
-def _in_a_model(models: "Sequence[pycolmap.Reconstruction]") -> set[str]:
-    return {name for model in models for name in registered(model)}
 
 
 def _one_by_one(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.model_folders import read_models, write_models
-from jaxsfm.colmap.model_images import fingerprint, registered
+from jaxsfm.colmap.model_images import fingerprint, registered_in_any
 from jaxsfm.config import Config
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches, Pair, PairResult
@@ -24,7 +24,7 @@ from jaxsfm.sfm.mapped_stage import (
 )
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refined_models import Believed, place_photos, refine_models
+from jaxsfm.sfm.refined_models import Believed, RefinedModels, place_photos, refine_models
 from jaxsfm.sfm.stage_files import VerificationFigures
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def refine_mapped(
     closer = _not_false(closer or {}, mapped)
 
     def refine(folder: Path) -> None:
-        made = refine_models(
+        after = refine_models(
             mapped.models(),
             Photos(given.images, config),
             _believed(given, mapped, closer),
@@ -81,8 +81,7 @@ def refine_mapped(
             on_pass=on_pass,
             steps=kept.folder.steps("refined", key),
         )
-        write_models(made.models, folder / SPARSE)
-        stage_files.write_refinement(folder, made.figures, made.order)
+        _write(folder, after)
 
     key = digest(mapped.key, *_settings(config), _looked(closer))
     refined = kept.folder.stage("refined", key, refine)
@@ -122,8 +121,7 @@ def place_lost(
       closer: matches of closer looks at these photos, original pixels.
     """
     closer = _not_false(closer, mapped)
-    placed = {name for model in made.models for name in registered(model)}
-    lost = {name for pair in closer for name in pair} - placed
+    lost = {name for pair in closer for name in pair} - registered_in_any(made.models)
 
     def place(folder: Path) -> None:
         after = place_photos(
@@ -135,8 +133,7 @@ def place_lost(
             config=given.config,
             options=given.options,
         )
-        write_models(after.models, folder / SPARSE)
-        stage_files.write_refinement(folder, after.figures, after.order)
+        _write(folder, after)
 
     models = [fingerprint(model) for model in made.models]
     key = digest(mapped.key, *_settings(given.config), models, _looked(closer))
@@ -167,6 +164,11 @@ def _believed(
         OverlaidMatches(believed, closer),
         mapped.verification.verified.keys() - false,
     )
+
+
+def _write(folder: Path, after: RefinedModels) -> None:
+    write_models(after.models, folder / SPARSE)
+    stage_files.write_refinement(folder, after.figures, after.order)
 
 
 def _settings(config: Config) -> list[Json]:

@@ -89,7 +89,7 @@ def run_of(monkeypatch, tmp_path):
             return {} if in_vain else {pair: result(pair) for pair in run.looks[-1][2]}
 
         monkeypatch.setattr(lost_photos, "look_closer", look_closer)
-        monkeypatch.setattr(lost_photos, "registered", lambda model: sorted(model))
+        monkeypatch.setattr(lost_photos, "registered_in_any", lambda models: set().union(*models))
         return run
 
     return of
@@ -201,7 +201,7 @@ def test_photos_without_a_place_are_placed_once_and_each_model_keeps_its_check(s
     found = ["of the second", "of the first"], [1, 0]
     monkeypatch.setattr(refined_stage, "place_photos", place_photos)
     monkeypatch.setattr(refined_stage, "fingerprint", sorted)
-    monkeypatch.setattr(refined_stage, "registered", lambda model: model)
+    monkeypatch.setattr(refined_stage, "registered_in_any", lambda models: set().union(*models))
     monkeypatch.setattr(refined_stage, "read_models", lambda *_: ["second", "first"])
     monkeypatch.setattr(refined_stage.stage_files, "write_refinement", lambda *_: None)
     monkeypatch.setattr(refined_stage.stage_files, "read_refinement", lambda _: found)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import Attempt, Mapped, MapperRun, first_models
 from jaxsfm.colmap.model import Model, stored_sizes
-from jaxsfm.colmap.model_images import ordered, registered
+from jaxsfm.colmap.model_images import ordered, registered, registered_in_any
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.model_join import ERROR_PX, JOIN_ERROR_PX, MIN_SHARED, adjusted
 from jaxsfm.sfm.parts.frames import common_frames, shared_points
@@ -86,7 +86,7 @@ def map_in_parts(
         )
         whole.append(joined)
     whole = ordered(whole)
-    photos = {name for each in found for name in registered(each)}
+    photos = registered_in_any(found)
     if not whole or len(registered(whole[0])) < WHOLE * len(photos):
         logger.info("the models of the parts do not make one model")
         return None
