@@ -1,7 +1,12 @@
-"""The exception for whatever a user can correct."""
+"""Errors that a user can correct, and questions whose errors harm nothing."""
 
 import contextlib
-from collections.abc import Iterator
+import logging
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+logger = logging.getLogger("jaxsfm")
 
 
 class UserError(Exception):
@@ -19,3 +24,18 @@ def writing(what: object) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"{what}: cannot be written ({error.strerror or error})") from error
+
+
+def remark(what: str, ask: Callable[[], T]) -> T | None:
+    """The answer to a question that is asked for a remark only; None if the question fails.
+
+    Such a question must not end a run, whatever is wrong with it. It fails in one line of the log.
+
+    Args:
+      what: what is asked, in words that follow "it is not known".
+    """
+    try:
+        return ask()
+    except Exception as error:  # noqa: BLE001
+        logger.warning("it is not known %s: %s (%s)", what, error, type(error).__name__)
+        return None

@@ -14,8 +14,13 @@ from jaxsfm.errors import UserError
 EngineName = Literal["local", "ray"]
 Mapper = Literal["incremental", "global"]
 """COLMAP's mappers."""
-MapperChoice = Literal["incremental", "parts", "global"]
-"""A mapper; `parts`: the incremental one, which maps many photos in parts."""
+Step = Literal["upright", "map-again", "split", "second-places", "register"]
+"""The steps of a run that can be left out, to see what they are worth (`jaxsfm.sfm.road`).
+
+upright: photos that are stored sideways are turned. map-again: the second mapping. split: models in
+which photos contradict each other are split. second-places: photos are looked for in other places.
+register: photos without a place are registered in the refined models.
+"""
 CameraSharing = Literal["auto", "single", "folder", "photo"]
 """Which photos share one camera (`jaxsfm.colmap.cameras`)."""
 Retrieval = Literal["gem", "vlad", "netvlad"]
@@ -114,8 +119,7 @@ class ReconstructionChoice:
       refine_intrinsics: Whether mapping refines the intrinsics. auto: only if --intrinsics is not
         given.
       mapper: Which of COLMAP's mappers computes the model. incremental: the one that adds photo
-        after photo. parts: the same, but more than 200 photos are mapped in parts, whose models are
-        joined. global: the one that places all photos at once.
+        after photo. global: the one that places all photos at once.
       seed: Seed of all random choices.
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores. With 1 thread, the
         same command gives the same model, byte for byte.
@@ -145,7 +149,7 @@ class ReconstructionChoice:
     cameras: CameraSharing = "auto"
     camera_model: str = "SIMPLE_RADIAL"
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto"
-    mapper: MapperChoice = "incremental"
+    mapper: Mapper = "incremental"
     seed: int = 0
     threads: int = -1
     reference: Path | None = None

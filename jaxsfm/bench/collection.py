@@ -21,7 +21,7 @@ from jaxsfm.bench.model_options import CollectionOptions
 from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import first_models
+from jaxsfm.colmap.mapper import run_mapper
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.config import preset
 from jaxsfm.io.pair_selection import natural
@@ -205,7 +205,7 @@ def _rows(options: CollectionOptions, methods: list[str], truth: Poses) -> Itera
             database = work / "database.db"
             seconds = write_other_matches(database, folder, method, pairs, Cameras())
             with timed(seconds, "mapping"):
-                models = first_models(database, MapOptions(refine_intrinsics=True)).models
+                models = run_mapper(database, MapOptions(refine_intrinsics=True))
             made = Made(models, seconds, None)
         else:
             given = RunOptions(pairs=options.pairs, keep_features=bool(added), progress=True)

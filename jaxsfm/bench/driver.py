@@ -26,12 +26,10 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
-from jaxsfm.io.looks import Looks, SavedMatches
+from jaxsfm.io.saved_matches import SavedMatches
 from jaxsfm.io.store import Store
 from jaxsfm.matching.device_cache import tile_order
 from jaxsfm.matching.retrieval import partner_pairs
-from jaxsfm.sfm.parts.map_parts import OVERLAP, PART
-from jaxsfm.sfm.parts.partition import graph_of, overlapping_parts
 from jaxsfm.sfm.view_graph import trusted_pairs
 
 T = TypeVar("T")
@@ -92,21 +90,18 @@ def measure(photos: int, folder: Path) -> dict[str, float]:
     timed("read", lambda: sum(store.load_matches(pair) is not None for pair in pairs))
     database = folder / "database.db"
     known = parse_intrinsics(street.intrinsics())
-    saved = SavedMatches(Looks(store), pairs)
+    saved = SavedMatches(store, pairs)
     timed("database", lambda: write_database(database, images, saved, Cameras(known=known)))
     timed("verification", lambda: verify(database, VerificationOptions()))
     views = timed("geometries", lambda: read_two_views(database))
     geometries = {pair: view.geometry for pair, view in views.items()}
     verdicts = timed("view graph", lambda: trusted_pairs(geometries))
     counts = {p: geometries[p].num_inliers for p, each in verdicts.items() if each.trusted}
-    graph = graph_of(counts)
-    parts = timed("parts", lambda: overlapping_parts(graph, size=PART, overlap=OVERLAP))
     on_disk = sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
     return {
         "photos": photos,
         "pairs": len(pairs),
         "trusted pairs": len(counts),
-        "number of parts": len(parts),
         **seconds,
         "peak_mb": peak_mb(),
         "disk_mb": on_disk / 1e6,

@@ -8,7 +8,7 @@ from jaxsfm.bench.model_options import CameraUse
 from jaxsfm.colmap.poses import Poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.pair_selection import natural
-from jaxsfm.options import MapperChoice
+from jaxsfm.options import Mapper
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 
@@ -57,7 +57,7 @@ class FrameSequence(NamedTuple):
     """Where results are kept."""
     camera: CameraUse
     """What is done with the camera of the folder."""
-    mapper: MapperChoice
+    mapper: Mapper
     """Of the presets."""
     truth: Poses
 

@@ -14,7 +14,7 @@ from jaxsfm.bench.options import (
     whole_numbers,
 )
 from jaxsfm.errors import UserError
-from jaxsfm.options import MapperChoice, check_seed, check_threads
+from jaxsfm.options import Mapper, Step, check_seed, check_threads
 
 CameraUse = Literal["known", "start", "unknown"]
 """Whether a camera of a folder is held, where its adjustment starts, or not used."""
@@ -164,6 +164,44 @@ class AmbiguousOptions(_Runs, SeedOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
+    """Options of `bench ledger`.
+
+    Attributes:
+      root: Folder of the data: strecha/SET in the layout of bench strecha, and one folder for each
+        other set. Sets that are not there are left out.
+      sets: Names of sets, separated by commas or blanks; * stands for any text, as in
+        synthetic-box-*. Without it, all sets in --root and all rendered scenes.
+      seeds: How often each set is reconstructed, with seeds 0, 1, ... A rendered scene is the same
+        for all of them.
+      threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
+      without: Leave out this step of all runs. upright: photos that are stored sideways are turned.
+        map-again: the second mapping. split: models in which photos contradict each other are
+        split. second-places: photos are looked for in other places. register: photos without a
+        place are registered in the refined models.
+      out: Folder for photos that are made, for databases and for models. A later call makes only
+        the runs that have no report there.
+      markdown: Write the table to this file, with a line for each set.
+      only_judge: Make no run. The runs in --out that have ended are judged.
+    """
+
+    root: Path
+    methods: tuple[str, ...] = dataclasses.field(default=("default",), init=False)
+    seeds: int = 3
+    threads: int = -1
+    without: Step | None = None
+    out: Path | None = None
+    markdown: Path | None = None
+    only_judge: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_threads(self.threads)
+        if self.only_judge and self.out is None:
+            raise UserError("--only-judge needs --out, the folder of the runs")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class SequenceOptions(BenchOptions):
     """Options of `bench sequence`.
 
@@ -187,7 +225,7 @@ class SequenceOptions(BenchOptions):
     every: tuple[str, ...] = ("10",)
     localize: int = 0
     intrinsics: CameraUse = "known"
-    mapper: MapperChoice = "incremental"
+    mapper: Mapper = "incremental"
     out: Path
 
     def __post_init__(self) -> None:

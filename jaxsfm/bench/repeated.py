@@ -25,17 +25,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.synthetic import (
-    TexturedPlane,
-    camera_matrix,
-    camera_text,
-    look_at,
-    render,
-    write_photo,
-)
+from jaxsfm.bench.scene_folder import write_scene_folder
+from jaxsfm.bench.synthetic import TexturedPlane, look_at, render
 from jaxsfm.bench.walls import moved, posters, shift, texture, turn, wall
 from jaxsfm.colmap.poses import CameraPose
-from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.sfm.evaluation import Similarity
 
 
@@ -177,15 +170,7 @@ def write_repeated(folder: Path, name: str, seed: int, size: tuple[int, int]) ->
     """
     if folder.is_dir():
         return
-    scene, k = repeated_scene(name, seed), camera_matrix(size)
-    # In these sets, pixels are counted from the corner of the top-left pixel, as COLMAP does.
-    k[:2, 2] += 0.5
-    with atomic_folder(folder) as fresh:
-        images, cameras = fresh / "images", fresh / "gt_dense_cameras"
-        images.mkdir()
-        cameras.mkdir()
-        np.savetxt(images / "K.txt", k, fmt="%.9g")
-        for i, pose in enumerate(scene.poses):
-            photo = f"view{i:02d}.png"
-            write_photo(images / photo, render(scene.planes, pose, size))
-            (cameras / f"{photo}.camera").write_text(camera_text(k, pose, size), encoding="ascii")
+    scene = repeated_scene(name, seed)
+    write_scene_folder(
+        folder, scene.poses, lambda i: render(scene.planes, scene.poses[i], size), size
+    )

@@ -24,7 +24,7 @@ from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.inliers import read_inliers
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import first_models
+from jaxsfm.colmap.mapper import run_mapper
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.view import View
@@ -138,7 +138,7 @@ def with_other_features(given: FrameSequence, method: str, pairs: set[Pair]) -> 
     names = [frame.name for frame in given.frames.mapped]
     options = MapOptions(refine_intrinsics=given.held is None)
     with timed(seconds, "mapping"):
-        models = first_models(database, options, names=names).models
+        models = run_mapper(database, options, names=names)
     row: dict[str, Json] = {
         "seconds": dict(seconds),
         **errors(model_poses(models[0]), given.truth),

@@ -134,7 +134,7 @@ def _run_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
 def _mapped(database: Path, work: Path, run: MethodRun, seconds: dict[str, float]) -> SetModels:
     """The models of the verified pairs in a database."""
     with timed(seconds, "mapping"):
-        models, _ = build_models(database, read_two_views(database), run.mapping)
+        models = build_models(database, read_two_views(database), run.mapping)
     write_models(models, work / "sparse")
     return SetModels(models, seconds, None)
 
@@ -148,7 +148,7 @@ def _run_refined_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetMo
         refined = refine_models(
             made.models,
             photos,
-            Believed(work / "database.db", {}, ()),
+            Believed(work / "database.db", {}),
             config=config,
             options=options,
         )

@@ -75,7 +75,7 @@ def rootsift_models(scene: Scene, scratch: Path, options: DayNightOptions) -> li
         names = {*subset.day, subset.night}
         kept = {pair: view for pair, view in every.items() if names.issuperset(pair)}
         drop_pairs(part, every.keys() - kept.keys())
-        found, _ = build_models(part, kept, _map_options(scene, options))
+        found = build_models(part, kept, _map_options(scene, options))
         poses = model_poses(found[0]) if found else {}
         models.append(SubsetModel(poses, night_matches(part, scene, subset)))
     return models

@@ -9,6 +9,7 @@ from jaxsfm.bench.model_options import (
     AmbiguousOptions,
     CollectionOptions,
     DayNightOptions,
+    LedgerOptions,
     SequenceOptions,
     StrechaOptions,
 )
@@ -37,6 +38,24 @@ def _run(
     check_writable(options.json, "--json", (".json",))
     print("\n".join(table_lines(bench(options))))
     return 0
+
+
+def ledger(bench: Unnamed[LedgerOptions]) -> int:
+    """Reconstruct ordinary, ambiguous and hard sets with plain defaults, and judge the models.
+
+    The table has a row for each set and seed: the photos in a model and the right ones, errors, the
+    verdict and whether it holds, seconds, and how many times as long it took as RootSIFT.
+
+    For example
+        $ jaxsfm bench ledger --root DATA --out OUT --json ledger.json --markdown ledger.md
+        $ jaxsfm bench ledger --root DATA --sets cup,ordinary-* --seeds 1 --out OUT
+    """
+    limit_threads(bench.threads)
+    from jaxsfm.bench.ledger import bench_ledger
+    from jaxsfm.bench.ledger_table import table_lines
+
+    check_writable(bench.markdown, "--markdown", (".md",))
+    return _run(bench_ledger, table_lines, bench)
 
 
 def strecha(bench: Unnamed[StrechaOptions]) -> int:

@@ -14,6 +14,7 @@ from jaxsfm.cli.bench_commands import (
     confidence,
     daynight,
     homography,
+    ledger,
     planes,
     poses,
     recall,
@@ -40,6 +41,7 @@ from jaxsfm.io.compiled_programs import keep_compiled
 from jaxsfm.io.versions import package_versions
 
 BENCHMARKS = {
+    "ledger": ledger,
     "strecha": strecha,
     "daynight": daynight,
     "ambiguous": ambiguous,

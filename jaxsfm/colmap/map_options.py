@@ -35,8 +35,6 @@ class MapOptions:
     """Settings of the mapper."""
 
     mapper: Mapper = "incremental"
-    in_parts: bool = False
-    """Many photos are mapped in parts (`jaxsfm.sfm.parts`)."""
     refine_intrinsics: bool = True
     seed: int = 0
     threads: int = -1

@@ -8,6 +8,7 @@ they agree on a camera, and it is not the one that was held, the photos speak fo
 
 import copy
 import dataclasses
+import math
 
 import numpy as np
 import pycolmap
@@ -72,6 +73,8 @@ def other_camera(model: pycolmap.Reconstruction, *, threads: int) -> OtherCamera
     halves = [_adjusted(model, part, threads) for part in (0, 1)]
     found = _between(*halves)
     distance, spread = camera_distance(held, found), camera_distance(*halves)
+    if not math.isfinite(distance + spread):  # the adjustment has left what a lens can be
+        return None
     if distance < max(OTHER * max(held.width, held.height), AGREEMENT * spread):
         return None
     return OtherCamera(
@@ -89,15 +92,19 @@ def camera_distance(first: pycolmap.Camera, second: pycolmap.Camera) -> float:
     directions are turned so that they fit best, for the poses of a model absorb a rotation.
 
     Returns:
-      the root mean square of the distances over the photo.
+      the root mean square of the distances over the photo; infinite if one of the cameras sees
+      nothing at some pixels, because its distortion folds there.
     """
     columns, rows = (np.linspace(0, side, GRID) for side in (first.width, first.height))
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     a, b = (_directions(camera, pixels) for camera in (first, second))
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return math.inf
     u, _, vt = np.linalg.svd(b.T @ a)
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     seen = np.asarray(second.img_from_cam(a @ turn.T))
-    return float(np.sqrt(np.square(seen - pixels).sum(axis=1).mean()))
+    apart = float(np.sqrt(np.square(seen - pixels).sum(axis=1).mean()))
+    return apart if math.isfinite(apart) else math.inf
 
 
 def _directions(camera: pycolmap.Camera, pixels: np.ndarray) -> np.ndarray:

@@ -24,8 +24,6 @@ FRAMES = "frames"
 """The folder with the frames of a video. It is there before the first run begins."""
 FRAMES_RECORD = "frames.json"
 """The file in it that says what the frames were made from."""
-SKY = "sky"
-"""The folder with the masks of the sky that a run made (`jaxsfm.runs.sky_masks`)."""
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")

@@ -22,11 +22,10 @@ from jaxsfm.io.images import (
     read_image,
     size_and_scale,
 )
-from jaxsfm.io.looks import Looks
 from jaxsfm.io.masked_images import with_mask
 from jaxsfm.io.masks import MaskFile, mask_path
 from jaxsfm.io.store import Store
-from jaxsfm.io.work_folder import RECORD, SKY
+from jaxsfm.io.work_folder import RECORD
 from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
 from jaxsfm.report.run_results import EvaluationReport
@@ -135,7 +134,7 @@ class FinishedRun:
     reference: ReferencePoses | None
     store: Store
     """The features and matches that the folder keeps."""
-    matches: Looks
+    matches: Store
     """The run's matches."""
 
     @functools.cached_property
@@ -197,10 +196,8 @@ def evaluation_report(
     return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
 
 
-def masks_folder(report: RunReport, home: Path) -> Path | None:
-    """The folder of the run's masks: the user's, or those of the sky in the work folder."""
-    if report.masked_sky:
-        return home / SKY
+def masks_folder(report: RunReport) -> Path | None:
+    """The folder of the run's masks."""
     folder = report.options.others.get("masks")
     return Path(folder) if isinstance(folder, str) else None
 
@@ -208,19 +205,18 @@ def masks_folder(report: RunReport, home: Path) -> Path | None:
 def _described(report: RunReport) -> RecordedConfig:
     """The limits of the working images whose cells the matches are of."""
     config, looks = report.options.config, report.looks
-    if looks is None or not looks.first_used:
+    if looks is None or looks.whole:
         return config
     return dataclasses.replace(config, max_size=looks.first_px)
 
 
-def _looks(store: Store, report: RunReport) -> Looks:
+def _looks(store: Store, report: RunReport) -> Store:
     """Where the matches of a run are; `store` has those at the size of its config."""
     identity, looks = report.identity, report.looks
-    if looks is None or not looks.first_used:
-        return Looks(store)
+    if looks is None or looks.whole:
+        return store
     first = dataclasses.replace(identity, config=identity.config | {"max_size": looks.first_px})
-    again = () if looks.in_vain else set(looks.again)
-    return Looks(Store(store.path, to_json(first)), store, again)
+    return Store(store.path, to_json(first))
 
 
 def read_run(
@@ -254,9 +250,7 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(
-            where, report.identity, _described(report), masks_folder(report, home)
-        ),
+        photos=RecordedPhotos(where, report.identity, _described(report), masks_folder(report)),
         model=model,
         colours=colours,
         reference=known,

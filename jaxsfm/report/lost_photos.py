@@ -125,15 +125,6 @@ def _lost_photos(
 def _taken_out(report: RunReport) -> dict[str, str]:
     """Why photos were taken out of a model, by name."""
     why = {
-        name: (
-            "the mapper gave it a pose, but its matches with the photos before and after it do not "
-            "agree with that pose"
-        )
-        for check in report.checks
-        if check
-        for name in check.taken_out
-    }
-    why |= {
         name: "the mapper gave it a pose, but something speaks against the model that it was in"
         for check in report.checks
         if check

@@ -111,35 +111,18 @@ class UsedLooks:
     """The sizes at which the photos of a run were described."""
 
     first_px: Count
-    """The longer side of the photos in the first look, pixels."""
-    photos: list[str] = field(default_factory=list)
-    """The photos that had no sure place in the model after it."""
-    again: list[tuple[str, str]] = field(default_factory=list)
-    """The pairs that were matched again, at the size of the config. Empty if the sky is masked and
-    something still speaks against the model, or if the photos are in no pair that was tried."""
+    """The longer side of the photos at first, pixels."""
     whole: bool = False
-    """Whether these are all pairs; then nothing of the first look was used."""
-    in_vain: bool = False
-    """Whether the second look gave no better model, so that the one of the first look stayed."""
-
-    @property
-    def first_used(self) -> bool:
-        """Whether the models are made of matches of the first look, alone or with others."""
-        return not self.whole or self.in_vain
+    """Whether no model was made of photos of this size, so that they were described at full size."""
 
     def in_words(self) -> str:
-        """What the looks found, in a sentence without a full stop."""
-        if not self.photos:
-            return f"all photos found a place with descriptions at {self.first_px} px"
-        lost = "1 photo" if len(self.photos) == 1 else f"{len(self.photos)} photos"
-        start = f"{lost} found no sure place at {self.first_px} px"
-        if not self.again:
-            return f"{start}; no pair was matched again"
-        which = "all pairs" if self.whole else f"{len(self.again)} pairs"
-        return (
-            f"{start}; {which} were matched again at full size"
-            + ", which gave no better model" * self.in_vain
-        )
+        """At what size the photos were described, in a sentence without a full stop."""
+        if self.whole:
+            return (
+                f"no model was made of photos of {self.first_px} px, so they were matched at full "
+                "size"
+            )
+        return f"photos were described at {self.first_px} px"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -75,11 +75,6 @@ class RunReport:
     given: UsedExternalMatches | None = None
     looks: UsedLooks | None = field(default=None, metadata=OMITTED)
     """None: all photos were described at the size of the config."""
-    own_cameras: bool | None = field(default=None, metadata=OMITTED)
-    """True: each photo has its own camera, because the model of shared ones was worse."""
-    masked_sky: Count | None = field(default=None, metadata=OMITTED)
-    """The number of photos whose sky was masked, because the photos contradicted each other with it
-    or something else spoke against the model. The masks are in the folder `sky` of the run."""
     turned: dict[str, Annotated[int, Range(1, 360)]] = field(default_factory=dict, metadata=OMITTED)
     """By how many degrees photos are turned clockwise to be upright, by name: those that the run
     found to be stored sideways without a note in EXIF."""

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from jaxsfm.io.images import named, shown_name
 from jaxsfm.io.pairs import describe
-from jaxsfm.io.work_folder import SKY
 from jaxsfm.report.georeference_lines import georeference_lines
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import EvaluationReport, LostPhoto, ViewGraph
@@ -113,13 +112,6 @@ def summary_lines(report: RunReport) -> list[str]:
     ]
     if looks := report.looks:
         lines.append(f"looks            {looks.in_words()}")
-    if report.own_cameras:
-        lines.append("cameras          one for each photo: the model of shared ones was worse")
-    if report.masked_sky:
-        lines.append(
-            f"sky              masked in {report.masked_sky} photos, which gave a better model "
-            f"(the masks are in {SKY})"
-        )
     if turned := report.turned:
         each = [f"{shown_name(name)} by {degrees} deg" for name, degrees in turned.items()]
         lines.append(f"turned           {named(each)} clockwise, to stand as the others do")

@@ -252,11 +252,6 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
             "look at each model by itself; each may be right, and what is missing is how they "
             f"belong together{way}; add such photos and run the same command again"
         )
-    if colour == "amber" and not (places or other or check.apart):
-        return (
-            "something spoke against the model before the sky was masked; look whether the model "
-            "is right, and whether the masks in the folder sky leave out the sky only"
-        )
     if colour == "amber":
         unsure = places[0].image if places else other.elsewhere[0] if other else check.apart[0][1]
         where = (

@@ -12,9 +12,9 @@ from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
-from jaxsfm.io.looks import SavedMatches
 from jaxsfm.io.orientation import UPRIGHT, quarters_between
 from jaxsfm.io.pairs import Pair, PairCounts
+from jaxsfm.io.saved_matches import SavedMatches
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
 from jaxsfm.report.lost_photos import explained
@@ -62,10 +62,6 @@ class StageResults:
     """How the models were moved into metres."""
     weights: UsedWeights
     looks: UsedLooks | None
-    own_cameras: bool
-    """Whether each photo has its own camera, because shared ones did not do."""
-    masked_sky: int
-    """The number of photos whose sky was masked."""
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -110,16 +106,11 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         ),
         given=None if about is None else from_json(UsedExternalMatches, about),
         looks=stages.looks,
-        own_cameras=stages.own_cameras or None,
-        masked_sky=stages.masked_sky or None,
         turned=_turned(stages.usable, stages.identity.orientations),
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,
-        checks=[
-            check and dataclasses.replace(check, without_sky=stages.masked_sky > 0)
-            for check in made.mapping.checks
-        ],
+        checks=made.mapping.checks,
         georeference=stages.georeference,
         lost=[],
         seconds=stages.seconds,

@@ -19,7 +19,6 @@ from jaxsfm.io.pairs import Pair, PairCounts, PairResult
 from jaxsfm.io.store import Store
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.runs.job import Job
-from jaxsfm.sfm.second_look import closest_pairs
 from jaxsfm.sfm.two_photos.matched import match_photos
 from jaxsfm.sfm.two_photos.pair_looks import HOPELESS
 from jaxsfm.sfm.two_photos.plane_looks import one_match_each
@@ -117,3 +116,13 @@ def pairs_to_look_at(
         ]
         found |= dict.fromkeys(own[:CLOSER])
     return list(found)
+
+
+def closest_pairs(name: str, counts: Mapping[Pair, PairCounts]) -> list[Pair]:
+    """The pairs of a photo: those with most inliers first, then those with most tentative matches.
+
+    Args:
+      counts: of pairs that were tried.
+    """
+    own = [pair for pair in counts if name in pair]
+    return sorted(own, key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))

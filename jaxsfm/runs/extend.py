@@ -14,9 +14,9 @@ from pathlib import Path
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
-from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
+from jaxsfm.io.saved_matches import SavedMatches
 from jaxsfm.io.versions import versions
 from jaxsfm.io.work_folder import RECORD, lock_folder, open_locked_folder
 from jaxsfm.matching.engines import Engine, chosen_engine
@@ -187,4 +187,4 @@ def _match_new(
     if not lost.keys() - added.keys():
         for _ in job.match_missing(files, pairs_without(missing, lost)):
             pass
-    return SavedMatches(Looks(job.store), pairs_without(pairs, lost)), lost
+    return SavedMatches(job.store, pairs_without(pairs, lost)), lost

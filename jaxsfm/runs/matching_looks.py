@@ -1,4 +1,4 @@
-"""The matching of a run's photos, at one size or at two."""
+"""The matching of a run's photos, at a small size first."""
 
 import dataclasses
 import logging
@@ -9,13 +9,11 @@ from typing import NamedTuple
 
 from jaxsfm.config import WORTH, Config
 from jaxsfm.io.images import ImageFile, working_size
-from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.pairs import Pair, PairCounts, best_pairs
 from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.job import Job, images_of, pairs_without
-from jaxsfm.sfm.second_look import SecondLook
 
 logger = logging.getLogger("jaxsfm")
 
@@ -29,12 +27,12 @@ def timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 class MatchedPairs(NamedTuple):
-    """The pairs of a run after a look."""
+    """The pairs of a run that were matched at one size."""
 
-    looks: Looks
+    store: Store
     """Where the matches are."""
     described: Config
-    """The settings of the look; after two looks at some pairs, those of the first one."""
+    """The settings that the photos were described with."""
     counts: dict[Pair, PairCounts]
     """Of every pair that was tried."""
 
@@ -89,24 +87,3 @@ def match_pairs(
         for result in job.match_missing(by_name, pairs_without(missing, lost)):
             counts[result.pair] = result.counts
     return counts, lost
-
-
-def match_again(
-    job: Job,
-    by_name: Mapping[str, ImageFile],
-    matched: MatchedPairs,
-    again: SecondLook,
-    seconds: dict[str, float],
-) -> MatchedPairs:
-    """Match pairs again at the size of the job.
-
-    Args:
-      matched: the pairs after the first look.
-    """
-    counts, _ = match_pairs(job, by_name, again.pairs, seconds)
-    if again.whole:
-        return MatchedPairs(Looks(job.store), job.config, counts)
-    looks = Looks(matched.looks.first, job.store, counts.keys())
-    both = SavedMatches(looks, counts)
-    united = {pair: both[pair].counts for pair in counts}
-    return MatchedPairs(looks, matched.described, matched.counts | united)

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -13,7 +14,7 @@ from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.intrinsics import used_cameras
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
-from jaxsfm.errors import UserError
+from jaxsfm.errors import UserError, remark
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.masked_images import masks_of, with_masks
@@ -27,17 +28,18 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page.after_run import page_after_run
-from jaxsfm.report.run_inputs import RunIdentity, UsedWeights
+from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.runs.job import Job, pairs_without
-from jaxsfm.runs.lost_photos import refine_with_closer_looks
-from jaxsfm.runs.mapping_looks import RunPhotos, map_in_looks
 from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.run_options import RunOptions, check_options
+from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
 from jaxsfm.runs.run_stages import RunStages
+from jaxsfm.sfm.check.model_check import MIN_VIEWS
+from jaxsfm.sfm.refined_stage import Reconstructed
 
 logger = logging.getLogger("jaxsfm")
 
@@ -138,25 +140,36 @@ def reconstruct_folder(
             measured=measured,
             seconds=seconds,
         )
-        mapped = map_in_looks(photos.without(lost), matched, stages)
+        photos = photos.without(lost)
+        if config.checked and "upright" not in options.without:
+            photos, matched = photos.upright(matched, seconds)
+            stages = dataclasses.replace(stages, images=[photos.images[i.name] for i in good])
         with folder.publish() as target:
-            made = refine_with_closer_looks(job, mapped, stages, target)
+            models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
+            looks = None
+            if matched.described != config:
+                looks = UsedLooks(first_px=matched.described.max_size)
+            if looks and not _has_model(models.made, good):
+                # Nothing that photos could be registered in was made of small photos.
+                logger.info("no model was made of small photos; matching them at full size")
+                looks = dataclasses.replace(looks, whole=True)
+                matched = photos.match_at_full_size(matched.counts, seconds)
+                models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
+            made = models.made
             moved = stages.write(made, target)
             report = run_report(
                 StageResults(
                     folder=images,
-                    identity=mapped.identity,
+                    identity=photos.identity,
                     usable=good,
                     skipped=skipped,
-                    results=mapped.matched.counts,
-                    handed_on=mapped.mapped.handed_on,
+                    results=matched.counts,
+                    handed_on=models.handed_on,
                     external=external,
                     reconstructed=made,
                     georeference=moved,
                     weights=from_json(UsedWeights, weights.described(config)),
-                    looks=mapped.looks,
-                    own_cameras=mapped.own_cameras,
-                    masked_sky=mapped.masked_sky,
+                    looks=looks,
                     seconds=seconds,
                 ),
                 config=config,
@@ -169,7 +182,8 @@ def reconstruct_folder(
             folder.drop_features()
         # The page is written before the lock is released: another run there would replace the files
         # that it shows.
-        page_after_run(out if made.models or not (out / "sparse").exists() else out / FAILED)
+        shown = out if made.models or not (out / "sparse").exists() else out / FAILED
+        remark("what the page would show", lambda: page_after_run(shown))
         return report
 
 
@@ -177,6 +191,12 @@ def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]
     if len(images) < 2:
         why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
         raise UserError(f"{folder}: {len(images)} usable images, at least 2 are needed{why}")
+
+
+def _has_model(made: Reconstructed, images: Sequence[ImageFile]) -> bool:
+    """Whether there is a model that others can judge: two photos say nothing about each other."""
+    largest = max((model.num_reg_images() for model in made.models), default=0)
+    return largest >= min(MIN_VIEWS, len(images))
 
 
 def _retrieve(

@@ -13,6 +13,7 @@ from jaxsfm.options import (
     EngineChoice,
     NewPhotosChoice,
     ReconstructionChoice,
+    Step,
     WeightsChoice,
     check_seed,
     check_threads,
@@ -36,6 +37,10 @@ class Computation:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunOptions(Computation, ReconstructionChoice):
     """What a reconstruction does, beyond its `Config`."""
+
+    without: tuple[Step, ...] = ()
+    """Steps that are left out. For measurements: each step is there because it is worth something.
+    """
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

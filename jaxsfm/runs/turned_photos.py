@@ -1,24 +1,20 @@
 """Photos that are stored sideways without a note in EXIF: which ones, and by how much.
 
-VGG does not recognise turned content, so such photos stay weak. The ones in the model are seen from
-their poses. For the others the quarter turns are tried, unless they match a photo of the model well
-as they are: a few photos of the model are matched with them at a small size.
+VGG does not recognise turned content, so a photo that is turned against the others has no strong
+pair with them. Before the first mapping, the quarter turns of such photos are tried: a few photos
+of the largest group that strong pairs join are matched with them at a small size.
 """
 
 import dataclasses
 import logging
 from collections.abc import Collection, Mapping, Sequence
 
-from jaxsfm.colmap.model_images import registered
-from jaxsfm.colmap.poses import model_poses
 from jaxsfm.io import orientation
-from jaxsfm.io.images import ImageFile, named, orientations
-from jaxsfm.io.pairs import Pair, PairCounts, make_pair
+from jaxsfm.io.images import ImageFile, named
+from jaxsfm.io.pairs import Pair, PairCounts, component_of, make_pair
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.matching_looks import job_of_look, match_pairs
-from jaxsfm.runs.run_stages import MappedRun
-from jaxsfm.sfm.turned_views import quarter_turns
 
 logger = logging.getLogger("jaxsfm")
 
@@ -26,19 +22,11 @@ TRIAL_SIZE = 400
 """Longer side of the photos in a trial, pixels. A trial of a photo then costs about as much as its
 description at 800 px."""
 PARTNERS = 8
-"""Photos of the model that a trial matches."""
+"""Photos that a trial matches."""
 LEAST_INLIERS = 60
-"""A turn is believed if it has so many verified matches with all partners together, and twice as
-many as any other turn. Strangers have a plane of 26 by accident, rarely two."""
-
-MOST = 0.5
-"""Photos of a smaller model are turned if the trials turn more than this share of them. It may show
-another place, and then some photo of many has `LEAST_INLIERS` by accident: of 53 photos of three
-other places beside a model of *cup*, one of Sacre Coeur was turned, and left its model."""
-FEW = 0.1
-"""If something speaks against the models, they are not made again for so small a share of the
-photos. A photo from far above has no clear top, and matches one from the other side when it is
-turned: one of the 135 photos of *statue* was, and all rounds of mapping were made again."""
+"""A pair is strong, and a turn is believed, with so many verified matches. Those of a trial are
+summed over all partners. A turn must have twice as many as any other one. Strangers have a plane of
+26 by accident, rarely two."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,44 +63,36 @@ def turned(image: ImageFile, quarters: int) -> ImageFile:
     return dataclasses.replace(image, orientation=code)
 
 
-def find_turned(
-    mapped: MappedRun, trials: Trials, counts: Mapping[Pair, PairCounts]
-) -> dict[str, ImageFile]:
-    """The photos that are stored sideways, turned so that they are upright.
+def find_turned(trials: Trials, counts: Mapping[Pair, PairCounts]) -> dict[str, ImageFile]:
+    """The photos that are stored sideways against most others, turned so that they stand as those.
 
     Args:
-      mapped: the models after the first look.
-      counts: of the pairs that were tried in it.
+      counts: of the pairs that were tried.
     """
-    images, models = trials.images, mapped.stage.models()
-    codes = orientations(images.values())
-    turns = quarter_turns(model_poses(models[0]), codes) if models else {}
-    placed = set(registered(models[0])) if models else {_best_matched(images, counts)}
-    upright = sorted(placed - turns.keys())
-    seen_upright = _seen_beside(upright, counts)
-    for name in sorted(images.keys() - placed - seen_upright):
-        if quarters := trials.turn_of(name, partners(name, upright, counts)):
-            turns[name] = quarters
-    for model in models[1:]:
-        members = set(registered(model)) - placed
-        if len(members & turns.keys()) <= MOST * len(members):
-            turns = {name: turn for name, turn in turns.items() if name not in members}
-    if len(turns) <= FEW * len(images) and not mapped.green():
-        return {}
+    images = trials.images
+    upright = largest_group(images, counts)
+    turns = {
+        name: quarters
+        for name in sorted(images.keys() - upright)
+        if (quarters := trials.turn_of(name, partners(name, sorted(upright), counts)))
+    }
     if turns:
         logger.info("stored sideways, turned and matched again: %s", named([*turns]))
-    return {name: turned(images[name], quarters) for name, quarters in sorted(turns.items())}
+    return {name: turned(images[name], quarters) for name, quarters in turns.items()}
 
 
-def _seen_beside(upright: Collection[str], counts: Mapping[Pair, PairCounts]) -> set[str]:
-    """The upright photos, and those that match one of them well and so are upright, too.
+def largest_group(names: Collection[str], counts: Mapping[Pair, PairCounts]) -> set[str]:
+    """The largest group of photos that strong pairs join; of equal ones, the first by name.
 
-    In a collection many photos are in no model or a smaller one, and a trial of each takes
-    seconds. Of the 135 photos of *statue* the first model has a tenth.
+    If no pair is strong, it is the photo with most verified matches.
     """
-    known = set(upright)
-    well = [pair for pair, found in counts.items() if found.num_inliers >= LEAST_INLIERS]
-    return {name for pair in well if known & set(pair) for name in pair}
+    strong = [pair for pair, found in counts.items() if found.num_inliers >= LEAST_INLIERS]
+    left, best = sorted({name for pair in strong for name in pair}), set[str]()
+    while left:
+        group = set(component_of({left[0]}, strong))
+        best = group if len(group) > len(best) else best
+        left = [name for name in left if name not in group]
+    return best or {_best_matched(names, counts)}
 
 
 def _best_matched(names: Collection[str], counts: Mapping[Pair, PairCounts]) -> str:

@@ -1,13 +1,13 @@
-"""From matches to the models of the mapper: verification, and mapping with its check.
+"""What the road starts from, and its first stages: verified pairs, and mappings with their checks.
 
-Each of the two stages reads the files of the one before. So a stage whose files exist from an
-earlier run (`jaxsfm.run_folder`) gives what it would give if it ran again.
+Each stage reads the files of the one before. So a stage whose files exist from an earlier run
+(`jaxsfm.io.work_folder`) gives what it would give if it ran again.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
@@ -15,6 +15,7 @@ from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
+from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
@@ -22,15 +23,13 @@ from jaxsfm.io.store import digest
 from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
+from jaxsfm.sfm.check.check_files import read_outcomes, write_outcomes
 from jaxsfm.sfm.check.check_model import CHECKED_BY
 from jaxsfm.sfm.checker import VerifiedPairs
-from jaxsfm.sfm.mapping import MappingFigures, build_checked_models
+from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
 from jaxsfm.sfm.stage_files import VerificationFigures
 
-if TYPE_CHECKING:
-    import pycolmap
-
-DATABASE, SPARSE, ALTERNATIVE = "database.db", "sparse", "alternative"
+DATABASE, SPARSE, ALTERNATIVE, OUTCOMES = "database.db", "sparse", "alternative", "outcomes.json"
 
 
 class StageCache(NamedTuple):
@@ -39,8 +38,6 @@ class StageCache(NamedTuple):
     folder: WorkFolder
     matches_key: str
     """Identifies the matches. A stage is used again only for the same matches."""
-    suffix: str = ""
-    """Of the names of the stages, so that those of several looks lie beside each other."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,23 +63,13 @@ class MatchedPhotos:
         self.cameras.check_fits(self.images)
 
 
-class MappedStage(NamedTuple):
-    """The models of the mapper, in the folder of their stage."""
+class VerifiedStage(NamedTuple):
+    """The verified pairs, in the folder of their stage."""
 
-    verification: VerificationFigures
-    figures: MappingFigures
-    folder: Path
+    figures: VerificationFigures
+    pairs: VerifiedPairs
     key: str
-    """Identifies all that the models depend on."""
-
-    @property
-    def database(self) -> Path:
-        """COLMAP's database of the models."""
-        return self.folder / DATABASE
-
-    def models(self, name: str = SPARSE) -> "list[pycolmap.Reconstruction]":
-        """The models, or the `ALTERNATIVE` ones."""
-        return read_models(self.folder / name, self.database)
+    """Identifies all that they depend on."""
 
 
 def matched_photos(
@@ -111,70 +98,88 @@ def matched_photos(
     )
 
 
-def map_matches(
-    given: MatchedPhotos,
-    kept: StageCache,
-    on_image: Callable[[], None] = lambda: None,
-    go_on: Callable[[], bool] | None = None,
-) -> MappedStage:
-    """Verify the matches, and map the trusted pairs until no photo contradicts the others.
+def verify_matches(given: MatchedPhotos, kept: StageCache) -> VerifiedStage:
+    """Let COLMAP verify the matches.
 
     Args:
       kept: stages of earlier runs, which are used again where they hold. New ones are kept there.
-      on_image: called for every image that the mapper registers.
-      go_on: as in `build_checked_models`; None: always go on. The answer follows from the photos.
 
     Raises:
       UserError: COLMAP fails.
     """
-    config, options, stages = given.config, given.options, kept.folder
+    config, options = given.config, given.options
 
-    def verify_matches(folder: Path) -> None:
+    def compute(folder: Path) -> None:
         write_database(folder / DATABASE, given.images, given.matches, given.cameras)
-        figures = _verified(folder / DATABASE, options, config.view_graph)
-        stage_files.write_verification(folder, figures)
-
-    def build(folder: Path) -> None:
-        two_views = read_two_views(verified / DATABASE)
-        photos = Photos(given.images, given.described)
-        made = build_checked_models(
-            VerifiedPairs(verified / DATABASE, two_views, given.matches, photos),
-            folder / DATABASE,
-            config=config,
-            options=options,
-            on_image=on_image,
-            go_on=go_on or (lambda: True),
-            steps=stages.steps(name, key),
+        verify(folder / DATABASE, options.verification(relative_poses=config.view_graph))
+        views = read_two_views(folder / DATABASE)
+        figures = VerificationFigures(
+            verified={pair: view.geometry.num_inliers for pair, view in views.items()},
+            angles={pair: view.tri_angle_deg for pair, view in views.items()},
         )
-        write_models(made.models, folder / SPARSE)
-        write_models(made.alternative, folder / ALTERNATIVE)
-        stage_files.write_mapping(folder, made.figures)
+        stage_files.write_verification(folder, figures)
 
     by_image = [[image.name, image.content, image.size] for image in given.images]
     camera = given.cameras.plain()
-    verifying = [options.seed, options.threads, options.scale, config.view_graph]
+    settings = [options.seed, options.threads, options.scale, config.view_graph]
     key = digest(
-        kept.matches_key, stage_files.FORMAT, by_image, camera, verifying, package_versions()
+        kept.matches_key, stage_files.FORMAT, by_image, camera, settings, package_versions()
     )
-    verified = stages.stage("verified" + kept.suffix, key, verify_matches)
+    folder = kept.folder.stage("verified", key, compute)
+    views = read_two_views(folder / DATABASE)
+    photos = Photos(given.images, given.described)
+    pairs = VerifiedPairs(folder / DATABASE, views, given.matches, photos)
+    return VerifiedStage(stage_files.read_verification(folder), pairs, key)
+
+
+def map_trusted(
+    given: MatchedPhotos,
+    verified: VerifiedStage,
+    trust: Trust,
+    name: str,
+    kept: StageCache,
+    on_image: Callable[[], None] = lambda: None,
+) -> MappedModels:
+    """Map the trusted pairs, and check the models.
+
+    Args:
+      name: of the stage.
+      on_image: called for every image that the mapper registers.
+
+    Raises:
+      UserError: COLMAP fails.
+    """
+    mapper = mapper_of(given, verified, on_image)
+
+    def compute(folder: Path) -> None:
+        made = mapper.map(trust, folder / DATABASE)
+        write_models(made.models, folder / SPARSE)
+        write_outcomes(folder / OUTCOMES, made.checks)
+
+    key = digest(verified.key, *_settings(given), _plain(trust))
+    folder = kept.folder.stage(name, key, compute)
+    return MappedModels(
+        trust=trust,
+        database=folder / DATABASE,
+        models=read_models(folder / SPARSE, folder / DATABASE),
+        checks=read_outcomes(folder / OUTCOMES),
+    )
+
+
+def mapper_of(
+    given: MatchedPhotos, verified: VerifiedStage, on_image: Callable[[], None] = lambda: None
+) -> Mapper:
+    """The mapper of verified photos."""
+    return Mapper(verified.pairs, config=given.config, options=given.options, on_image=on_image)
+
+
+def _settings(given: MatchedPhotos) -> list[Json]:
+    """What a mapping depends on besides its pairs."""
+    config = given.config
     aligning = config.refinement or Refinement()
     checking = config.checked and [getattr(aligning, name) for name in CHECKED_BY]
-    refines = config.refinement is not None
-    key = digest(key, dataclasses.asdict(options), checking, refines, go_on is not None)
-    name = "mapped" + kept.suffix
-    verification = stage_files.read_verification(verified)
-    mapped = stages.stage(name, key, build)
-    return MappedStage(verification, stage_files.read_mapping(mapped), mapped, key)
+    return [dataclasses.asdict(given.options), checking, config.refinement is not None]
 
 
-def _verified(database: Path, options: MapOptions, view_graph: bool) -> VerificationFigures:
-    """Verify the matches of a database."""
-    verify(
-        database,
-        options.verification(relative_poses=view_graph),
-    )
-    two_views = read_two_views(database)
-    return VerificationFigures(
-        verified={pair: view.geometry.num_inliers for pair, view in two_views.items()},
-        angles={pair: view.tri_angle_deg for pair, view in two_views.items()},
-    )
+def _plain(trust: Trust) -> list[Json]:
+    return [trust.basis, trust.thorough, sorted(trust.dropped())]

@@ -1,61 +1,134 @@
-"""From verified pairs to checked models: hypotheses about which pairs are right, and a choice.
+"""Mappings of all photos: which pairs each trusts, what its check says, and which one is better.
 
-Where photos contradict each other in a model, pairs that joined them are refuted, and the model is
-made again without them. So other ways to join the groups of photos are tried until the photos agree
-with one, or until no pair is left that joins the groups. The two hypotheses are described in
-`jaxsfm.sfm.hypotheses`. The second is tried if something speaks against the first one. If both
-stand, both models are returned. Models in which photos contradict each other to the end are taken
-apart (`jaxsfm.sfm.told_apart`). Models that share photos are joined (`jaxsfm.sfm.joined_models`).
+The first mapping trusts the pairs on which most others agree (`jaxsfm.sfm.view_graph`). If its
+photos contradict each other, a second one is made without the pairs that the check rejected. If the
+photos are numbered in the order in which they were taken, pairs of photos that follow each other
+come first in it (`jaxsfm.sfm.photo_order`). There is no third one.
 """
 
 import dataclasses
-import logging
+import shutil
 import tempfile
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
+from jaxsfm.colmap.database import drop_pairs
+from jaxsfm.colmap.inliers import keep_inliers, read_inliers
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import Attempt
-from jaxsfm.colmap.model_images import take_out
-from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.mapper import Attempt, complete, run_mapper
+from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.triangulation import with_all_points
+from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.config import Config
-from jaxsfm.io.kept_folders import Steps
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked
-from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
-from jaxsfm.sfm.check.model_check import MIN_VIEWS, Alternative, Basis, ModelCheck
-from jaxsfm.sfm.checker import VerifiedPairs
-from jaxsfm.sfm.hypotheses import by_order, by_votes
-from jaxsfm.sfm.photo_order import neighbours, ordered, orders
-from jaxsfm.sfm.round import Round
-from jaxsfm.sfm.rounds import Rounds
-from jaxsfm.sfm.view_graph import Verdict
+from jaxsfm.sfm.check.model_check import Basis, Contradiction, ModelCheck
+from jaxsfm.sfm.checker import Checker, VerifiedPairs
+from jaxsfm.sfm.mapper_matches import mapper_matches
+from jaxsfm.sfm.photo_order import follow, neighbours, ordered, orders
+from jaxsfm.sfm.view_graph import Verdict, strengths, trusted_pairs
 
 if TYPE_CHECKING:
     import pycolmap
 
-logger = logging.getLogger("jaxsfm")
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trust:
+    """Which pairs a mapping is given, and how the mapper runs."""
+
+    basis: Basis = "pairs"
+    """What the trusted pairs follow."""
+    verdicts: dict[Pair, Verdict] = dataclasses.field(default_factory=dict)
+    """By pair. Pairs without a verdict are trusted."""
+    thorough: bool = False
+    """Whether the mapper makes no draft, but does all that COLMAP's own one does."""
+
+    def dropped(self) -> set[Pair]:
+        """The pairs that the mapper is not given."""
+        return {pair for pair, verdict in self.verdicts.items() if not verdict.trusted}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MappedModels:
+    """The models of one mapping, and what their checks say."""
+
+    trust: Trust
+    database: Path
+    """With the pairs that the mapping was given."""
+    models: "list[pycolmap.Reconstruction]"
+    """The one with most photos first."""
+    checks: list[Checked | None]
+    """For each model; None where it was not checked."""
+
+    def contradicted(self) -> int:
+        """The number of points at which photos contradict each other."""
+        return sum(
+            each.contradicted
+            for done in self.checks
+            if done is not None
+            for each in done.check.contradictions
+        )
+
+    def rejected(self) -> dict[Pair, Contradiction]:
+        """The pairs that joined photos which contradict each other.
+
+        Pairs whose own two photos contradict each other come first. Others that join groups are
+        rejected only if there is none of these: with them gone, the groups may be joined rightly.
+        """
+        done = [each for each in self.checks if each is not None]
+        opposed = {pair: why for each in done for pair, why in each.refuted.items()}
+        return opposed or {pair: why for each in done for pair, why in each.suspected.items()}
+
+    def apart(self, following: set[Pair]) -> set[Pair]:
+        """Those pairs of photos that follow each other that do not agree with their model."""
+        inside = [each for each in self.checks if each is not None]
+        return {
+            pair
+            for each in inside
+            for pair in following - each.explained
+            if each.check.photos() >= set(pair)
+        }
+
+    def consistent_pairs(self) -> int:
+        """The number of pairs of photos, matched or not, whose places nothing contradicts."""
+        sizes = [
+            len(part)
+            for model, done in zip(self.models, self.checks, strict=True)
+            for part in (done.parts if done is not None else [registered(model)])
+        ]
+        return sum(size * (size - 1) // 2 for size in sizes)
+
+    def better_than(self, other: "MappedModels", following: set[Pair]) -> bool:
+        """Whether these models are better. This is the only rule that compares two mappings.
+
+        The models are better in which more pairs of photos have places that nothing contradicts.
+        A photo that loses its place loses all its pairs, and so does a photo that others
+        contradict. Of equal ones, those are better in which fewer photos disagree with the photo
+        that was taken next.
+        """
+        ours, theirs = self.consistent_pairs(), other.consistent_pairs()
+        if ours != theirs:
+            return ours > theirs
+        return len(self.apart(following)) < len(other.apart(following))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MappingFigures:
-    """What the rounds left beside the models."""
+    """What the mappings left beside the models."""
 
     verdicts: dict[Pair, Verdict]
-    """Which pairs the mapper was given in the round of the models, and which not. Empty if the view
-    graph is switched off and no pair was refuted."""
+    """Which pairs the mapper was given for the models, and which not. Empty if the view graph is
+    switched off and no pair was rejected."""
     attempts: list[Attempt]
-    """All runs of the mapper, in all rounds."""
+    """All runs of the mapper."""
     checks: list[ModelCheck | None]
     """For each model; None where it was not checked."""
     basis: Basis = "pairs"
     """What the models follow."""
-    cut_short: bool = False
-    """Whether more rounds may give better models (`jaxsfm.sfm.hypotheses.Voted`)."""
 
     def misleading(self) -> set[Pair]:
-        """Pairs that do not say where photos stand, because the rounds found them to be false."""
+        """Pairs that do not say where photos stand, because they were found to be false."""
         return {
             pair
             for pair, verdict in self.verdicts.items()
@@ -63,193 +136,128 @@ class MappingFigures:
         }
 
 
-class Mapped(NamedTuple):
-    """The outcome of mapping."""
+class Mapper:
+    """Makes mappings from verified pairs, and has their models checked."""
 
-    models: "list[pycolmap.Reconstruction]"
-    """The one with most images first; empty if there is none. If they are to be refined, they have
-    the points of the matches that the mapper was given."""
-    figures: MappingFigures
-    alternative: "list[pycolmap.Reconstruction]"
-    """Models that join the photos in another way; empty if there is no other way."""
+    def __init__(
+        self,
+        given: VerifiedPairs,
+        *,
+        config: Config,
+        options: MapOptions,
+        on_image: Callable[[], None] = lambda: None,
+    ) -> None:
+        """
+        Args:
+          config: its `view_graph`, `checked` and `refinement` switch those parts on. If models are
+            refined, the mapper is given a share of the matches, of which it makes a draft.
+          on_image: called for every image that the mapper registers.
+        """
+        self.given, self._config, self._options = given, config, options
+        self._share, self._on_image = config.refinement is not None, on_image
 
+    @property
+    def _draft(self) -> MapOptions:
+        return dataclasses.replace(self._options, draft=self._share)
 
-def build_checked_models(
-    given: VerifiedPairs,
-    database: Path,
-    *,
-    config: Config,
-    options: MapOptions,
-    on_image: Callable[[], None] = lambda: None,
-    go_on: Callable[[], bool] = lambda: True,
-    steps: Steps | None = None,
-) -> Mapped:
-    """Map verified pairs until no photo contradicts the others, with two hypotheses.
+    def trust_votes(self) -> Trust:
+        """What the first mapping trusts."""
+        if not self._config.view_graph:
+            return Trust()
+        return Trust(verdicts=trusted_pairs(self._geometries()))
 
-    If photos still contradict each other after the last round, the parts of the best models are
-    returned, and their checks say so; the alternative is then what they are parts of. If nothing
-    speaks against the models only because an earlier one fell apart when pairs were left out, the
-    checks say so, too. A round that leaves no model to check does not count.
+    def trust_again(self, first: MappedModels) -> Trust | None:
+        """What a second mapping trusts; None if a second one has no other pairs to go by.
 
-    Args:
-      database: where to write the pairs that the models were made from.
-      config: its `view_graph` and `checked` switch these parts on.
-      on_image: called for every image that the mapper registers.
-      go_on: whether to go on, if photos still contradict each other after the first rounds. If not,
-        the best of these is returned.
-      steps: where models and checks are kept until all rounds are made; None: nowhere.
-    """
-    following = neighbours(given.two_views.keys())
-    with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
-        rounds = Rounds(
-            given,
-            database,
-            Path(scratch),
-            config=config,
-            options=options,
-            on_image=on_image,
-            steps=steps,
-        )
-        voted = by_votes(rounds, view_graph=config.view_graph, go_on=go_on)
-        best, other = rounds.joined(voted.best), None
-        checks, complete = _checks(best, following, rounds.fallen_apart(best)), False
-        if green(checks):
-            checks, complete = rounds.with_second_places(best, checks), True
-        names = {name for pair in given.two_views for name in pair}
+        Args:
+          first: the first mapping, against which something speaks.
+        """
+        rejected = first.rejected()
+        left = {p: each for p, each in self._geometries().items() if p not in rejected}
+        names = {name for pair in self.given.two_views for name in pair}
         found = orders(names)
-        if found and ordered(found, names) and not green(checks):
-            logger.info("something speaks against the model; following the order of the names")
-            rounds.doubt(checks)
-            other = rounds.joined(by_order(rounds, found))
-            if other.at_least_as_good_as(best):
-                best, other = other, best
-                checks, complete = _checks(best, following, rounds.fallen_apart(best)), False
-        rounds.go_back_to(best)
-        whole, parts = best, []
-        red = best.contradicted() > 0
-        if red:
-            best, parts = rounds.told_apart(best)
-            best = rounds.joined(best)
-            checks = _checks(best, following, _still_apart(parts, best))
-        checks = _without_strays(best, checks, following)
-        if not complete:
-            checks = rounds.with_second_places(best, checks)
-        alternative = []
-        if parts and checks[0] is not None:
-            whole = whole.contradicting()
-            checks[0] = dataclasses.replace(checks[0], alternative=_untold(whole, checks[0]))
-            alternative = rounds.with_all_points(whole)
-        elif other is not None and checks[0] is not None and _stands(other, red=red):
-            told = _alternative(best, other)
-            if told is not None:
-                checks[0] = dataclasses.replace(checks[0], alternative=told)
-                alternative = rounds.with_all_points(other)
-    figures = MappingFigures(
-        verdicts=best.verdicts,
-        attempts=rounds.attempts,
-        checks=checks,
-        basis=best.basis,
-        cut_short=voted.cut_short,
-    )
-    return Mapped(best.models, figures, alternative)
+        numbered = bool(found) and ordered(found, names)
+        if not (rejected or numbered):
+            return None
+        links = follow(found, strengths(left)) if numbered else set[Pair]()
+        verdicts = trusted_pairs(left, strict=True, first=links)
+        verdicts |= {pair: _rejected(each) for pair, each in rejected.items()}
+        return Trust(basis="order" if numbered else "pairs", verdicts=verdicts)
+
+    def trust_thoroughly(self, first: MappedModels) -> Trust | None:
+        """What a second mapping trusts if the first one left out photos; None if it left out few.
+
+        The pairs are the same, but the mapper does all that it can.
+        """
+        dropped = first.trust.dropped()
+        pairs = sorted(pair for pair in self.given.two_views if pair not in dropped)
+        if not self._share or complete(first.models, pairs):
+            return None
+        return dataclasses.replace(first.trust, thorough=True)
+
+    def map(self, trust: Trust, database: Path) -> MappedModels:
+        """Map the trusted pairs, and check the models.
+
+        Args:
+          database: where to write the pairs.
+
+        Raises:
+          UserError: COLMAP fails.
+        """
+        shutil.copyfile(self.given.database, database)
+        drop_pairs(database, sorted(trust.dropped()))
+        options = self._options if trust.thorough else self._draft
+        with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
+            source = database
+            if self._share:
+                source = Path(scratch) / "mapper.db"
+                shutil.copyfile(database, source)
+                keep_inliers(source, mapper_matches(read_inliers(source)))
+            models = run_mapper(source, options, on_image=self._on_image)
+        checks = self.checker(database).check(models, ())
+        return MappedModels(trust=trust, database=database, models=models, checks=checks)
+
+    def checker(self, database: Path) -> Checker:
+        """Checks models that were made from the pairs of a database.
+
+        They are checked with the points of all matches of these pairs. The points are adjusted as
+        those of a draft: the check asks only where they are missing.
+        """
+        whole: list[tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]] = []
+
+        def with_points(model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
+            if not self._share:
+                return model
+            for one, found in whole:
+                if one is model:
+                    return found
+            whole.append((model, with_all_points(model, database, self._draft)))
+            return whole[-1][1]
+
+        return Checker(self.given, self._config, self._options.seed, with_points)
+
+    def with_points_for_good(self, made: MappedModels) -> "list[pycolmap.Reconstruction]":
+        """The models with the points of all matches of their pairs, if they are not refined."""
+        if not self._share:
+            return made.models
+        return [with_all_points(model, made.database, self._options) for model in made.models]
+
+    def following(self) -> set[Pair]:
+        """The verified pairs of photos that follow each other by their names."""
+        return neighbours(self.given.two_views.keys())
+
+    def _geometries(self) -> dict[Pair, PairGeometry]:
+        return {pair: view.geometry for pair, view in self.given.two_views.items()}
 
 
-def green(checks: Sequence[ModelCheck | None]) -> bool:
-    """Whether nothing is known to speak against any of the models."""
-    return all(check is None or check.verdict == "green" for check in checks)
-
-
-def _checks(
-    made: Round, following: Set[Pair], parts: Sequence[list[str]] = ()
-) -> list[ModelCheck | None]:
-    """The checks of the models, with the neighbours in an order that do not agree with them.
-
-    Args:
-      parts: those that were told apart.
-    """
-
-    def with_neighbours(each: Checked) -> ModelCheck:
-        inside = each.check.photos()
-        apart = [list(p) for p in sorted(following - each.explained) if inside >= set(p)]
-        return dataclasses.replace(each.check, apart=apart, told_apart=list(parts))
-
-    return [each and with_neighbours(each) for each in made.checks]
-
-
-def _still_apart(parts: Sequence[list[str]], made: Round) -> list[list[str]]:
-    """The parts that were told apart, after models were joined: those whose photos are in one model
-    are one. There are none if all are one."""
-    models = [each.check.photos() for each in made.checks if each is not None]
-    joined: dict[int, list[str]] = {}
-    for k, part in enumerate(parts):
-        inside = [i for i, photos in enumerate(models) if photos.issuperset(part)]
-        joined.setdefault(inside[0] if inside else -1 - k, []).extend(part)
-    found = sorted((sorted(set(part)) for part in joined.values()), key=lambda p: (-len(p), p))
-    return found if len(found) > 1 else []
-
-
-def _without_strays(
-    made: Round, checks: Sequence[ModelCheck | None], following: Set[Pair]
-) -> list[ModelCheck | None]:
-    """Take photos out of the models with which none of their neighbours there agrees.
-
-    A photo at the end of a model is often one whose pair with the next photo takes one wall for
-    another. Where photos contradict each other, nothing is taken out: neighbours may be the wrong
-    ones.
-
-    Returns:
-      the checks of the models that remain.
-    """
-    told = list(checks)
-    for k, (model, done, check) in enumerate(zip(made.models, made.checks, checks, strict=True)):
-        if done is None or check is None or check.contradictions:
-            continue
-        beside = {name for pair in following & done.explained for name in pair}
-        strays = {name for pair in following & done.against for name in pair} - beside
-        if strays and sum(map(len, check.groups)) - len(strays) >= MIN_VIEWS:
-            take_out(model, strays)
-            told[k] = check.without(strays)
-    return told
-
-
-def _stands(other: Round, *, red: bool) -> bool:
-    """Whether other models are worth showing: not if photos contradict these ones alone.
-
-    Args:
-      red: whether photos contradict the best models too.
-    """
-    return bool(other.checked_photos()) and (red or not other.contradicted())
-
-
-def _untold(whole: Round, part: ModelCheck) -> Alternative:
-    """What the largest model that was told apart says of the largest part.
-
-    Args:
-      whole: the round, with the models that were told apart alone.
-    """
-    assert whole.checks[0] is not None
-    before, now = (check.photos() for check in (whole.checks[0].check, part))
-    return Alternative(
-        basis=whole.basis,
-        images=len(before),
-        elsewhere=sorted(before - now),
-        contradicted=whole.contradicted(),
-        whole=True,
-    )
-
-
-def _alternative(best: Round, other: Round) -> Alternative | None:
-    """What an alternative says of the best model; None if the two agree."""
-    ours, theirs = (model_poses(made.models[0]) for made in (best, other))
-    common = {name: pose for name, pose in ours.items() if name in theirs}
-    if not common:
-        return None
-    same, *elsewhere = groups(common, theirs)
-    if len(same) >= SAME_SHARE * len(common):
-        return None
-    return Alternative(
-        basis=other.basis,
-        images=len(theirs),
-        elsewhere=sorted(name for group in elsewhere for name in group),
-        contradicted=other.contradicted(),
+def _rejected(each: Contradiction) -> Verdict:
+    return Verdict(
+        trusted=False,
+        refuted=True,
+        strength=0.0,
+        rotation_error_deg=None,
+        reason=(
+            f"the photos it joins contradict each other: of {each.tested} points of one group, "
+            f"{each.contradicted} are missing in the other"
+        ),
     )

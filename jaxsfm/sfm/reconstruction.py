@@ -10,8 +10,9 @@ from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.work_folder import WorkFolder
-from jaxsfm.sfm.mapped_stage import StageCache, map_matches, matched_photos
-from jaxsfm.sfm.refined_stage import Reconstructed, refine_mapped
+from jaxsfm.sfm.mapped_stage import StageCache, matched_photos
+from jaxsfm.sfm.refined_stage import Reconstructed
+from jaxsfm.sfm.road import walk
 
 
 def reconstruct(
@@ -49,4 +50,4 @@ def reconstruct(
     )
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         stages = StageCache(WorkFolder(Path(scratch), {}), "")
-        return refine_mapped(given, map_matches(given, stages), database, stages)
+        return walk(given, stages, database)

@@ -13,7 +13,7 @@ from jaxsfm.sfm.refine.passes import RefinementFigures, figures_from_json
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 17
+FORMAT = 18
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 
@@ -44,12 +44,11 @@ def read_verification(folder: Path) -> VerificationFigures:
 
 
 def write_mapping(folder: Path, figures: MappingFigures) -> None:
-    """Write the figures of the stage `mapped` into its folder."""
+    """Write the figures of the mappings into the folder of the stage `settled`."""
     plain = {
         "verdicts": [[pair, dataclasses.asdict(v)] for pair, v in figures.verdicts.items()],
         "attempts": [dataclasses.asdict(attempt) for attempt in figures.attempts],
         "basis": figures.basis,
-        "cut_short": figures.cut_short,
         "checks": [check and dataclasses.asdict(check) for check in figures.checks],
     }
     (folder / FIGURES).write_text(json.dumps(plain), encoding="utf-8")
@@ -67,7 +66,6 @@ def read_mapping(folder: Path) -> MappingFigures:
         attempts=attempts,
         checks=[row and check_from_json(row) for row in plain["checks"]],
         basis=plain["basis"],
-        cut_short=plain["cut_short"],
     )
 
 

@@ -22,7 +22,7 @@ with one exception in 90.
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -83,16 +83,18 @@ def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
 
 
 def trusted_pairs(
-    geometries: Mapping[Pair, PairGeometry], *, strict: bool = False
+    geometries: Mapping[Pair, PairGeometry], *, strict: bool = False, first: Collection[Pair] = ()
 ) -> dict[Pair, Verdict]:
     """Decide for every pair, of image names in order, whether it is trusted.
 
     Args:
       strict: strong pairs may not have any rotation either. This is for photos of repeated
         structure, whose false pairs are as strong as true ones.
+      first: pairs that are joined before all others, because something else than their strength
+        speaks for them.
     """
     strength = strengths(geometries)
-    ranked = sorted(geometries, key=lambda p: (-strength[p], p))
+    ranked = sorted(geometries, key=lambda p: (p not in first, -strength[p], p))
     known = [p for p in ranked if geometries[p].rotation is not None and strength[p] > 0]
     rotations = _average(_grow(known, geometries, strength), known, geometries)
     verdicts = {}

@@ -11,7 +11,6 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.images import WorkingImage
-from jaxsfm.io.looks import SECOND_CELLS
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.report.finished_run import FinishedRun
@@ -107,7 +106,7 @@ def _patch(
     pixels = Pixels(image.scale)
     aligned = pixels.from_original(final)
     corner, walked = None, None
-    if own is not None and own[0] < SECOND_CELLS:
+    if own is not None:
         row, column = divmod(own[0], width // FINE_STRIDE)
         corner = np.asarray([column, row]) * float(FINE_STRIDE)
         walked = pixels.from_original(own[1].astype(np.float64))

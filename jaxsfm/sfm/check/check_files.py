@@ -19,11 +19,9 @@ def check_from_json(row: dict[str, Any]) -> ModelCheck:
         other_places=[OtherPlace(**each) for each in row["other_places"]],
         alternative=row["alternative"] and Alternative(**row["alternative"]),
         apart=row["apart"],
-        taken_out=row["taken_out"],
         told_apart=row["told_apart"],
         shrunk=row["shrunk"],
         unconfirmed=row["unconfirmed"],
-        without_sky=row["without_sky"],
     )
 
 

@@ -1,7 +1,6 @@
 """The outcome of the check of a model, and the verdict that follows from it."""
 
 import dataclasses
-from collections.abc import Collection
 from typing import Literal
 
 from jaxsfm.io.pairs import Pair
@@ -88,30 +87,24 @@ class ModelCheck:
     apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Pairs of photos that follow each other by their names and were matched, but whose matches do
     not agree with the model. Sorted."""
-    taken_out: list[str] = dataclasses.field(default_factory=list)
-    """Photos that are not in the model any more, because their matches with the photos before and
-    after them did not agree with it. Sorted."""
     told_apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Groups of photos, the largest first, that were in one model with others which they
-    contradict, or in a model of an earlier round that something spoke against. Each group of three
-    photos or more is in a model without the others now. They are the same for all models of a run:
-    where there are any, the scene repeats itself, also elsewhere."""
+    contradict. Each group of three photos or more is in a model without the others now. They are
+    the same for all models of a run: where there are any, the scene repeats itself, also
+    elsewhere."""
     shrunk: list[str] = dataclasses.field(default_factory=list)
     """Photos that see their points so much nearer than others that a part of the model has shrunk
     (`jaxsfm.sfm.check.scale`). Sorted."""
     unconfirmed: bool = False
     """Whether the model was not refined, because too few of its points were found in the photos
     that should show them."""
-    without_sky: bool = False
-    """Whether the sky was masked because something spoke against a model with it. What masked
-    pixels show contradicts nothing, so this check is weaker than the one before."""
 
     @property
     def verdict(self) -> VerdictColour:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        speaks_against = self.apart or self.unconfirmed or self.without_sky or self.doubted()
+        speaks_against = self.apart or self.unconfirmed or self.doubted()
         return "amber" if speaks_against else "green"
 
     def doubted(self) -> bool:
@@ -122,14 +115,3 @@ class ModelCheck:
     def photos(self) -> set[str]:
         """The photos of the model."""
         return {name for group in self.groups for name in group}
-
-    def without(self, names: Collection[str]) -> "ModelCheck":
-        """The check of the model from which photos have been taken out."""
-        groups = [[name for name in group if name not in names] for group in self.groups]
-        return dataclasses.replace(
-            self,
-            groups=sorted(filter(None, groups), key=lambda group: (-len(group), group)),
-            apart=[pair for pair in self.apart if not set(pair) & set(names)],
-            taken_out=sorted(names),
-            shrunk=[name for name in self.shrunk if name not in names],
-        )

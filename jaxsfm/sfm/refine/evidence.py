@@ -1,7 +1,7 @@
 """The evidence for a pose from matches: keypoints of an image, and the surface under them."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,9 +10,6 @@ from jaxsfm.colmap.view import View
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.refine import plane_geometry
 
-if TYPE_CHECKING:
-    import pycolmap
-
 REACH_PX = 16.0
 """A match lies on the surface of an observation this near, working pixels: two fine cells."""
 MATCH_ERROR_PX = 12.0
@@ -20,25 +17,16 @@ MATCH_ERROR_PX = 12.0
 dark image are about 4 px off, and cells are 8 px wide."""
 
 
-class UnmappedImage(NamedTuple):
-    """An image that the mapper put into no model."""
-
-    name: str
-    image_id: int
-    camera: "pycolmap.Camera"
-
-
 class Evidence(NamedTuple):
     """Facts that refinement uses besides the model."""
 
     matches: Mapping[Pair, PairResult]
     """Verified matches by pair, original pixels."""
-    unmapped: Sequence[UnmappedImage]
     seed: int
     """For RANSAC in the resection from matches."""
 
 
-NO_EVIDENCE = Evidence({}, (), 0)
+NO_EVIDENCE = Evidence({}, 0)
 
 
 def matched_points(

@@ -13,7 +13,6 @@ A few hundred points for each view make the poses good, so all passes but the la
 the points of the matches that the mapper was given. Then all others return.
 """
 
-import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,7 +20,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.colmap.triangulation import MIN_POINTS
-from jaxsfm.io.images import ImageError
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
@@ -45,7 +43,8 @@ class RefinementFigures:
 
     passes: list[PassFigures]
     placed: list[Placement]
-    """One for each view that was weak in any pass, and for each image that the mapper left out."""
+    """One for each view that was weak in any pass, and for each photo without a place that was to
+    be registered."""
     camera: OtherCamera | None = None
     """The camera that the photos speak for, if it is not the one that was held."""
 
@@ -89,25 +88,14 @@ def _sizes_of_passes(passes: int, described_px: int) -> list[int]:
     return [described_px] * passes + larger
 
 
-def _working_sizes(
-    reconstruction: "pycolmap.Reconstruction", read: Reader, evidence: Evidence
-) -> tuple[Sizes, Evidence]:
-    """The sizes of all images, and the evidence without unmapped images that cannot be read."""
-
-    def working_size(name: str) -> tuple[tuple[int, int], tuple[float, float]]:
-        gray, scale = read(name)
-        return (gray.shape[1], gray.shape[0]), scale
-
+def _working_sizes(reconstruction: "pycolmap.Reconstruction", read: Reader) -> Sizes:
+    """The sizes of all images."""
     sizes = {}
     for image_id in sorted(reconstruction.reg_image_ids()):
         name = reconstruction.image(image_id).name
-        sizes[name] = working_size(name)
-    readable = []
-    for image in evidence.unmapped:
-        with contextlib.suppress(ImageError):  # deleted since; it is not in the model anyway
-            sizes[image.name] = working_size(image.name)
-            readable.append(image)
-    return sizes, evidence._replace(unmapped=readable)
+        gray, scale = read(name)
+        sizes[name] = (gray.shape[1], gray.shape[0]), scale
+    return sizes
 
 
 def refine_model(
@@ -133,7 +121,7 @@ def refine_model(
       reconstruction: from the mapper; not changed.
       read: intensities by image name; may be called several times per image.
       settings: of the passes. With one thread the model is repeatable to the last byte.
-      evidence: images that the mapper left out, and matches to place them and weak views by.
+      evidence: matches to place weak views by.
       with_all_points: gives a model the points of all matches, before the last of the `passes`.
         None: it has them already.
       described_px: the size of a pixel in which the keypoints were found, a power of two of working
@@ -145,7 +133,7 @@ def refine_model(
     Raises:
       ImageError: an image of the model cannot be read any more.
     """
-    sizes, evidence = _working_sizes(reconstruction, read, evidence)
+    sizes = _working_sizes(reconstruction, read)
     images, refinement = DeviceImages(read), settings.refinement
     now = _as_arrays(reconstruction, sizes)
     figures: list[PassFigures] = []
@@ -167,45 +155,17 @@ def refine_model(
     placing = _Placing(images, sizes, evidence, settings)
     placed: list[Placement] = []
     if doubtful := _doubtful(figures):
-        model, placed = placing.placed(now.model, doubtful, unmapped=False)
+        model, placed = placing.placed(now.model, doubtful)
         if model is not now.model:
             now, done = run(_as_arrays(model.to_colmap(), sizes), images, 1, limits, settings)
             figures.append(done)
     # A view that was weak in any pass is placed: what little agreed in the first pass looks like
     # much in the next (58 of 153 observations after 22 of 393, and the camera 0.4 m off).
     weak = sorted(_weak(figures))
-    if any(done.accepted for done in figures) and (weak or evidence.unmapped):
+    if weak:
         now, later = placing.confirmed(now, weak)
         placed = [*({at.name: at for at in (*placed, *later)}).values()]
     return now.reconstruction, RefinementFigures(passes=figures, placed=placed)
-
-
-def place_images(
-    reconstruction: "pycolmap.Reconstruction",
-    read: Reader,
-    settings: PassSettings,
-    *,
-    evidence: Evidence,
-) -> "tuple[pycolmap.Reconstruction, list[Placement]]":
-    """Place unmapped images on a model that has been refined, as its refinement does.
-
-    Args:
-      reconstruction: not changed.
-      read: intensities by image name; may be called several times per image.
-      settings: those of the refinement.
-      evidence: the unmapped images, and matches to place them by.
-
-    Returns:
-      the same model if no image has a place in it; what became of each image.
-
-    Raises:
-      ImageError: an image of the model cannot be read any more.
-    """
-    sizes, evidence = _working_sizes(reconstruction, read, evidence)
-    placing = _Placing(DeviceImages(read), sizes, evidence, settings)
-    now, placed = placing.confirmed(_as_arrays(reconstruction, sizes), [])
-    found = any(at.octave_px is not None and not at.doubt for at in placed)
-    return (now.reconstruction if found else reconstruction), placed
 
 
 def _weak(figures: Sequence[PassFigures]) -> set[str]:
@@ -229,26 +189,21 @@ class _Placing(NamedTuple):
     evidence: Evidence
     settings: PassSettings
 
-    def placed(
-        self, model: Model, names: Sequence[str], *, unmapped: bool
-    ) -> tuple[Model, list[Placement]]:
-        """`place_weak_views`; `unmapped`: also images that the mapper left out."""
-        evidence = self.evidence if unmapped else self.evidence._replace(unmapped=[])
+    def placed(self, model: Model, names: Sequence[str]) -> tuple[Model, list[Placement]]:
+        """`place_weak_views`."""
         return place_weak_views(
             model,
             names,
             self.images,
-            self.sizes,
             refinement=self.settings.refinement,
             refine_intrinsics=self.settings.refine_intrinsics,
-            evidence=evidence,
+            evidence=self.evidence,
         )
 
     def confirmed(self, now: Refined, weak: Sequence[str]) -> tuple[Refined, list[Placement]]:
-        """A model whose weak views are placed, with the images that the mapper left out, and
-        without the views that nothing confirms."""
+        """A model whose weak views are placed, without the views that nothing confirms."""
         reconstruction, before = now
-        model, placed = self.placed(before, weak, unmapped=True)
+        model, placed = self.placed(before, weak)
         if model is not before:
             reconstruction = model.to_colmap()
         if self.settings.refinement.weak_octaves:  # otherwise nothing has tried to confirm them

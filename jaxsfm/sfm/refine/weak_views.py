@@ -1,4 +1,4 @@
-"""Weak views, and images that the mapper left out: their poses on the structure of other views.
+"""Weak views: their poses on the structure of other views.
 
 A view is weak where refinement finds little to align, because noise hides it: a night among days.
 Such views are placed on the structure that the others make, at octaves where noise averages out
@@ -11,12 +11,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from jaxsfm.colmap.model import Model, Sizes
+from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, Evidence, matched_points
 from jaxsfm.sfm.refine.fixed_structure import FixedStructure
@@ -74,39 +73,31 @@ def place_weak_views(
     model: Model,
     weak: Sequence[str],
     images: DeviceImages,
-    sizes: Sizes,
     *,
     refinement: Refinement,
     refine_intrinsics: bool,
     evidence: Evidence,
 ) -> tuple[Model, list[Placement]]:
-    """Place weak views and unmapped images on the structure of the other views, which stays fixed.
+    """Place weak views on the structure of the other views, which stays fixed.
 
-    A placed view gets the observations that agree with its new pose instead of those it had. A
-    weak view starts from its pose and from its matches, an unmapped image from its matches.
+    A placed view gets the observations that agree with its new pose instead of those it had. It
+    starts from its pose and from its matches.
 
     Args:
       weak: names of views.
-      images: those of the views and the unmapped images, in working pixels.
-      sizes: as in `jaxsfm.sfm.refine.passes.refine_model`, of the unmapped images too.
+      images: those of the views, in working pixels.
       refine_intrinsics: whether the focal length of a placed view moves too, if no other view has
         its camera.
 
     Returns:
       the same model if no view could be placed; what became of each view.
     """
-    outside = [
-        View.without_pose(name, image_id, camera, sizes[name][0], Pixels(sizes[name][1]))
-        for name, image_id, camera in evidence.unmapped
-    ]
-    every, count = [*model.views, *outside], len(model.views)
     weak_ones = [k for k, view in enumerate(model.views) if view.name in weak]
-    wanted = [*weak_ones, *range(count, len(every))]
     strong, rows = _structure(model, weak_ones)
-    poses: dict[int, list[PoseHypothesis]] = {k: [] for k in wanted}
+    poses: dict[int, list[PoseHypothesis]] = {k: [] for k in weak_ones}
     if len(rows) and refinement.weak_octaves:
         structure = FixedStructure(strong, images, refinement)
-        poses = _starts(every, structure, wanted, evidence, refine_intrinsics)
+        poses = _starts(model.views, structure, weak_ones, evidence, refine_intrinsics)
         follow([pose for mine in poses.values() for pose in mine], structure)
         lost = [mine for mine in poses.values() if not any(map(trusted, mine))]
         search([pose for mine in lost for pose in mine], structure)
@@ -115,7 +106,7 @@ def place_weak_views(
         right = [pose for pose in map(trusted, mine) if pose is not None]
         if right:
             best[k] = min(right, key=lambda pose: pose.doubt_px)
-        placements.append(_placement(every[k].name, k < count, mine, best.get(k)))
+        placements.append(_placement(model.views[k].name, mine, best.get(k)))
     return (_with_placed(model, best, rows) if best else model), placements
 
 
@@ -126,10 +117,10 @@ def _starts(
     evidence: Evidence,
     refine_intrinsics: bool,
 ) -> dict[int, list[PoseHypothesis]]:
-    """The poses to follow, for each wanted image (an index).
+    """The poses to follow, for each wanted view (an index).
 
     Args:
-      images: the views of the structure, and behind them those without a pose.
+      images: the views of the structure.
     """
     model, normal = structure.model, structure.normals
     cameras = [view.camera.camera_id for view in images]
@@ -143,21 +134,18 @@ def _starts(
             estimate_focal_length=own and not images[k].camera.has_prior_focal_length,
             seed=evidence.seed,
         )
-        known = [images[k]] if k < len(model.views) else []
         starts[k] = [
             PoseHypothesis(view=view, own_camera=own)
-            for view in [*known, *([found] if found else [])]
+            for view in [images[k], *([found] if found else [])]
         ]
     return starts
 
 
-def _placement(
-    name: str, registered: bool, mine: list[PoseHypothesis], best: OctavePose | None
-) -> Placement:
+def _placement(name: str, mine: list[PoseHypothesis], best: OctavePose | None) -> Placement:
     most = max(mine, key=lambda pose: pose.agreed, default=None)
     return Placement(
         name=name,
-        registered=registered,
+        registered=True,
         octave_px=best.octave_px if best else None,
         candidates=len(best.points.candidates) if best else most.candidates if most else 0,
         agreed=best.agreed if best else most.agreed if most else 0,
@@ -169,15 +157,14 @@ def _with_placed(model: Model, best: Mapping[int, OctavePose], rows: np.ndarray)
     """The model with placed views, whose old observations go.
 
     Args:
-      best: by index of the view. An index past the last view is that of an unmapped image.
+      best: by index of the view.
       rows: for each point of the structure its index in the model.
     """
     tracks, views = model.tracks, list(model.views)
     parts = [tracks.select(~np.isin(tracks.view, list(best))).observations]
     for k, pose in sorted(best.items()):
-        at = min(k, len(views))
-        views[at : at + 1] = [pose.view]
-        parts.append(pose.points.observations(at, rows))
+        views[k] = pose.view
+        parts.append(pose.points.observations(k, rows))
     joined = Tracks.from_parts(tracks.points, parts, ordered=True)
     return model.with_views(views).with_tracks(joined)
 
@@ -193,33 +180,20 @@ def remove_unconfirmed(
     had such a view, with 0 and with 4 observations, where others had thousands. No other photo had
     fewer than 60.
 
-    An image that the mapper left out needs as many observations, even if alignment placed it:
-    a photo of *statue* was placed among those of castle-P19, where 15 points held it.
-
     Args:
-      placements: what became of the weak views and of the images that the mapper left out.
+      placements: what became of the weak views.
 
     Returns:
-      the same model if no view is taken out; the placements, with `held` or `doubt` where one is.
+      the same model if no view is taken out; the placements, with `held` where one is.
     """
     counts = np.bincount(model.tracks.view, minlength=len(model.views)).tolist()
     held = {view.name: count for view, count in zip(model.views, counts, strict=True)}
     few = {name for name, count in held.items() if count < MIN_COUNT}
-    refuted = {
-        each.name
-        for each in placements
-        if each.name in few and not (each.registered and each.octave_px is not None)
-    }
+    refuted = {each.name for each in placements if each.name in few and each.octave_px is None}
     stay = held.keys() - refuted
     if not refuted or len(stay) < 2:
         return model, list(placements)
     return model.part(stay)[0], [
-        _taken_out(each, held[each.name]) if each.name in refuted else each for each in placements
+        dataclasses.replace(each, held=held[each.name]) if each.name in refuted else each
+        for each in placements
     ]
-
-
-def _taken_out(each: Placement, held: int) -> Placement:
-    """What became of a view that so few observations hold in the model."""
-    if each.registered:
-        return dataclasses.replace(each, held=held)
-    return dataclasses.replace(each, doubt=f"only {held} points hold it in the model")

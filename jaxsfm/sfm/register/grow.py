@@ -2,23 +2,28 @@
 
 It works in rounds. In a round, each view is looked for in every model that has views like it, and
 gets its place in the model of which it shows most points (`jaxsfm.sfm.register.place`).
-What it shows beyond the model's points becomes new points (`jaxsfm.sfm.register.triangulate`), in
-which the next round locates further views.
+Places that the view itself or its neighbours contradict are given up
+(`jaxsfm.sfm.check.placed_views`). What it shows beyond the model's points becomes new points
+(`jaxsfm.sfm.register.triangulate`), in which the next round locates further views.
 """
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.sfm.check.placed_views import Placed, doubts
+from jaxsfm.sfm.photo_order import neighbours
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
+from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, MIN_SHARE
 from jaxsfm.sfm.register.locate_view import Localization
 from jaxsfm.sfm.register.place import Place, UnregisteredView, best_place, place_in
 from jaxsfm.sfm.register.triangulate import new_points
+
+_NOT_TRUSTED: dict[str, Any] = {"trusted": False, "octave_px": None, "points": None}
 
 
 class ExtendedModels(NamedTuple):
@@ -78,17 +83,25 @@ def grow(
             best = best_place(known.values())
             if best.found.trusted:
                 fresh[name] = best
-                on_view()
         if not fresh:
             located = {name: best_place(known.values()).found for name, known in tried.items()}
             return ExtendedModels(models, placed, located, rounds)
-        rounds, latest = rounds + 1, set(fresh)
-        placed |= {name: place.model for name, place in fresh.items()}
-        for k in {place.model for place in fresh.values()}:
+        stay = dict[str, Place]()
+        for k in sorted({place.model for place in fresh.values()}):
             own = {name: place for name, place in fresh.items() if place.model == k}
-            model = _with_placed(models[k], own)
-            more = new_points(model, own, matches, images, refinement=refinement)
-            models[k] = model.with_tracks(model.tracks.joined(more))
+            against = _against(_with_placed(models[k], own), own, matches, images, refinement)
+            for name, why in against.items():
+                refused = dataclasses.replace(own.pop(name).found, **_NOT_TRUSTED, why=why)
+                tried[name][k] = fresh[name]._replace(found=refused)
+            if own:
+                model = _with_placed(models[k], own)
+                more = new_points(model, own, matches, images, refinement=refinement)
+                models[k] = model.with_tracks(model.tracks.joined(more))
+            stay |= own
+        rounds, latest = rounds + 1, set(stay)
+        placed |= {name: place.model for name, place in stay.items()}
+        for _ in stay:
+            on_view()
 
 
 def _held(located: Localization) -> Localization:
@@ -105,7 +118,23 @@ def _held(located: Localization) -> Localization:
         f"alignment finds {located.agreed} of the {located.candidates} points that it would show "
         f"there, but only {count} of them hold it (needed: {MIN_COUNT})"
     )
-    return dataclasses.replace(located, trusted=False, why=why, octave_px=None, points=None)
+    return dataclasses.replace(located, **_NOT_TRUSTED, why=why)
+
+
+def _against(
+    model: Model,
+    own: Mapping[str, Place],
+    matches: Mapping[Pair, PairResult],
+    images: DeviceImages,
+    refinement: Refinement | None,
+) -> dict[str, str]:
+    """What speaks against the places of new views in a model, in words, by name."""
+    details = {
+        name: found.octave_px == 1 and found.agreed >= MIN_SHARE * found.candidates
+        for name, found in ((name, place.found) for name, place in own.items())
+    }
+    placed = Placed(details, neighbours(matches.keys()), matches)
+    return doubts(model, images, refinement or Refinement(), placed)
 
 
 def _with_placed(model: Model, fresh: Mapping[str, Place]) -> Model:

@@ -1,0 +1,215 @@
+"""Registration of the photos of a run that have no place after the refinement.
+
+These are photos that the mapper has lost, and photos that the refinement has taken out. They are
+located as photos that are added later (`jaxsfm.sfm.register.grow`), in the best of all models, and
+their places have to stand the same tests. The matches that the run has are tried first, then those
+with the best partners at full size.
+"""
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from jaxsfm.colmap.database import read_images
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model_folders import colour_points, read_models
+from jaxsfm.colmap.model_images import fingerprint, registered_in_any
+from jaxsfm.colmap.view import View
+from jaxsfm.io.images import ImageError
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.photos import Photos
+from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.store import digest
+from jaxsfm.sfm import stage_files
+from jaxsfm.sfm.checker import opened
+from jaxsfm.sfm.mapped_stage import SPARSE, MatchedPhotos, StageCache
+from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.passes import RefinementFigures
+from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refined_models import RefinedModels
+from jaxsfm.sfm.refined_stage import (
+    Reconstructed,
+    believed_matches,
+    refinement_settings,
+    write_refined,
+)
+from jaxsfm.sfm.register.grow import grow
+from jaxsfm.sfm.register.locate_view import Localization
+from jaxsfm.sfm.register.place import UnregisteredView
+from jaxsfm.sfm.settled_stage import SettledModels
+
+if TYPE_CHECKING:
+    import pycolmap
+
+SHORTLIST = 20
+"""A photo is located among so many photos of a model at most, those with most matches, as `extend`
+does by default."""
+
+
+class MatchLost(Protocol):
+    """Matches photos without a place with their best partners, at full size."""
+
+    def __call__(
+        self, lost: Collection[str], placed: Collection[str], false: Collection[Pair]
+    ) -> Mapping[Pair, PairResult]:
+        """The matches, original pixels. Pairs that were found to be false are left out."""
+        ...
+
+
+def register_lost(
+    given: MatchedPhotos,
+    settled: SettledModels,
+    made: Reconstructed,
+    kept: StageCache,
+    match_lost: MatchLost | None,
+) -> Reconstructed:
+    """Register the photos that have no place in the refined models, which stay as they are.
+
+    Args:
+      made: the refined models.
+      match_lost: gives further matches of photos that are still without a place. None: the matches
+        of the run have to do.
+    """
+    names = {image.name for image in given.images}
+    refined = [k for k, done in enumerate(made.refinement) if done is not None]
+    if not refined or not names - registered_in_any(made.models):
+        return made
+
+    def compute(folder: Path) -> None:
+        found = _Registration(given, settled, made)
+        found.register(believed_matches(given, settled))
+        if match_lost is not None:
+            # A photo that was registered may be the partner of another one.
+            while more := match_lost(found.lost(), found.placed(), settled.figures.misleading()):
+                if not found.register(more):
+                    break
+        write_refined(folder, found.outcome())
+
+    models = [fingerprint(model) for model in made.models]
+    settings = [*refinement_settings(given.config), match_lost is not None]
+    key = digest(settled.key, *settings, given.config.closer_looks, models)
+    folder = kept.folder.stage("registered", key, compute)
+    refinement, order = stage_files.read_refinement(folder)
+    checks = [made.mapping.checks[k] for k in order]
+    return dataclasses.replace(
+        made,
+        mapping=dataclasses.replace(made.mapping, checks=checks),
+        models=read_models(folder / SPARSE, settled.database),
+        refinement=refinement,
+    )
+
+
+class _Registration:
+    """Refined models that take up photos."""
+
+    def __init__(self, given: MatchedPhotos, settled: SettledModels, made: Reconstructed) -> None:
+        self._given, self._made = given, made
+        self._photos = Photos(given.images, given.config)
+        self._cameras = read_images(settled.database)
+        opened_models = [opened(model, self._photos)[0] for model in made.models]
+        self._models: list[Model] = opened_models
+        self._changed: set[int] = set()
+        self._images = DeviceImages(self._photos.gray)
+        self._outcomes: dict[str, Localization] = {}
+        self._placed: dict[str, int] = {}
+        self._unreadable: set[str] = set()
+
+    def placed(self) -> set[str]:
+        """The photos with a place."""
+        return {view.name for model in self._models for view in model.views}
+
+    def lost(self) -> set[str]:
+        """The photos without a place that can be read."""
+        names = {image.name for image in self._given.images}
+        return names - self.placed() - self._unreadable
+
+    def register(self, matches: Mapping[Pair, PairResult]) -> bool:
+        """Register lost photos by these matches, original pixels; says whether any was."""
+        wanted = {
+            name: view
+            for name in sorted(self.lost())
+            if (view := self._unregistered(name, matches)) is not None
+        }
+        own = {name for each in wanted.values() for name in each.shortlist} | wanted.keys()
+        pairs = [p for p in matches if wanted.keys() & set(p) and own >= set(p)]
+        if not pairs:
+            return False
+        grown = grow(
+            self._models,
+            wanted,
+            {pair: matches[pair] for pair in pairs},
+            self._images,
+            refinement=self._given.config.refinement,
+            seed=self._given.options.seed,
+        )
+        self._models = grown.models
+        self._changed |= set(grown.placed.values())
+        self._outcomes |= grown.located
+        self._placed |= grown.placed
+        return bool(grown.placed)
+
+    def _unregistered(
+        self, name: str, matches: Mapping[Pair, PairResult]
+    ) -> UnregisteredView | None:
+        """A lost photo with the camera that it has in each model; None if it cannot be used."""
+        partners = {
+            other: matches[pair].num_inliers
+            for pair in matches
+            if name in pair
+            for other in set(pair) - {name}
+        }
+        if not partners:
+            return None
+        try:
+            size = self._photos.working_size(name)
+        except ImageError:  # deleted since; it is in no model anyway
+            self._unreadable.add(name)
+            return None
+        image_id, camera = self._cameras[name]
+        views, shared = [], False
+        for model in self._models:
+            cameras = {view.camera.camera_id: view.camera for view in model.views}
+            shared |= camera.camera_id in cameras
+            refined = cameras.get(camera.camera_id, camera)
+            views.append(View.without_pose(name, image_id, refined, size[0], Pixels(size[1])))
+        shortlist = sorted(partners, key=lambda other: (-partners[other], other))[:SHORTLIST]
+        own_camera = self._given.options.refine_intrinsics and not shared
+        return UnregisteredView(views, own_camera, sorted(shortlist))
+
+    def outcome(self) -> RefinedModels:
+        """The models with the photos that were registered, the one with most photos first."""
+        models: list[pycolmap.Reconstruction] = list(self._made.models)
+        for k in sorted(self._changed):
+            models[k] = self._models[k].to_colmap()
+            colour_points(models[k], self._photos.rgb)
+        order = sorted(range(len(models)), key=lambda k: -models[k].num_reg_images())
+        figures = [self._figures(k) for k in range(len(models))]
+        return RefinedModels([models[k] for k in order], [figures[k] for k in order], order)
+
+    def _figures(self, k: int) -> RefinementFigures | None:
+        """What was done to a model, with the photos that were looked for. Photos that have no place
+        stand in the first model that was refined."""
+        done, refined = self._made.refinement[k], self._made.refinement
+        if done is None:
+            return None
+        first = next(i for i, each in enumerate(refined) if each is not None)
+        rows = {row.name: row for row in done.placed}
+        for name, found in self._outcomes.items():
+            if self._placed.get(name, first) == k:
+                own = _row(name, found)
+                # A photo without a place keeps the reason for which it was taken out.
+                rows[name] = own if found.trusted else rows.get(name, own)
+        return dataclasses.replace(done, placed=[*rows.values()])
+
+
+def _row(name: str, found: Localization) -> Placement:
+    return Placement(
+        name=name,
+        registered=False,
+        octave_px=found.octave_px,
+        candidates=found.candidates,
+        agreed=found.agreed,
+        error_px=found.error_px,
+        doubt="" if found.trusted else found.why or "",
+    )

@@ -1,0 +1,112 @@
+"""The road from matches to models, step by step.
+
+`walk` is the whole road. Each step is a function that is described where it is written, and what a
+step decides is decided nowhere else. A step in `Step` can be skipped by name, which says what it is
+worth (`jaxsfm bench ledger --without STEP`).
+"""
+
+import contextlib
+import logging
+from collections.abc import Callable, Collection
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxsfm.options import Step
+from jaxsfm.sfm.mapped_stage import (
+    MatchedPhotos,
+    StageCache,
+    VerifiedStage,
+    map_trusted,
+    mapper_of,
+    verify_matches,
+)
+from jaxsfm.sfm.mapping import MappedModels, Mapper
+from jaxsfm.sfm.refined_stage import Reconstructed, refine_settled
+from jaxsfm.sfm.register.lost import MatchLost, register_lost
+from jaxsfm.sfm.settled_stage import settle
+
+logger = logging.getLogger("jaxsfm")
+
+
+class Watch(NamedTuple):
+    """Who is told how far the road has been walked."""
+
+    stage: Callable[[str], AbstractContextManager[None]] = lambda _: contextlib.nullcontext()
+    """Called with the name of each stage; the block that it opens is the stage."""
+    on_image: Callable[[], None] = lambda: None
+    """Called for every photo that the mapper registers."""
+    on_pass: Callable[[], None] = lambda: None
+    """Called after every pass of the refinement."""
+
+
+def walk(
+    given: MatchedPhotos,
+    kept: StageCache,
+    database: Path,
+    *,
+    without: Collection[Step] = (),
+    match_lost: MatchLost | None = None,
+    watch: Watch | None = None,
+) -> Reconstructed:
+    """Make models of photos that were described and matched.
+
+    Args:
+      kept: stages of earlier runs, which are used again where they hold. New ones are kept there.
+      database: where to write COLMAP's database; a file there is replaced.
+      without: steps to skip.
+      match_lost: matches photos that have no place with photos that have one, at full size. None:
+        the matches that are given have to do.
+
+    Raises:
+      UserError: COLMAP fails.
+    """
+    watch = watch or Watch()
+    with watch.stage("mapping"):
+        # 1. Let COLMAP verify each pair.
+        verified = verify_matches(given, kept)
+        mapper = mapper_of(given, verified)
+        # 2. Trust the pairs on which most others agree.
+        trust = mapper.trust_votes()
+        # 3. Map them, and 4. ask whether the photos agree with the models.
+        first = map_trusted(given, verified, trust, "mapped", kept, watch.on_image)
+        # 5. Map once more, if something speaks against the models or photos are left out.
+        second = None
+        if "map-again" not in without:
+            second = _map_again(given, verified, mapper, first, kept)
+        # 6. Keep the better mapping. Split it where photos still contradict each other, and look
+        # for second places of photos.
+        settled = settle(given, verified, (first, second), kept, without=without)
+    with watch.stage("refinement"):
+        # 7. Move the keypoints to a fraction of a pixel.
+        made = refine_settled(given, verified, settled, database, kept, watch.on_pass)
+    if "register" in without or given.config.refinement is None:
+        return made
+    # 8. Register the photos that have no place. 9. The verdict follows from the checks.
+    with watch.stage("registration"):
+        return register_lost(given, settled, made, kept, match_lost)
+
+
+def _map_again(
+    given: MatchedPhotos,
+    verified: VerifiedStage,
+    mapper: Mapper,
+    first: MappedModels,
+    kept: StageCache,
+) -> MappedModels | None:
+    """A second mapping; None if nothing calls for one.
+
+    Photos that contradict each other, or their neighbours, call for other pairs. Photos that were
+    left out call for more effort with the same pairs.
+    """
+    if not given.config.checked:
+        return None
+    trust, why = None, ""
+    if first.contradicted() or first.apart(mapper.following()):
+        trust, why = mapper.trust_again(first), "photos contradict the model"
+    if trust is None:
+        trust, why = mapper.trust_thoroughly(first), "the model lacks photos"
+    if trust is None:
+        return None
+    logger.info("%s; mapping once more", why)
+    return map_trusted(given, verified, trust, "mapped-again", kept)

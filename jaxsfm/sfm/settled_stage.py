@@ -1,0 +1,188 @@
+"""The models that a run goes on with: the better mapping, split where photos contradict each other."""
+
+import dataclasses
+import functools
+import shutil
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jaxsfm.colmap.mapper import attempt_of
+from jaxsfm.colmap.model_folders import read_models, write_models
+from jaxsfm.colmap.model_images import fingerprint
+from jaxsfm.colmap.poses import model_poses
+from jaxsfm.errors import remark
+from jaxsfm.io.store import digest
+from jaxsfm.options import Step
+from jaxsfm.sfm import stage_files
+from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
+from jaxsfm.sfm.check.model_check import Alternative, ModelCheck
+from jaxsfm.sfm.checker import Checker
+from jaxsfm.sfm.mapped_stage import (
+    ALTERNATIVE,
+    DATABASE,
+    SPARSE,
+    MatchedPhotos,
+    StageCache,
+    VerifiedStage,
+    mapper_of,
+)
+from jaxsfm.sfm.mapping import MappedModels, Mapper, MappingFigures
+from jaxsfm.sfm.told_apart import told_apart
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+class SettledModels(NamedTuple):
+    """The models that a run goes on with, in the folder of their stage."""
+
+    figures: MappingFigures
+    folder: Path
+    key: str
+    """Identifies all that the models depend on."""
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database of the models."""
+        return self.folder / DATABASE
+
+    def models(self, name: str = SPARSE) -> "list[pycolmap.Reconstruction]":
+        """The models, or the `ALTERNATIVE` ones."""
+        return read_models(self.folder / name, self.database)
+
+
+class _Settled(NamedTuple):
+    """Models before they are written."""
+
+    models: "list[pycolmap.Reconstruction]"
+    checks: list[ModelCheck | None]
+    alternative: "list[pycolmap.Reconstruction]"
+
+
+def settle(
+    given: MatchedPhotos,
+    verified: VerifiedStage,
+    made: tuple[MappedModels, MappedModels | None],
+    kept: StageCache,
+    *,
+    without: Collection[Step] = (),
+) -> SettledModels:
+    """Keep the better of two mappings, split it where photos contradict each other, and look for
+    second places of its photos.
+
+    Args:
+      made: the first mapping and the second one, if there was one.
+      without: steps to skip.
+
+    Raises:
+      UserError: COLMAP fails.
+    """
+    first, second = made
+    mapper = mapper_of(given, verified)
+    best, other = first, second
+    if second is not None and second.better_than(first, mapper.following()):
+        best, other = second, first
+    attempts = [attempt_of(each.models, given.options.mapper) for each in made if each is not None]
+
+    def compute(folder: Path) -> None:
+        shutil.copyfile(best.database, folder / DATABASE)
+        found = _settled(given, mapper, best, other, without)
+        figures = MappingFigures(
+            verdicts=best.trust.verdicts,
+            attempts=attempts,
+            checks=found.checks,
+            basis=best.trust.basis,
+        )
+        write_models(found.models, folder / SPARSE)
+        write_models(found.alternative, folder / ALTERNATIVE)
+        stage_files.write_mapping(folder, figures)
+
+    models = [fingerprint(model) for each in made if each is not None for model in each.models]
+    key = digest(verified.key, models, given.config.checked, sorted(without))
+    folder = kept.folder.stage("settled", key, compute)
+    return SettledModels(stage_files.read_mapping(folder), folder, key)
+
+
+def _settled(
+    given: MatchedPhotos,
+    mapper: Mapper,
+    best: MappedModels,
+    other: MappedModels | None,
+    without: Collection[Step],
+) -> _Settled:
+    checker, parts = mapper.checker(best.database), list[list[str]]()
+    whole = best
+    if best.contradicted() and "split" not in without:
+        found = told_apart(best.models, best.checks, checker, given.options)
+        best = dataclasses.replace(best, models=found.models, checks=found.checks)
+        parts = found.told_apart
+    apart = best.apart(mapper.following())
+    checks: list[ModelCheck | None] = [
+        done
+        and dataclasses.replace(
+            done.check,
+            apart=[list(pair) for pair in sorted(apart) if done.check.photos() >= set(pair)],
+            told_apart=parts,
+        )
+        for done in best.checks
+    ]
+    if "second-places" not in without:
+        checks = _with_second_places(checker, best, checks)
+    if not checks or checks[0] is None:
+        return _Settled(best.models, checks, [])
+    shown = whole if parts else other
+    told = _alternative(shown, whole=bool(parts), check=checks[0], best=best)
+    if shown is None or told is None:
+        return _Settled(best.models, checks, [])
+    checks[0] = dataclasses.replace(checks[0], alternative=told)
+    return _Settled(best.models, checks, mapper.with_points_for_good(shown))
+
+
+def _with_second_places(
+    checker: Checker, best: MappedModels, checks: Sequence[ModelCheck | None]
+) -> list[ModelCheck | None]:
+    """The checks with the second places of photos."""
+    return [
+        done
+        and check
+        and (
+            remark(
+                "whether photos fit into the model in a second place",
+                functools.partial(checker.with_second_places, model, done, check),
+            )
+            or check
+        )
+        for model, done, check in zip(best.models, best.checks, checks, strict=True)
+    ]
+
+
+def _alternative(
+    other: MappedModels | None, *, whole: bool, check: ModelCheck, best: MappedModels
+) -> Alternative | None:
+    """What another mapping says of the best model; None if the two agree.
+
+    Args:
+      other: the mapping; None if there is no other one.
+      whole: whether the best model is a part of its largest model.
+      check: that of the best model.
+      best: the best mapping.
+    """
+    if other is None or not other.models:
+        return None
+    theirs, now = model_poses(other.models[0]), check.photos()
+    if whole:
+        elsewhere = sorted(theirs.keys() - now)
+    else:
+        ours = model_poses(best.models[0])
+        same, *others = groups({n: p for n, p in ours.items() if n in theirs}, theirs) or [[]]
+        if len(same) >= SAME_SHARE * len(ours.keys() & theirs.keys()) and not other.contradicted():
+            return None
+        elsewhere = sorted(name for group in others for name in group)
+    return Alternative(
+        basis=other.trust.basis,
+        images=len(theirs),
+        elsewhere=elsewhere,
+        contradicted=other.contradicted(),
+        whole=whole,
+    )
