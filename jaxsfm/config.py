@@ -116,10 +116,10 @@ class Config:
     enlarge: float = 1.0
     """Smaller images are enlarged by up to this factor, but not beyond `max_size`."""
     first_look: int | None = None
-    """Longer side of the working image, pixels, at which a run first describes and matches its
-    photos. Only those photos that this leaves without a place are described again at `max_size`
-    (`jaxsfm.sfm.second_look`). The refinement works at `max_size` in any case. None, or without a
-    refinement: photos are described at `max_size` from the beginning."""
+    """Longer side of the working image, pixels, at which a run describes and matches its photos.
+    Only photos that this leaves without a place are matched at `max_size`, or all photos if it
+    gives no model (`jaxsfm.runs.run_photos`). The refinement works at `max_size` in any case. None,
+    or without a refinement: photos are described at `max_size` from the beginning."""
     first_look_share: float = 1.0
     """Where `first_look` hardly reduces the median photo: this share of its longer side instead."""
     octaves: int = 1

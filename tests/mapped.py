@@ -6,7 +6,7 @@ from pathlib import Path
 import pycolmap
 
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import build_models
+from jaxsfm.colmap.mapper import run_mapper
 from jaxsfm.colmap.two_views import read_two_views, verify
 
 
@@ -23,4 +23,5 @@ def map_database(
     path: Path, options: MapOptions, *, on_image: Callable[[], None] = lambda: None
 ) -> list[pycolmap.Reconstruction]:
     """Verify and map a database; returns its models, the largest first."""
-    return build_models(path, verified(path, options), options, on_image=on_image)[0]
+    verified(path, options)
+    return run_mapper(path, options, on_image=on_image)

@@ -98,6 +98,7 @@ def judged_row(
         "verdict": "",
         "outcome": "ended in an error",
         "doubt": "",
+        "wrong": None,
         "error": "",
         "mappings": None,
         "seconds": {},
@@ -127,7 +128,8 @@ def judged_row(
         "verdict": report.verdict or "",
         "outcome": found.outcome,
         "doubt": said,
-        "mappings": getattr(report, "mappings", None),
+        "wrong": max((each.doubt for _, each in report.checked), default=None),
+        "mappings": len(report.mapping),
         "seconds": dict(report.seconds),
         "total_seconds": total,
         "times_rootsift": times,
@@ -172,14 +174,14 @@ def _run_options(options: LedgerOptions, seed: int) -> RunOptions:
         seed=seed,
         threads=options.threads,
         progress=True,
-        without=() if options.without is None else (options.without,),
+        without=options.without,
     )
 
 
 def _set_rows(each: LedgerSet, out: Path, options: LedgerOptions) -> Iterator[LedgerRow]:
     """The rows of a set, one for each seed."""
-    home, step = out / each.name, options.without
-    end = f"-without-{step}" if step else ""
+    home, left_out = out / each.name, "+".join(options.without)
+    end = f"-without-{left_out}" if left_out else ""
     folders = {seed: home / f"seed{seed}{end}" / "run" for seed in range(options.seeds)}
     if options.only_judge:
         folders = {seed: at for seed, at in folders.items() if kept_run(at) is not None}
@@ -193,7 +195,7 @@ def _set_rows(each: LedgerSet, out: Path, options: LedgerOptions) -> Iterator[Le
             if seed == 0:
                 _with_rootsift(each, run, home, report)
         rootsift = rootsift_figures(each, given, home / "seed0" / "rootsift")
-        yield {**judged_row(each, given, seed, folder, rootsift), "without": step or ""}
+        yield {**judged_row(each, given, seed, folder, rootsift), "without": left_out}
 
 
 def bench_ledger(options: LedgerOptions) -> LedgerFigures:

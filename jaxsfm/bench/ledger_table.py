@@ -51,6 +51,9 @@ class LedgerRow(TypedDict):
     outcome: LedgerOutcome
     doubt: str
     """What the run says against its models; empty if it says nothing."""
+    wrong: float | None
+    """How probably a model is wrong, as the check says; the largest of all models. None: no model
+    was checked."""
     error: str
     """Why the run ended; empty if it has a report."""
     mappings: int | None

@@ -101,9 +101,7 @@ SET_METHODS = (ROOTSIFT, REFINED_ROOTSIFT, LIGHTGLUE, *RUN_METHODS[1:])
 MAPPERS: dict[str, Mapper] = {"colmap": "incremental", "colmap-global": "global"}
 """Methods that hand the matches of `default` to COLMAP: every verified pair, to this mapper.
 
-Neither our view graph nor our refinement takes part. As for all methods, the mapper is started
-again from other initial pairs if its model lacks photos, and the global mapper is tried if the
-incremental one gives no model (`jaxsfm.colmap.mapper.build_models`).
+Neither our view graph nor our refinement takes part.
 """
 _MAPPED = dataclasses.replace(CONFIGS["default"], view_graph=False, checked=False, refinement=None)
 AMBIGUOUS_METHODS = (*SET_METHODS, *MAPPERS)

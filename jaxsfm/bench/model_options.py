@@ -175,8 +175,8 @@ class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
       seeds: How often each set is reconstructed, with seeds 0, 1, ... A rendered scene is the same
         for all of them.
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
-      without: Leave out this step of all runs. upright: photos that are stored sideways are turned.
-        map-again: the second mapping. split: models in which photos contradict each other are
+      without: Leave out these steps of all runs. upright: photos that are stored sideways are
+        turned. map-again: the second mapping. split: models in which photos contradict each other are
         split. second-places: photos are looked for in other places. register: photos without a
         place are registered in the refined models.
       out: Folder for photos that are made, for databases and for models. A later call makes only
@@ -189,7 +189,7 @@ class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
     methods: tuple[str, ...] = dataclasses.field(default=("default",), init=False)
     seeds: int = 3
     threads: int = -1
-    without: Step | None = None
+    without: tuple[Step, ...] = ()
     out: Path | None = None
     markdown: Path | None = None
     only_judge: bool = False

@@ -52,10 +52,10 @@ def ledger(bench: Unnamed[LedgerOptions]) -> int:
     """
     limit_threads(bench.threads)
     from jaxsfm.bench.ledger import bench_ledger
-    from jaxsfm.bench.ledger_table import table_lines
+    from jaxsfm.bench.ledger_curve import lines_with_curve
 
     check_writable(bench.markdown, "--markdown", (".md",))
-    return _run(bench_ledger, table_lines, bench)
+    return _run(bench_ledger, lines_with_curve, bench)
 
 
 def strecha(bench: Unnamed[StrechaOptions]) -> int:

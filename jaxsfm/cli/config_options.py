@@ -79,10 +79,10 @@ class ModelChoice(MatchingChoice):
         pairs. It is for scenes that repeat themselves. preset: as the preset says.
       refine: Number of passes of the refinement, which moves keypoints to a fraction of a pixel. 0
         switches it off. Without it, as many as the preset says.
-      first_look: Longer side, in pixels, at which photos are described and matched first. Photos
-        that find no place in this way are looked at again at --max-size. 0, or --refine 0,
-        describes all photos at --max-size. Without it, as the preset says: default takes 800, and
-        five eighths of the median photo if that has less than 1000 pixels.
+      first_look: Longer side, in pixels, at which photos are described and matched. Photos that
+        find no place in this way are matched at --max-size, and so are all photos if there is no
+        model. 0, or --refine 0, describes all photos at --max-size. Without it, as the preset says:
+        default takes 800, and five eighths of the median photo if that has less than 1000 pixels.
     """
 
     view_graph: Literal["preset", "yes", "no"] = "preset"

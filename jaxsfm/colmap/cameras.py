@@ -60,19 +60,6 @@ class Cameras:
             return {name: dataclasses.asdict(each) for name, each in known.items()}
         return dataclasses.asdict(known) if known else [self.sharing, self.model]
 
-    def each_its_own(self, images: Sequence[ImageFile]) -> "Cameras | None":
-        """The same with a camera for each photo; None unless `auto` makes most photos share one.
-
-        In a collection of a photo site a few photos share a camera (12 of the 135 of *statue*), and
-        they cannot be why the whole model is bent.
-        """
-        if self.known is not None or self.sharing != "auto":
-            return None
-        alone = sum(len(group) == 1 for group in self.groups(images))
-        if 2 * alone >= len(images):
-            return None
-        return dataclasses.replace(self, sharing="photo")
-
     def assigned(
         self, images: Sequence[ImageFile]
     ) -> list[tuple[pycolmap.Camera, list[ImageFile]]]:

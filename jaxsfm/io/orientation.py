@@ -39,11 +39,6 @@ def upright(stored: np.ndarray, orientation: int) -> np.ndarray:
     return stored.swapaxes(0, 1) if orientation in _TRANSPOSED else stored
 
 
-def as_stored(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Undo `upright`: turn the pixels (h, w, ...) of an upright photo to how they are stored."""
-    return upright(pixels, _UNDONE_BY.get(orientation, orientation))
-
-
 def to_stored(size: tuple[int, int], orientation: int) -> np.ndarray:
     """The float64 matrix (3, 3) that maps pixels of the upright photo to those of the stored one.
 

@@ -116,19 +116,6 @@ class ChosenMatches(LazyMatches):
         return self._matches[pair]
 
 
-class OverlaidMatches(LazyMatches):
-    """The matches of another mapping, some of them replaced, and others added."""
-
-    def __init__(
-        self, matches: Mapping[Pair, PairResult], others: Mapping[Pair, PairResult]
-    ) -> None:
-        super().__init__([*matches, *others])
-        self._matches, self._others = matches, others
-
-    def _load(self, pair: Pair) -> PairResult:
-        return self._others[pair] if pair in self._others else self._matches[pair]
-
-
 class PairCounts(NamedTuple):
     """The numbers of a `PairResult` without its arrays."""
 

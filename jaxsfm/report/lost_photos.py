@@ -11,6 +11,7 @@ that lost it, the numbers that decided, and what may help:
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 from jaxsfm.config import Config
 from jaxsfm.core.types import Status
@@ -25,6 +26,14 @@ from jaxsfm.report.pair_outcomes import (
 )
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, Stage
+
+
+class _Refused(NamedTuple):
+    """Why a photo has no place although places were looked for after the mapping."""
+
+    had_pose: bool
+    """Whether there was a pose, which something speaks against."""
+    why: str
 
 
 def explained(
@@ -55,7 +64,7 @@ def explained(
     return dataclasses.replace(
         report,
         view_graph=view_graph_report(groups, models[0] if models else (), pairs),
-        lost=_lost_photos(groups, models, pairs, _taken_out(report)),
+        lost=_lost_photos(groups, models, pairs, _refused(report)),
         no_model=None if models else _no_model(pairs),
     )
 
@@ -64,7 +73,7 @@ def _lost_photos(
     groups: Sequence[PhotoGroup],
     models: Sequence[Collection[str]],
     pairs: PairOutcomes,
-    taken_out: dict[str, str],
+    refused: dict[str, _Refused],
 ) -> list[LostPhoto]:
     """Every photo without a pose in the best model, with the stage that lost it.
 
@@ -75,7 +84,7 @@ def _lost_photos(
     * `no plane`: no homography had enough inliers;
     * `not connected`: no chain of trusted pairs leads to the model;
     * `no pose`: trusted pairs lead to the model, but COLMAP found no pose;
-    * `not confirmed`: COLMAP or refinement found a pose, but the photo was taken out again;
+    * `not confirmed`: COLMAP or registration found a pose, but something speaks against it;
     * `other model`: trusted pairs lead to the best model, but the photo is in a smaller one.
     """
     best_model = set(models[0]) if models else set()
@@ -94,8 +103,9 @@ def _lost_photos(
             if smaller is not None:
                 stage = "other model" if stage == "no pose" else stage
                 detail += f"; in the smaller model sparse/{smaller}"
-            elif name in taken_out:
-                stage, detail = "not confirmed", f"{detail}; {taken_out[name]}"
+            elif name in refused:
+                stage = "not confirmed" if refused[name].had_pose else stage
+                detail += f"; {refused[name].why}"
             if stage == "no pose":
                 advice = without_pose(name, own, pairs, model=bool(models))
             elif stage == "not confirmed":
@@ -122,10 +132,12 @@ def _lost_photos(
     return sorted(lost, key=lambda photo: photo.image)
 
 
-def _taken_out(report: RunReport) -> dict[str, str]:
-    """Why photos were taken out of a model, by name."""
-    why = {
-        name: "the mapper gave it a pose, but something speaks against the model that it was in"
+def _refused(report: RunReport) -> dict[str, _Refused]:
+    """Why photos were taken out of a model or not registered in it, by name."""
+    found = {
+        name: _Refused(
+            True, "the mapper gave it a pose, but something speaks against the model that it was in"
+        )
         for check in report.checks
         if check
         for group in check.told_apart
@@ -134,14 +146,20 @@ def _taken_out(report: RunReport) -> dict[str, str]:
     for each in report.refinement:
         for at in each.placed if each else ():
             if at.doubt:
-                why[at.name] = f"refinement found a place for it, but {at.doubt}"
+                before = found.get(at.name)
+                why = f"registration found no place that can be trusted: {at.doubt}"
+                found[at.name] = _Refused(
+                    had_pose=before is not None or at.candidates > 0,
+                    why=f"{before.why}; {why}" if before else why,
+                )
             elif at.held is not None:
-                why[at.name] = (
+                why = (
                     f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
                     f"{at.candidates} points that it should show, and only {at.held} points hold "
                     "it in the model"
                 )
-    return why
+                found[at.name] = _Refused(True, why)
+    return found
 
 
 def _stage(own: Sequence[PairRow], connected: bool) -> tuple[Stage, str]:

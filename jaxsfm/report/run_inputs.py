@@ -113,7 +113,7 @@ class UsedLooks:
     first_px: Count
     """The longer side of the photos at first, pixels."""
     whole: bool = False
-    """Whether no model was made of photos of this size, so that they were described at full size."""
+    """Whether photos of this size gave no model, so that they were matched at full size."""
 
     def in_words(self) -> str:
         """At what size the photos were described, in a sentence without a full stop."""

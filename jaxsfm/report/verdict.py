@@ -174,12 +174,13 @@ def _other_model(other: Alternative) -> Finding:
             f"told apart; photos contradict each other at {other.contradicted} of its points"
         )
         return Finding(text, other.elsewhere, [])
-    own: Basis = "order" if other.basis == "pairs" else "pairs"
     moved = "1 photo has" if len(other.elsewhere) == 1 else f"{len(other.elsewhere)} photos have"
     text = (
-        f"alternative/0 follows {FOLLOWS[other.basis]}, and the model follows {FOLLOWS[own]}: "
+        f"alternative/0 is another mapping, which follows {FOLLOWS[other.basis]}: "
         f"{moved} another place there ({named(other.elsewhere)})"
     )
+    if not other.elsewhere:
+        text = f"alternative/0 is another mapping, which follows {FOLLOWS[other.basis]}"
     if other.contradicted:
         text += f"; photos contradict each other at {other.contradicted} of its points"
     return Finding(text, other.elsewhere, [])

@@ -78,11 +78,12 @@ def match_pairs(
     """
     store = job.store
     with timed(seconds, "extraction"):
-        counts = {p: r.counts for p in pairs if (r := store.load_matches(p)) is not None}
-        missing = [pair for pair in pairs if pair not in counts]
-        if counts and job.progress:  # a trial of a few pairs is no news
-            logger.info("%d of %d pairs have been matched before", len(counts), len(pairs))
+        before = {p: r.counts for p in pairs if (r := store.load_matches(p)) is not None}
+        missing = [pair for pair in pairs if pair not in before]
+        if before and job.progress:  # a trial of a few pairs is no news
+            logger.info("%d of %d pairs have been matched before", len(before), len(pairs))
         lost = job.extract_missing(images_of(missing, by_name))
+        counts = {pair: before[pair] for pair in pairs_without(before, lost)}
     with timed(seconds, "matching"):
         for result in job.match_missing(by_name, pairs_without(missing, lost)):
             counts[result.pair] = result.counts

@@ -14,7 +14,7 @@ from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.intrinsics import used_cameras
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
-from jaxsfm.errors import UserError, remark
+from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.masked_images import masks_of, with_masks
@@ -182,8 +182,7 @@ def reconstruct_folder(
             folder.drop_features()
         # The page is written before the lock is released: another run there would replace the files
         # that it shows.
-        shown = out if made.models or not (out / "sparse").exists() else out / FAILED
-        remark("what the page would show", lambda: page_after_run(shown))
+        page_after_run(out if made.models or not (out / "sparse").exists() else out / FAILED)
         return report
 
 

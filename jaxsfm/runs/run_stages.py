@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from tqdm import tqdm
@@ -70,7 +71,7 @@ class RunStages:
             [[*pair, matched.store.match_key(pair)] for pair in self._chosen(matched)],
             self.external.about and self.external.about["sha256"],
         )
-        with _bars(self.seconds, len(self.images), quiet=not self.options.progress) as watch:
+        with self._watch() as watch:
             made = walk(
                 given,
                 StageCache(self.folder, key),
@@ -100,6 +101,28 @@ class RunStages:
             ),
         )
 
+    @contextlib.contextmanager
+    def _watch(self) -> Iterator[Watch]:
+        """Progress bars of the mapping and of the refinement, and the time of each stage."""
+        photos, quiet = len(self.images), not self.options.progress
+        refines = self.config.refinement is not None
+        with (
+            tqdm(total=photos, desc="mapping", unit="image", disable=quiet) as mapped,
+            tqdm(desc="refinement", unit="pass", disable=quiet or not refines) as passes,
+        ):
+
+            def stage(name: str) -> AbstractContextManager[None]:
+                # Without a refinement, its stage only copies the models.
+                return timed(self.seconds if refines or name != "refinement" else {}, name)
+
+            def on_image() -> None:
+                mapped.update(mapped.n < photos)  # several models may share images
+
+            def on_pass() -> None:
+                passes.update()
+
+            yield Watch(stage, on_image, on_pass)
+
     def write(self, made: Reconstructed, target: Path) -> Georeference | None:
         """Move the models onto the measured positions, and write them into `target`."""
         moved = self._move(made, target / DATABASE)
@@ -120,21 +143,3 @@ class RunStages:
         priors = measured.positions if geographic else measured.local(measured.frame())
         write_pose_priors(database, priors, geographic=geographic)
         return move_models(made.models, measured) if made.models else None
-
-
-@contextlib.contextmanager
-def _bars(seconds: dict[str, float], photos: int, *, quiet: bool) -> Iterator[Watch]:
-    """Progress bars of the mapping and of the refinement, and the time of each stage."""
-    with (
-        tqdm(total=photos, desc="mapping", unit="image", disable=quiet) as mapped,
-        tqdm(total=0, desc="refinement", unit="pass", disable=quiet) as passes,
-    ):
-
-        def on_image() -> None:
-            mapped.update(mapped.n < photos)  # several models may share images
-
-        def on_pass() -> None:
-            passes.total = passes.n + 1
-            passes.update()
-
-        yield Watch(lambda stage: timed(seconds, stage), on_image, on_pass)

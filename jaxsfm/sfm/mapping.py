@@ -7,8 +7,10 @@ come first in it (`jaxsfm.sfm.photo_order`). There is no third one.
 """
 
 import dataclasses
+import itertools
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +29,7 @@ from jaxsfm.sfm.check.model_check import Basis, Contradiction, ModelCheck
 from jaxsfm.sfm.checker import Checker, VerifiedPairs
 from jaxsfm.sfm.mapper_matches import mapper_matches
 from jaxsfm.sfm.photo_order import follow, neighbours, ordered, orders
-from jaxsfm.sfm.view_graph import Verdict, strengths, trusted_pairs
+from jaxsfm.sfm.view_graph import STRONG, Verdict, strengths, trusted_pairs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -70,6 +72,10 @@ class MappedModels:
             for each in done.check.contradictions
         )
 
+    def in_parts(self) -> bool:
+        """Whether a model has parts that contradict each other, or that nothing holds together."""
+        return any(done is not None and len(done.parts) > 1 for done in self.checks)
+
     def rejected(self) -> dict[Pair, Contradiction]:
         """The pairs that joined photos which contradict each other.
 
@@ -91,13 +97,25 @@ class MappedModels:
         }
 
     def consistent_pairs(self) -> int:
-        """The number of pairs of photos, matched or not, whose places nothing contradicts."""
-        sizes = [
-            len(part)
+        """The number of pairs of photos, matched or not, whose places nothing contradicts.
+
+        COLMAP's models share photos. A pair of photos that two models have counts once.
+        """
+        parts = [
+            part
             for model, done in zip(self.models, self.checks, strict=True)
             for part in (done.parts if done is not None else [registered(model)])
         ]
-        return sum(size * (size - 1) // 2 for size in sizes)
+        inside: dict[str, set[int]] = {}
+        for k, part in enumerate(parts):
+            for name in part:
+                inside.setdefault(name, set()).add(k)
+        # Photos that are in the same parts are counted together.
+        alike = Counter(frozenset(own) for own in inside.values())
+        across = itertools.combinations(alike.items(), 2)
+        return sum(count * (count - 1) // 2 for count in alike.values()) + sum(
+            count * other for (own, count), (theirs, other) in across if own & theirs
+        )
 
     def better_than(self, other: "MappedModels", following: set[Pair]) -> bool:
         """Whether these models are better. This is the only rule that compares two mappings.
@@ -243,8 +261,14 @@ class Mapper:
         return [with_all_points(model, made.database, self._options) for model in made.models]
 
     def following(self) -> set[Pair]:
-        """The verified pairs of photos that follow each other by their names."""
-        return neighbours(self.given.two_views.keys())
+        """The strong pairs of photos that follow each other by their names.
+
+        Where a photographer walks on to another place, the last photo before and the first one
+        after have a weak pair, which says nothing: photos 13 and 14 of Herz-Jesus-P25 have a
+        strength of 0.0002, and all others that follow each other 0.7 to 1.
+        """
+        strength = strengths(self._geometries())
+        return {pair for pair in neighbours(strength.keys()) if strength[pair] >= STRONG}
 
     def _geometries(self) -> dict[Pair, PairGeometry]:
         return {pair: view.geometry for pair, view in self.given.two_views.items()}

@@ -22,11 +22,6 @@ if TYPE_CHECKING:
 MIN_SHARED = 3
 """The least number of photos that two models must share. Two share a pair, which may be false in
 both models."""
-JOIN_ERROR_PX = 12.0
-"""Points of two models that are one fall together so nearly, working pixels. Before refinement,
-models are bent: of 2548 common points of two right models of *statue* (43 and 17 photos), 17 fall
-together within 2.7 pixels, 1867 within 8 and 2451 within 16. COLMAP allows as much for a photo that
-it adds."""
 MIN_COMMON = 15
 """The least number of common points that fall together: that of COLMAP's mapper for a pair."""
 MIN_SHARE = 0.5

@@ -1,4 +1,5 @@
-"""The models that a run goes on with: the better mapping, split where photos contradict each other."""
+"""The models that a run goes on with: the better mapping, split where its photos contradict each
+other."""
 
 import dataclasses
 import functools
@@ -68,8 +69,8 @@ def settle(
     *,
     without: Collection[Step] = (),
 ) -> SettledModels:
-    """Keep the better of two mappings, split it where photos contradict each other, and look for
-    second places of its photos.
+    """Keep the better of two mappings, split it where photos do not agree, and look for second
+    places of its photos.
 
     Args:
       made: the first mapping and the second one, if there was one.
@@ -113,7 +114,7 @@ def _settled(
 ) -> _Settled:
     checker, parts = mapper.checker(best.database), list[list[str]]()
     whole = best
-    if best.contradicted() and "split" not in without:
+    if best.in_parts() and "split" not in without:
         found = told_apart(best.models, best.checks, checker, given.options)
         best = dataclasses.replace(best, models=found.models, checks=found.checks)
         parts = found.told_apart

@@ -1,4 +1,9 @@
-"""Models in which photos contradict each other, taken apart into models in which none do."""
+"""Models taken apart into parts in which photos agree with each other.
+
+Photos of two parts contradict each other, or next to nothing holds them together: they do not agree
+about any surface, and they have few points in common. False pairs can join such photos, and nothing
+in them says that they belong together.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -25,7 +30,8 @@ class Parts(NamedTuple):
     """The one with most images first."""
     checks: list[Checked | None]
     told_apart: list[list[str]]
-    """The photos of each part that was taken out of a model, the largest first."""
+    """The photos of each part that was taken out of a model with photos that they contradict, the
+    largest first."""
 
 
 def told_apart(
@@ -34,7 +40,7 @@ def told_apart(
     checker: Checker,
     options: MapOptions,
 ) -> Parts:
-    """Take models apart whose photos contradict each other, until none do.
+    """Take models apart whose photos do not all agree, until all do.
 
     What is left of a model is adjusted without the photos that had been joined to it wrongly, and
     checked again. Photos of parts with fewer than `MIN_VIEWS` are in no model any more. A model
@@ -80,4 +86,7 @@ def _parts(
                 parts, names = _parts((alone, again), checker, options)
                 made += parts
         groups += names or [part]
-    return (made, groups) if made else ([whole], [])
+    if not made:
+        return [whole], []
+    contradicted = done is not None and bool(done.check.contradictions)
+    return made, groups if contradicted else []

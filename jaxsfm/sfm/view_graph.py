@@ -14,6 +14,8 @@ are compared, the strongest first:
 3. The rotations of all images are then averaged over the agreeing pairs (robustly), and a pair
    whose own rotation is further than `TOLERANCE_DEG` from them is dropped, unless it is strong:
    then its rotation may be poor (a plane, a guessed focal length), but its matches are sound.
+4. A pair that alone joins two groups of photos agrees with the averaged rotations whatever its own
+   rotation is. If it is not strong, nothing speaks for it, and it is dropped.
 
 So a false pair is trusted only where no stronger pair contradicts it. The order of images and pairs
 has no effect. On castle-P19 the rotations of false pairs are off by 75-180 deg, and their strength
@@ -27,7 +29,7 @@ from collections.abc import Collection, Iterable, Mapping
 import numpy as np
 
 from jaxsfm.colmap.two_views import PairGeometry
-from jaxsfm.io.pairs import Pair
+from jaxsfm.io.pairs import Pair, make_pair
 
 STRONG = 0.3
 """A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09 before
@@ -116,7 +118,44 @@ def trusted_pairs(
             rotation_error_deg=error,
             reason=reason,
         )
+    for pair in bridges([pair for pair, verdict in verdicts.items() if verdict.trusted]):
+        if strength[pair] < STRONG:
+            why = (
+                f"it alone joins two groups of photos, and it is weak (its strength is "
+                f"{strength[pair]:.3f} of 1)"
+            )
+            verdicts[pair] = dataclasses.replace(verdicts[pair], trusted=False, reason=why)
     return verdicts
+
+
+def bridges(pairs: Collection[Pair]) -> list[Pair]:
+    """The pairs without which a group of images would fall in two, sorted (Tarjan 1974)."""
+    beside: dict[str, list[str]] = {}
+    for a, b in pairs:
+        beside.setdefault(a, []).append(b)
+        beside.setdefault(b, []).append(a)
+    order, low, found = dict[str, int](), dict[str, int](), list[Pair]()
+    for root in sorted(beside):
+        if root in order:
+            continue
+        order[root] = low[root] = len(order)
+        stack = [(root, "", iter(beside[root]))]
+        while stack:
+            image, parent, left = stack[-1]
+            for other in left:
+                if other not in order:
+                    order[other] = low[other] = len(order)
+                    stack.append((other, image, iter(beside[other])))
+                    break
+                if other != parent:
+                    low[image] = min(low[image], order[other])
+            else:
+                stack.pop()
+                if parent:
+                    low[parent] = min(low[parent], low[image])
+                    if low[image] > order[parent]:
+                        found.append(make_pair(parent, image))
+    return sorted(found)
 
 
 Rotations = dict[str, np.ndarray]

@@ -371,7 +371,7 @@ def test_a_step_that_is_left_out_has_folders_of_its_own(tmp_path, monkeypatch):
     write_set(tmp_path)
     asked = fake_runs(monkeypatch)
     out = tmp_path / "out"
-    rows = judged_rows(tmp_path, out, only_judge=False, without="split", seeds=1)
+    rows = judged_rows(tmp_path, out, only_judge=False, without=("split",), seeds=1)
     assert [row["without"] for row in rows] == ["split"] and rows[0]["times_rootsift"] == 3
     assert [each[1] for each in asked] == ["seed0-without-split", "seed0"]
     assert asked[0][2].all_options.without == ("split",)
@@ -400,6 +400,7 @@ def row(name="cup", seed=0, outcome="right", **more):
         "half": "",
         "seed": seed,
         "without": "",
+        "wrong": None,
         "images": 10,
         "registered": 10,
         "right": 10,

@@ -54,7 +54,8 @@ def test_a_run_leaves_a_model_a_database_and_a_report(plain):
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (out / "sparse" / "0" / name).stat().st_size > 0
     assert rows(out, "select count(*) from images") == [(3,)]
-    assert set(report["seconds"]) == {"extraction", "matching", "mapping", "refinement"}
+    stages = {"extraction", "matching", "mapping", "refinement", "registration"}
+    assert set(report["seconds"]) == stages
     assert not (out / "features").exists()
 
 
@@ -141,7 +142,7 @@ def test_best_pairs_hands_on_fewer(scene, copied, plain):
 def test_refine_and_view_graph_switch_their_stages(scene, tmp_path, copied, plain):
     args = ("--intrinsics", scene / "K.txt", "--threads", "1")
     bare = run(scene, copied, *args, "--refine", "0", "--view-graph", "no")
-    assert "refinement" not in bare["seconds"] and bare["refinement"] == [None]
+    assert not {"refinement", "registration"} & {*bare["seconds"]} and bare["refinement"] == [None]
     assert all(row["view_graph"] is None for row in bare["pairs"]["each"])
     full = plain[1]
     assert len(full["refinement"][0]["passes"]) == 2
@@ -563,20 +564,17 @@ def test_a_photo_that_vanishes_before_refinement_leaves_the_mappers_model(
 def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
     scene, tmp_path, monkeypatch, capsys
 ):
-    from jaxsfm.colmap import mapper
+    from jaxsfm.sfm import mapping
 
-    build = mapper.first_models
+    build = mapping.run_mapper
 
-    def without_one(*arguments, **options):
-        made = build(*arguments, **options)
-        (image,) = [i for i in made.models[0].images.values() if i.name == "view2.png"]
-        made.models[0].deregister_frame(image.frame_id)
-        return made
+    def without_one(*arguments, **options):  # in the second mapping, too
+        models = build(*arguments, **options)
+        (image,) = [i for i in models[0].images.values() if i.name == "view2.png"]
+        models[0].deregister_frame(image.frame_id)
+        return models
 
-    monkeypatch.setattr("jaxsfm.sfm.mapper_runs.first_models", without_one)
-    monkeypatch.setattr(
-        "jaxsfm.sfm.mapper_runs.with_left_out_images", lambda made, *_, **__: made
-    )  # further runs of the mapper leave it out, too
+    monkeypatch.setattr(mapping, "run_mapper", without_one)
     report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
     assert report["models"][0]["registered"] == 3
     (placed,) = [p for p in report["refinement"][0]["placed"] if p["name"] == "view2.png"]
@@ -588,23 +586,22 @@ def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
 def test_another_model_is_written_beside_the_result_and_goes_when_there_is_none(
     scene, tmp_path, monkeypatch, capsys
 ):
-    from jaxsfm.sfm import mapped_stage
+    from jaxsfm.sfm import settled_stage
     from jaxsfm.sfm.check.model_check import Alternative
 
-    build, out = mapped_stage.build_checked_models, tmp_path / "out"
+    settled, out = settled_stage._settled, tmp_path / "out"
 
-    def two(*arguments, **options):
-        made = build(*arguments, **options)
+    def two(*arguments):
+        made = settled(*arguments)
         told = Alternative(basis="order", images=3, elsewhere=["view2.png"], contradicted=0)
-        checks = [dataclasses.replace(made.figures.checks[0], alternative=told)]
-        figures = dataclasses.replace(made.figures, checks=checks)
-        return made._replace(figures=figures, alternative=made.models)
+        checks = [dataclasses.replace(made.checks[0], alternative=told)]
+        return made._replace(checks=checks, alternative=made.models)
 
     args = ["reconstruct", scene / "images", "--out", out, "--intrinsics", scene / "K.txt"]
     args = [str(a) for a in args]
-    monkeypatch.setattr(mapped_stage, "build_checked_models", two)
+    monkeypatch.setattr(settled_stage, "_settled", two)
     assert main(args) == 3
-    assert "other model      alternative/0 follows the order" in capsys.readouterr().out
+    assert "alternative/0 is another mapping, which follows the order" in capsys.readouterr().out
     assert (out / "alternative" / "0" / "images.bin").is_file()
     page = (out / "report.html").read_text()
     assert "<b>Another model</b> of these photos" in page and "Photos that fit" not in page
@@ -669,6 +666,15 @@ def test_no_description_of_an_option_is_broken_where_the_source_wraps():
         assert attributes and not re.search(r"\n {4}", attributes), choice.__name__
     assert "Folder with the photos; sub-folders are included.\n" in COMMANDS["pairs"].__doc__
     assert "convolutions: Number format in which the network multiplies." in MatchingChoice.__doc__
+
+
+def test_the_mappers_are_those_of_colmap(scene, tmp_path, capsys):
+    args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out"), "--mapper"]
+    with pytest.raises(SystemExit) as ended:
+        main([*args, "parts"])
+    assert ended.value.code == 2 and not (tmp_path / "out").exists()
+    said = capsys.readouterr().err
+    assert "incremental" in said and "global" in said and "parts" in said
 
 
 def test_every_option_has_a_description(capsys, monkeypatch):

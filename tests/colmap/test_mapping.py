@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -14,7 +15,7 @@ from jaxsfm.colmap import mapper
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import drop_pairs, write_database
 from jaxsfm.colmap.map_options import LEAST_PARALLAX, MapOptions, narrowest_angle_deg
-from jaxsfm.colmap.mapper import build_models, initial_pairs
+from jaxsfm.colmap.mapper import attempt_of, build_models, complete, initial_pairs
 from jaxsfm.colmap.model_images import registered, take_out
 from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views
 from jaxsfm.core.types import Status
@@ -67,8 +68,8 @@ def runs(monkeypatch, outcomes):
     """`run_mapper` gives these outcomes in turn; the (mapper, pair) of every call are kept."""
     calls, left = [], list(outcomes)
 
-    def run(database, options, start, on_image):
-        calls.append((options.mapper, start.pair))
+    def run(database, options, *, start=None):
+        calls.append((options.mapper, start))
         return left.pop(0)
 
     monkeypatch.setattr(mapper, "run_mapper", run)
@@ -80,67 +81,63 @@ PAIRS = {pair: two_view(100 - k) for k, pair in enumerate(exhaustive_pairs("abcd
 
 def test_a_complete_model_needs_one_attempt(monkeypatch, tmp_path):
     calls = runs(monkeypatch, [[model("abcdef")]])
-    models, attempts = build_models(tmp_path / "d.db", PAIRS, ONE)
+    models = build_models(tmp_path / "d.db", PAIRS, ONE)
     assert calls == [("incremental", None)] and models[0].num_reg_images() == 6
-    assert [a.registered for a in attempts] == [[6]]
 
 
 def test_images_that_nothing_connects_are_no_reason_to_try_again(monkeypatch, tmp_path):
     calls = runs(monkeypatch, [[model("abc"), model("de")]])
     apart = {p: two_view() for p in [("a", "b"), ("a", "c"), ("d", "e")]}
-    assert len(build_models(tmp_path / "d.db", apart, ONE)[0]) == 2 and len(calls) == 1
+    assert len(build_models(tmp_path / "d.db", apart, ONE)) == 2 and len(calls) == 1
 
 
 def test_connected_images_left_out_are_tried_from_other_pairs_and_the_best_counts(
     monkeypatch, tmp_path
 ):
     calls = runs(monkeypatch, [[model("ab")], [model("abcd")], [model("abc")]])
-    models, attempts = build_models(tmp_path / "d.db", PAIRS, ONE)
+    models = build_models(tmp_path / "d.db", PAIRS, ONE)
     assert [initial for _, initial in calls] == [None, ("a", "b"), ("c", "d")]  # each image once
-    assert models[0].num_reg_images() == 4
-    assert [a.registered for a in attempts] == [[2], [4], [3]]
+    assert [m.num_reg_images() for m in models] == [4]
 
 
-def test_after_a_draft_the_whole_run_is_tried_before_other_pairs(monkeypatch, tmp_path):
-    drafts, left = [], [[model("ab")], [model("abc")], [model("abcdef")], [model("ab")]]
-
-    def run(database, options, start, on_image):
-        drafts.append((options.draft, start.pair))
-        return left.pop(0)
-
-    monkeypatch.setattr(mapper, "run_mapper", run)
-    draft = dataclasses.replace(ONE, draft=True)
-    models, attempts = build_models(tmp_path / "d.db", PAIRS, draft)
-    assert drafts == [(True, None), (False, None), (False, ("a", "b"))]
-    assert models[0].num_reg_images() == 6 and [a.registered for a in attempts] == [[2], [3], [6]]
+def test_the_global_mapper_has_no_first_pair_and_runs_once(monkeypatch, tmp_path):
+    calls = runs(monkeypatch, [[model("ab")]])
+    options = dataclasses.replace(ONE, mapper="global")
+    assert len(build_models(tmp_path / "d.db", PAIRS, options)) == 1
+    assert calls == [("global", None)]
 
 
-def test_after_a_draft_no_connected_image_may_be_missing(monkeypatch, tmp_path):
-    """Without a draft, one of twelve is no reason to try again. A night photo is one of many."""
-    names = "abcdefghijkl"
-    chain = {pair: two_view() for pair in zip(names[:-1], names[1:], strict=True)}
-    draft = dataclasses.replace(ONE, draft=True)
-    calls = runs(monkeypatch, [[model(names[:-1])], [model(names)]])
-    assert len(build_models(tmp_path / "d.db", chain, draft)[1]) == 2 == len(calls)
-    calls = runs(monkeypatch, [[model(names[:-1])], [model(names[:-1])]])
-    assert len(build_models(tmp_path / "d.db", chain, draft)[1]) == 2 == len(calls)
-    calls = runs(monkeypatch, [[model(names)]])
-    assert len(build_models(tmp_path / "d.db", chain, draft)[1]) == 1 == len(calls)
+def test_what_a_run_of_the_mapper_made_is_told_in_numbers(monkeypatch):
+    attempt = attempt_of([model("abcd"), model("xy")], "incremental")  # pyright: ignore
+    assert (attempt.mapper, attempt.initial_pair) == ("incremental", None)
+    assert attempt.registered == [4, 2]
 
 
-@pytest.mark.parametrize("draft", [True, False])
 @pytest.mark.parametrize(
-    ("images", "registered", "tried"), [(41, 21, False), (41, 20, True), (40, 21, True)]
+    ("images", "registered", "whole"),
+    [
+        (10, 9, True),
+        (10, 8, False),
+        (40, 36, True),
+        (40, 35, False),
+        (41, 21, True),
+        (41, 20, False),
+    ],
 )
-def test_of_many_images_half_may_be_missing(
-    monkeypatch, tmp_path, draft, images, registered, tried
+def test_a_tenth_may_be_missing_and_half_of_many_images(
+    monkeypatch, tmp_path, images, registered, whole
 ):
     names = "".join(chr(200 + k) for k in range(images))
     chain = {pair: two_view() for pair in zip(names[:-1], names[1:], strict=True)}
-    calls = runs(monkeypatch, [[model(names[:registered])]] * 5)
-    options = dataclasses.replace(ONE, draft=draft)
-    build_models(tmp_path / "d.db", chain, options)
-    assert (len(calls) > 1) == tried
+    found: list[Any] = [model(names[:registered])]
+    assert complete(found, chain.keys()) == whole
+    calls = runs(monkeypatch, [found] * 5)
+    build_models(tmp_path / "d.db", chain, ONE)
+    assert (len(calls) == 1) == whole
+
+
+def test_without_a_model_what_pairs_connect_is_missing():
+    assert complete([], []) and not complete([], [("a", "b")])
 
 
 def test_a_draft_is_adjusted_less_often_and_takes_no_image_for_a_single_pair():
@@ -187,22 +184,13 @@ def test_only_a_draft_asks_for_more_parallax(monkeypatch, tmp_path, scene, draft
     assert (p.mapper.filter_min_tri_angle > own) == draft
 
 
-def test_without_any_model_the_global_mapper_is_the_last_try(monkeypatch, tmp_path):
-    calls = runs(monkeypatch, [[], [], [], [model("abc")]])
-    models, attempts = build_models(tmp_path / "d.db", PAIRS, ONE)
-    assert [mapper for mapper, _ in calls] == ["incremental"] * 3 + ["global"]
-    assert models and attempts[-1].mapper == "global"
-    calls = runs(monkeypatch, [[]])
-    assert build_models(tmp_path / "d.db", {}, ONE)[0] == [] and len(calls) == 1
-
-
 def test_a_model_of_images_that_a_larger_one_has_is_left_out(monkeypatch, tmp_path):
     """Of two models of the same images, the one with more points stays."""
     found = [model("abc"), model("abcde"), model("fgh", 5), model("fgh", 9), model("xa")]
     monkeypatch.setattr(
         mapper.pycolmap, "incremental_mapping", lambda *_, **__: dict(enumerate(found))
     )
-    models = mapper.first_models(tmp_path / "d.db", ONE).models
+    models = mapper.run_mapper(tmp_path / "d.db", ONE)
     assert models == [found[1], found[3], found[4]]
 
 
@@ -240,7 +228,7 @@ def test_a_planar_scene_is_mapped_whole(tmp_path, scene):
     write_database(tmp_path / "d.db", scene.images, results, scene.cameras)
     two_views = verified(tmp_path / "d.db", ONE)
     assert all(view.planar for view in two_views.values())
-    models, _ = build_models(tmp_path / "d.db", two_views, ONE)
+    models = build_models(tmp_path / "d.db", two_views, ONE)
     assert models[0].num_reg_images() == 5
     assert models[0].compute_mean_reprojection_error() < 0.01
 
@@ -273,7 +261,7 @@ def test_dropped_pairs_are_gone_for_the_mapper_but_their_matches_stay(tmp_path, 
     assert sorted(left) == [pair for pair in all_pairs if pair not in dropped]
     with pycolmap.Database.open(path) as db:
         assert len(db.read_all_matches()[0]) == len(all_pairs)
-    models, _ = build_models(path, left, ONE)
+    models = build_models(path, left, ONE)
     assert lonely not in {models[0].image(i).name for i in models[0].reg_image_ids()}
 
 
@@ -284,7 +272,7 @@ def test_a_given_initial_pair_gives_the_same_scene(tmp_path, scene, initial):
         assert map_database(tmp_path / "d.db", ONE)[0].num_reg_images() == 5
         return
     pair = initial_pairs(verified(tmp_path / "d.db", ONE))[initial]
-    assert mapper.run_mapper(tmp_path / "d.db", ONE, mapper.Start(pair))[0].num_reg_images() == 5
+    assert mapper.run_mapper(tmp_path / "d.db", ONE, start=pair)[0].num_reg_images() == 5
 
 
 def test_a_given_pair_gives_one_model_not_one_per_try(tmp_path, scene):
@@ -300,21 +288,14 @@ def test_a_given_pair_gives_one_model_not_one_per_try(tmp_path, scene):
     write_database(path, small + scene.images, scene.results | other, scene.cameras)
     two_views = verified(path, ONE)
     pair = next(p for p in initial_pairs(two_views) if p[0] in scene.names)
-    assert [m.num_reg_images() for m in mapper.run_mapper(path, ONE, mapper.Start(pair))] == [5]
-    assert [m.num_reg_images() for m in build_models(path, two_views, ONE)[0]] == [5, 3]
+    assert [m.num_reg_images() for m in mapper.run_mapper(path, ONE, start=pair)] == [5]
+    assert [m.num_reg_images() for m in build_models(path, two_views, ONE)] == [5, 3]
 
 
 def test_models_of_other_images_stay_beside_a_better_attempt(monkeypatch, tmp_path):
     runs(monkeypatch, [[model("ab"), model("xy")], [model("abcdef")]])
-    models, _ = build_models(tmp_path / "d.db", PAIRS, ONE)
+    models = build_models(tmp_path / "d.db", PAIRS, ONE)
     assert [m.names for m in models] == [list("abcdef"), list("xy")]
-
-
-def test_one_missing_image_of_many_is_no_reason_to_try_again(monkeypatch, tmp_path):
-    names = [f"{k:02d}" for k in range(30)]
-    chain = {pair: two_view() for pair in zip(names, names[1:], strict=False)}
-    calls = runs(monkeypatch, [[Model(names=names[:-1], points=9)]])
-    assert len(build_models(tmp_path / "d.db", chain, ONE)[1]) == 1 == len(calls)
 
 
 def test_images_that_are_taken_out_leave_no_point_with_fewer_than_two_observations(rendered):

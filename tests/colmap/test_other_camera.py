@@ -107,3 +107,29 @@ def test_a_rotation_is_no_distance():
     longer.params = [*(1.01 * np.asarray(longer.params[:2])), *longer.params[2:]]
     corner = np.hypot(TRUTH.width, TRUTH.height) / 2
     assert 0.003 * corner < camera_distance(TRUTH, longer) < 0.01 * corner
+
+
+def folding() -> pycolmap.Camera:
+    """A camera whose distortion folds: it sees no direction at the corners of a photo."""
+    lens = pycolmap.Camera(camera_id=1, model="OPENCV", width=SIZE[0], height=SIZE[1])
+    lens.params = [*TRUTH.params, -2.0, 0.0, 0.0, 0.0]
+    corner = np.asarray(lens.cam_from_img(np.zeros((1, 2))))
+    assert not np.isfinite(corner).all()
+    return lens
+
+
+def test_a_camera_whose_distortion_folds_is_infinitely_far_from_any_other():
+    lens = folding()
+    assert camera_distance(lens, TRUTH) == camera_distance(TRUTH, lens) == np.inf
+    assert camera_distance(lens, lens) == np.inf
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_photos_speak_for_no_camera_whose_distortion_folds(rendered, monkeypatch, which):
+    """An adjustment can leave what a lens can be, of one half of the points or of both."""
+    halves = [camera(), camera()]
+    for half in halves:
+        half.model, half.params = pycolmap.CameraModelId.OPENCV, [*TRUTH.params, *[0.0] * 4]
+    halves[which] = folding()
+    monkeypatch.setattr(module, "_adjusted", lambda model, part, threads: halves[part])
+    assert other_camera(held_with(rendered, 1.03), threads=1) is None

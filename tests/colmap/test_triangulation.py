@@ -12,7 +12,7 @@ from jaxsfm.colmap import triangulation
 from jaxsfm.colmap.database import read_images, read_matches, write_database
 from jaxsfm.colmap.inliers import keep_inliers, read_inliers
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import build_models
+from jaxsfm.colmap.mapper import run_mapper
 from jaxsfm.colmap.model_images import registered, take_out
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.triangulation import with_all_points
@@ -102,8 +102,8 @@ def test_kept_inliers_are_all_that_changes(database, few):
 
 
 def test_a_model_of_few_matches_gets_the_points_of_all_and_keeps_its_poses(database, few):
-    every = build_models(database, {}, ONE).models[0]
-    model = build_models(few, {}, ONE).models[0]
+    every = run_mapper(database, ONE)[0]
+    model = run_mapper(few, ONE)[0]
     before, points = model_poses(model), model.num_points3D()
     assert points < 0.3 * every.num_points3D()
     whole = with_all_points(model, database, ONE)
@@ -118,7 +118,7 @@ def test_a_model_of_few_matches_gets_the_points_of_all_and_keeps_its_poses(datab
 
 
 def test_images_without_a_pose_stay_without_one(database, few):
-    model = build_models(few, {}, ONE).models[0]
+    model = run_mapper(few, ONE)[0]
     gone = sorted(registered(model))[0]
     take_out(model, {gone})
     whole = with_all_points(model, database, ONE)
@@ -126,7 +126,7 @@ def test_images_without_a_pose_stay_without_one(database, few):
 
 
 def test_cameras_that_were_adjusted_stay_as_they_are(database, few):
-    model = build_models(few, {}, MapOptions(threads=1)).models[0]
+    model = run_mapper(few, MapOptions(threads=1))[0]
     for camera in model.cameras.values():
         camera.params = [*(1.01 * np.asarray(camera.params[:1])), *camera.params[1:]]
     whole = with_all_points(model, database, MapOptions(threads=1))
@@ -135,7 +135,7 @@ def test_cameras_that_were_adjusted_stay_as_they_are(database, few):
 
 
 def test_a_file_that_is_no_database_is_named(tmp_path, few):
-    model = build_models(few, {}, ONE).models[0]
+    model = run_mapper(few, ONE)[0]
     broken = tmp_path / "broken.db"
     broken.write_bytes(b"no database")
     with pytest.raises(UserError, match=r"broken\.db: COLMAP failed"):

@@ -9,8 +9,8 @@ from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import DamagedImage, ImageFile
-from jaxsfm.io.looks import Looks, SavedMatches
 from jaxsfm.io.pairs import PairResult
+from jaxsfm.io.saved_matches import SavedMatches
 from jaxsfm.io.store import Store
 
 PAIRS = [("a.jpg", "b.jpg"), ("a b", "c"), ("a", "b c"), ("new\nline", "日本"), ("x", "\udcff")]
@@ -170,7 +170,7 @@ def test_saved_matches_are_read_when_asked_for(tmp_path):
     pairs = [("a.jpg", "b.jpg"), ("a.jpg", "c.jpg")]
     for n, pair in enumerate(pairs, start=3):
         folder.save_matches(result(pair, n))
-    saved = SavedMatches(Looks(folder), pairs)
+    saved = SavedMatches(folder, pairs)
     assert list(saved) == pairs and len(saved) == 2
     assert_same(saved[pairs[1]], result(pairs[1], 4))
     assert ("b.jpg", "c.jpg") not in saved and saved.get(("b.jpg", "c.jpg")) is None

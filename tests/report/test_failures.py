@@ -243,33 +243,58 @@ def test_an_image_that_refinement_took_out_says_what_was_missing():
     assert "photos between b - c" in row["help"][-1]["reason"]
 
 
-def test_an_image_that_refinement_placed_and_took_out_says_what_speaks_against_its_place():
+@pytest.mark.parametrize(
+    ("verified", "candidates", "stage"),
+    [
+        (42, 9, "not confirmed"),
+        (42, 0, "no pose"),
+        (0, 9, "not confirmed"),
+        (0, 0, "not connected"),
+    ],
+)
+def test_an_image_that_registration_refused_says_why(verified, candidates, stage):
+    """Without a pose, it is as lost as it was before."""
     tried = {
         ("a", "b"): counts(Status.VERIFIED, 500, 400),
         ("b", "c"): counts(Status.VERIFIED, 90, 60),
     }
     reason = "its matches with its neighbour b do not agree with it"
-    at = Placement(name="c", registered=False, octave_px=1, candidates=9, agreed=8, error_px=0.1)
-    figures = RefinementFigures(passes=[], placed=[replace(at, doubt=reason)])
+    placed = Placement(
+        name="c",
+        registered=False,
+        octave_px=None,
+        candidates=candidates,
+        agreed=0,
+        error_px=None,
+        doubt=reason,
+    )
+    figures = RefinementFigures(passes=[], placed=[placed])
     found = explained(
-        "abc", tried, {("a", "b"): 300, ("b", "c"): 42}, [["a", "b"]], refinement=[figures]
+        "abc", tried, {("a", "b"): 300, ("b", "c"): verified}, [["a", "b"]], refinement=[figures]
     )
     (row,) = found["lost"]
+    assert row["stage"] == stage
+    assert row["detail"].endswith(f"; registration found no place that can be trusted: {reason}")
+
+
+def test_an_image_that_was_told_apart_and_then_refused_says_both():
+    tried = {("a", "b"): counts(Status.VERIFIED, 500, 400)}
+    tried |= {("b", "c"): counts(Status.VERIFIED, 90, 60)}
+    refused = Placement(
+        name="c", registered=False, octave_px=None, candidates=0, agreed=0, error_px=None, doubt="X"
+    )
+    told = [["a", "b"], ["c"]]
+    (row,) = explained(
+        "abc",
+        tried,
+        dict.fromkeys(tried, 42),
+        [["a", "b"]],
+        refinement=[RefinementFigures(passes=[], placed=[refused])],
+        checks=[ModelCheck(groups=[], contradictions=[], other_places=[], told_apart=told)],
+    )["lost"]
     assert row["stage"] == "not confirmed"
-    assert row["detail"].endswith(f"; refinement found a place for it, but {reason}")
-
-
-def test_an_image_that_its_neighbours_do_not_agree_with_says_so():
-    tried = {
-        ("a", "b"): counts(Status.VERIFIED, 500, 400),
-        ("b", "c"): counts(Status.VERIFIED, 90, 60),
-    }
-    check = ModelCheck(groups=[["a", "b"]], contradictions=[], other_places=[], taken_out=["c"])
-    found = explained(
-        "abc", tried, {("a", "b"): 300, ("b", "c"): 42}, [["a", "b"]], checks=[None, check]
-    )
-    (row,) = found["lost"]
-    assert row["stage"] == "not confirmed" and "photos before and after it" in row["detail"]
+    assert "speaks against the model that it was in; registration" in row["detail"]
+    assert row["detail"].endswith(": X")
 
 
 def test_an_image_that_contradicts_the_model_it_was_in_says_so():

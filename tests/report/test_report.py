@@ -6,6 +6,7 @@ import pytest
 
 from jaxsfm.io.images import ImageError, inspect_image
 from jaxsfm.report.finished_run import masks_folder
+from jaxsfm.report.run_inputs import UsedLooks
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.summary import summary_lines
 
@@ -145,39 +146,20 @@ def test_skipped_and_lost_images_have_one_line_each_whatever_their_names(tmp_pat
     ]
 
 
-def test_a_masked_sky_is_said_and_its_masks_are_found_in_the_work_folder():
-    """Otherwise the masks are those of the user, if there are any."""
-    masked = report(masked_sky=3)
-    said = "sky              masked in 3 photos, which gave a better model (the masks are in sky)"
-    assert said in summary_lines(masked)
-    assert not any(line.startswith("sky") for line in summary_lines(report()))
-    home = Path("out")
-    assert masks_folder(masked, home) == home / "sky"
-    assert masks_folder(report(), home) is None
-    own = report(options=OPTIONS | {"masks": "/m"})
-    assert masks_folder(own, home) == Path("/m")
+def test_the_masks_of_a_run_are_those_of_the_user():
+    assert masks_folder(report()) is None
+    assert masks_folder(report(options=OPTIONS | {"masks": "/m"})) == Path("/m")
 
 
 @pytest.mark.parametrize(
-    ("found", "said"),
+    ("whole", "said"),
     [
-        ({}, "all photos found a place with descriptions at 800 px"),
-        (
-            {"photos": ["a"], "again": [["a", "b"], ["a", "c"]]},
-            "1 photo found no sure place at 800 px; 2 pairs were matched again at full size",
-        ),
-        (
-            {"photos": ["a", "b"], "again": [["a", "b"]], "whole": True},
-            "2 photos found no sure place at 800 px; all pairs were matched again at full size",
-        ),
-        (
-            {"photos": ["a"], "again": [["a", "b"]], "whole": True, "in_vain": True},
-            "1 photo found no sure place at 800 px; all pairs were matched again at full size, "
-            "which gave no better model",
-        ),
+        (False, "photos were described at 800 px"),
+        (True, "no model was made of photos of 800 px, so they were matched at full size"),
     ],
 )
-def test_what_the_first_look_found_is_said(found, said):
-    lines = summary_lines(report(looks={"first_px": 800} | found))
+def test_at_what_size_photos_were_described_is_said(whole, said):
+    assert UsedLooks(first_px=800, whole=whole).in_words() == said
+    lines = summary_lines(report(looks={"first_px": 800, "whole": whole}))
     assert f"looks            {said}" in lines
     assert not any(line.startswith("looks") for line in summary_lines(report()))

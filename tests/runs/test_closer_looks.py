@@ -10,7 +10,6 @@ from pair_results import counts, job_and_images, result
 
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageError, ImageFile
-from jaxsfm.io.pairs import ChosenMatches, OverlaidMatches
 from jaxsfm.io.store import Store
 from jaxsfm.runs import closer_looks
 from jaxsfm.runs.closer_looks import CLOSER, look_closer, pairs_to_look_at, without_matches
@@ -98,17 +97,3 @@ def test_a_pair_without_matches_has_its_counts_of_tentative_matches():
     bare = without_matches(result(("a", "b")))
     assert bare.num_inliers == 0 == len(bare.homographies) == len(bare.cells)
     assert bare.num_tentative == 60 and bare.status == Status.NO_PLANE
-
-
-def test_overlaid_matches_replace_those_of_the_same_pair_and_add_others():
-    ours = {("a", "b"): result(("a", "b"), 3), ("a", "c"): result(("a", "c"), 4)}
-    theirs = {("a", "c"): result(("a", "c"), 6), ("b", "c"): result(("b", "c"), 7)}
-    found = OverlaidMatches(ChosenMatches(ours, ours), theirs)
-    assert {pair: each.num_inliers for pair, each in found.items()} == {
-        ("a", "b"): 3,
-        ("a", "c"): 6,
-        ("b", "c"): 7,
-    }
-    assert len(found) == 3 and ("b", "d") not in found
-    with pytest.raises(KeyError):
-        found["b", "d"]

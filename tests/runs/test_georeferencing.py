@@ -60,8 +60,8 @@ def placed(plain, scene, tmp_path_factory) -> Placed:
         raise AssertionError("a stage was computed again")
 
     with pytest.MonkeyPatch.context() as patch:
-        for stage in ("verify", "build_checked_models"):
-            patch.setattr(mapped_stage, stage, never)
+        patch.setattr(mapped_stage, "verify", never)
+        patch.setattr(mapped_stage.Mapper, "map", never)
         patch.setattr(refined_stage, "refine_models", never)
         options = ["--georeference", str(table), "--reference", str(scene / "reference")]
         assert again(run, scene, *options) == 0

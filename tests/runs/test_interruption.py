@@ -38,7 +38,7 @@ def interrupt_after(monkeypatch, owner, name: str, calls: int) -> list[int]:
     [
         ("extraction", Store, "save_features", 1),
         ("matching", Store, "save_matches", 2),
-        ("mapping", jaxsfm.runs.run_stages, "map_matches", 0),
+        ("mapping", jaxsfm.runs.run_stages, "walk", 0),
     ],
 )
 @pytest.mark.slow

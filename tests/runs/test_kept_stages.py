@@ -28,7 +28,7 @@ def counted(monkeypatch) -> dict[str, int]:
     count(Store, "save_features", "extract")
     count(Store, "save_matches", "match")
     count(mapped_stage, "verify", "verify")
-    count(mapped_stage, "build_checked_models", "map")
+    count(mapped_stage.Mapper, "map", "map")
     count(refined_stage, "refine_models", "refine")
     return counts
 

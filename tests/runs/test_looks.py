@@ -1,24 +1,26 @@
-"""A run that describes its photos at a small size first."""
+"""A run that describes its photos at a small size."""
 
+import dataclasses
 import json
 import shutil
-import sqlite3
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 import pytest
 
 from jaxsfm.cli.main import main
-from jaxsfm.io.looks import SECOND_CELLS
+from jaxsfm.config import preset
 from jaxsfm.io.store import Store
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.page.close_ups import close_ups
 from jaxsfm.report.page.pair_pictures import pair_pictures
 from jaxsfm.runs import run_stages
-from jaxsfm.sfm.second_look import SecondLook
+from jaxsfm.sfm.mapped_stage import MatchedPhotos
+from jaxsfm.sfm.refined_stage import Reconstructed
 
 FIRST_PX = 200
-"""The longer side of the photos in the first look; they have 320 pixels."""
+"""The longer side of the photos when they are described; they have 320 pixels."""
 MODEL = ("cameras.bin", "images.bin", "points3D.bin")
 
 pytestmark = pytest.mark.slow
@@ -34,21 +36,15 @@ def run(scene: Path, out: Path, *args: str) -> dict:
 
 @pytest.fixture(scope="module")
 def looked(scene, tmp_path_factory) -> tuple[Path, dict]:
-    """A run whose first look settles all photos, and its report."""
+    """A run in which all photos find a place, and its report."""
     out = tmp_path_factory.mktemp("looked") / "out"
     return out, run(scene, out)
 
 
-def test_where_the_first_look_settles_all_photos_nothing_is_described_at_full_size(looked):
+def test_where_all_photos_find_a_place_none_is_described_at_full_size(looked):
     out, report = looked
     assert report["models"][0]["registered"] == 3
-    assert report["looks"] == {
-        "first_px": FIRST_PX,
-        "photos": [],
-        "again": [],
-        "whole": False,
-        "in_vain": False,
-    }
+    assert report["looks"] == {"first_px": FIRST_PX, "whole": False}
     # One pass more than the preset has, at full size.
     assert len(report["refinement"][0]["passes"]) == 3
     assert len(list((out / "matches").rglob("*.safetensors"))) == 3
@@ -61,7 +57,7 @@ def test_the_refinement_works_at_full_size(looked):
     assert model.compute_mean_reprojection_error() < 0.2
 
 
-def test_pages_show_the_matches_and_the_cells_of_the_first_look(looked):
+def test_pages_show_the_matches_and_the_cells_of_photos_at_a_small_size(looked):
     found = read_run(looked[0])
     pictures, _ = pair_pictures(found)
     assert pictures
@@ -80,75 +76,28 @@ def test_the_same_run_again_computes_nothing(looked, scene, tmp_path, monkeypatc
     assert run(scene, out)["models"] == looked[1]["models"]
 
 
-def test_a_second_look_at_everything_gives_what_one_look_gives(
+def test_photos_that_give_no_model_at_a_small_size_are_matched_at_full_size(
     looked, plain, scene, tmp_path, monkeypatch
 ):
-    """The first look leaves nothing behind."""
+    """The model is that of a run which describes its photos at full size from the beginning."""
     out = Path(shutil.copytree(looked[0], tmp_path / "out"))
+    sizes, walk = [], run_stages.walk
 
-    def everything(counts, photos, settled, trusted, **_):
-        return SecondLook(sorted(photos), sorted(counts), whole=True)
+    def no_model_at_first(given: MatchedPhotos, *args: Any, **options: Any) -> Reconstructed:
+        sizes.append(given.described.max_size)
+        made = walk(given, *args, **options)
+        if sizes[1:]:
+            return made
+        mapping = dataclasses.replace(made.mapping, checks=[])
+        return dataclasses.replace(made, mapping=mapping, models=[], refinement=[])
 
-    monkeypatch.setattr(run_stages, "second_look", everything)
+    monkeypatch.setattr(run_stages, "walk", no_model_at_first)
     report = run(scene, out)
-    assert report["looks"]["whole"] and len(report["looks"]["again"]) == 3
+    assert sizes == [FIRST_PX, preset("default").max_size]
+    assert report["looks"] == {"first_px": FIRST_PX, "whole": True}
+    assert report["pairs"] == plain[1]["pairs"] and report["models"] == plain[1]["models"]
     for name in MODEL:
         one, two = (folder / "sparse" / "0" / name for folder in (plain[0], out))
         assert one.read_bytes() == two.read_bytes()
-    assert report["pairs"] == plain[1]["pairs"]
-
-
-def test_a_second_look_at_one_pair_adds_its_matches_to_those_of_the_first_one(
-    looked, plain, scene, tmp_path, monkeypatch
-):
-    out = Path(shutil.copytree(looked[0], tmp_path / "out"))
-    first, second, third = sorted(plain[1]["identity"]["images"])
-
-    def one_pair(counts, photos, settled, trusted, **_):
-        return SecondLook([third], [(second, third)], whole=False)
-
-    monkeypatch.setattr(run_stages, "second_look", one_pair)
-    report = run(scene, out)
-    assert report["looks"]["photos"] == [third] and not report["looks"]["whole"]
-    once, full, both = (
-        {tuple(row["pair"]): row["inliers"] for row in each["pairs"]["each"]}
-        for each in (looked[1], plain[1], report)
-    )
-    again = (second, third)
-    assert both == once | {again: once[again] + full[again]}
-    with sqlite3.connect(out / "database.db") as db:
-        written = db.execute("select sum(rows) from matches").fetchone()[0]
-    db.close()
-    assert written == sum(both.values())
-    found = read_run(out)
-    united, once = map(found.matches.load_matches, (again, (first, second)))
-    assert united is not None and ((united.cells >= SECOND_CELLS).sum(0) == full[again]).all()
-    assert once is not None and (once.cells < SECOND_CELLS).all()
-    assert report["models"][0]["registered"] == 3
-    assert pair_pictures(found)[0] and close_ups(found)
-
-
-def test_the_model_of_the_first_look_stays_if_the_second_one_gives_no_better_one(
-    looked, scene, tmp_path, monkeypatch
-):
-    """At full size, a photo is lost."""
-    out = Path(shutil.copytree(looked[0], tmp_path / "out"))
-    third = sorted(looked[1]["identity"]["images"])[2]
-
-    def everything(counts, photos, settled, trusted, **_):
-        return SecondLook([third], sorted(counts), whole=True)
-
-    monkeypatch.setattr(run_stages, "second_look", everything)
-    photos = run_stages.MappedRun.photos.func
-
-    def without_one(mapped):
-        lost = {third} if mapped.cache.suffix else set()
-        return [names - lost for names in photos(mapped)]
-
-    monkeypatch.setattr(run_stages.MappedRun, "photos", property(without_one))
-    report = run(scene, out)
-    assert report["looks"]["in_vain"] and report["looks"]["whole"]
-    for key in ("models", "pairs", "refinement"):
-        assert report[key] == looked[1][key]
     found = read_run(out)
     assert pair_pictures(found)[0] and close_ups(found)

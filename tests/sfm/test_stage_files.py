@@ -48,7 +48,6 @@ two = dataclasses.replace(
     check_of("green"),
     alternative=OTHER,
     apart=[NAMES[:2]],
-    taken_out=NAMES[3:],
     told_apart=[NAMES[:3]],
 )
 checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red"), two])

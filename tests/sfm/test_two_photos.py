@@ -22,7 +22,6 @@ from jaxsfm.io.photo_views import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
 from jaxsfm.sfm.two_photos import evidence, matched, pair_looks, plane_looks, scale_search
-from jaxsfm.sfm.two_photos import look as look_module
 from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
 from jaxsfm.sfm.two_photos.common_view import (
     Located,
@@ -79,26 +78,6 @@ def test_four_matches_are_no_evidence():
 def test_cells_of_an_enlarged_photo_are_counted_in_larger_cells():
     cells = np.arange(64)  # 8 x 8 fine cells are 4 x 4 coarse ones, and 2 x 2 of twice their size
     assert [evidence._coarse_cells(cells, 8, times) for times in (1.0, 2.0)] == [16, 4]
-
-
-@pytest.mark.parametrize(("enlarge", "max_size"), [(1.0, 240), (2.5, 750)])
-def test_the_evidence_of_whole_photos_needs_their_sizes_only(
-    weights, tmp_path, monkeypatch, enlarge, max_size
-):
-    """Also of photos that are stored sideways, reduced or enlarged."""
-    config = dataclasses.replace(preset("paper"), enlarge=enlarge, max_size=max_size)
-    cv2.imwrite(str(tmp_path / "a.png"), rng_of(1).integers(0, 255, (200, 300, 3), np.uint8))
-    image = dataclasses.replace(inspect_image(tmp_path / "a.png"), orientation=6)
-    images = (image, image)
-    both = [image_features(weights, each, config=config) for each in images]
-    # Five rows of a photo that lies, seven and a half of one that stands.
-    cells = np.arange(150, dtype=np.int32)[:, None] * np.int32([1, 1])
-    found = result(rng_of(2).uniform(0, 60, (150, 2)), np.eye(3)[None], np.zeros(150, int))
-    found = dataclasses.replace(found, cells=cells, num_tentative=400)
-    monkeypatch.setattr(look_module, "match_features", lambda *_, **__: found)
-    expected = look_module.look(both[0], both[1], images, config=config, seed=0).evidence
-    assert expected > 0
-    assert look_module.evidence_of_photos(found, images, config=config) == pytest.approx(expected)
 
 
 def test_confidence_grows_from_none_to_certainty():

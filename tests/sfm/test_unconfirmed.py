@@ -11,7 +11,7 @@ from jaxsfm.config import preset
 from jaxsfm.sfm import refined_stage
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refined_stage import check_refined, refine_mapped
+from jaxsfm.sfm.refined_stage import check_refined, refine_settled
 
 
 def refined(*accepted: bool) -> RefinementFigures:
@@ -50,15 +50,15 @@ def test_each_model_of_a_run_has_the_check_that_follows_from_its_own_refinement(
     done = [refined(True), refined(False)]
     monkeypatch.setattr(refined_stage.stage_files, "read_refinement", lambda _: (done, [1, 0]))
     monkeypatch.setattr(refined_stage, "read_models", lambda *_: ["part", "whole"])
-    (tmp_path / "mapped.db").touch()
-    mapped: Any = SimpleNamespace(
+    (tmp_path / "settled.db").touch()
+    settled: Any = SimpleNamespace(
         figures=MappingFigures(verdicts={}, attempts=[], checks=[whole, part]),
-        database=tmp_path / "mapped.db",
+        database=tmp_path / "settled.db",
         key="",
-        verification=None,
         models=lambda _: [],
     )
+    verified: Any = SimpleNamespace(figures=None)
     given: Any = SimpleNamespace(config=preset("default"), matches={})
     kept: Any = SimpleNamespace(folder=SimpleNamespace(stage=lambda *_: tmp_path))
-    made = refine_mapped(given, mapped, tmp_path / "database.db", kept)
+    made = refine_settled(given, verified, settled, tmp_path / "database.db", kept)
     assert made.mapping.checks == [part, dataclasses.replace(whole, unconfirmed=True)]

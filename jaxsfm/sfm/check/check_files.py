@@ -21,6 +21,7 @@ def check_from_json(row: dict[str, Any]) -> ModelCheck:
         apart=row["apart"],
         told_apart=row["told_apart"],
         shrunk=row["shrunk"],
+        doubt=row["doubt"],
         unconfirmed=row["unconfirmed"],
     )
 

@@ -10,7 +10,8 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import Agreement, agreement
-from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, Grouping, group_views, parts, share
+from jaxsfm.sfm.check.doubt import CURVE, MAX_CONTRADICTED
+from jaxsfm.sfm.check.grouping import Grouping, disagreement, group_views, parts, share
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.check.other_places import Refused, Surface, other_places
 from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
@@ -64,8 +65,8 @@ class Checked(NamedTuple):
     against: set[Pair]
     """Pairs that do not agree with the model."""
     parts: list[list[str]]
-    """The photos in parts in which no groups contradict each other, the largest first. A model
-    without contradictions is one part."""
+    """The photos in parts in which no groups contradict each other and something holds the groups
+    together, the largest first. Right models of ordinary photos are one part."""
 
 
 def check_model(
@@ -109,10 +110,16 @@ def check_model(
         if refuted or suspected:
             break
     groups = [sorted(names[k] for k in group) for group in grouping.groups]
-    check = ModelCheck(groups=groups, contradictions=contradictions, other_places=[], shrunk=near)
+    check = ModelCheck(
+        groups=groups,
+        contradictions=contradictions,
+        other_places=[],
+        shrunk=near,
+        doubt=CURVE.probability(disagreement(found)),
+    )
     agreeing = {pair for pair, fit in fits.items() if fit >= MIN_FIT}
     explained = {p for p in agreeing if not any(each.joined_by(p) for each in contradictions)}
-    whole = parts(grouping, seen.view, seen.point) if contradictions else [range(len(names))]
+    whole = parts(grouping, seen.view, seen.point)
     apart = [sorted(names[k] for k in part) for part in whole]
     return Checked(check, refuted, suspected, explained, fits.keys() - agreeing, apart)
 

@@ -7,11 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.sfm.check.agreement import Agreement
+from jaxsfm.sfm.check.doubt import MAX_CONTRADICTED
 
-MAX_CONTRADICTED = 0.03
-"""Groups contradict each other if a larger share of the points of each one is contradicted by the
-other (`share`). On castle-P19, single true pairs reach 0.037 and groups 0.02. The two halves that
-are taken for each other have 0.69; faces of rendered prisms that differ in one poster 0.04-0.2."""
 MIN_TESTED = 30
 """Fewer tested points say nothing about two groups."""
 
@@ -40,6 +37,8 @@ class Grouping(NamedTuple):
     """Indices of views, the largest group first."""
     contradictions: list[OpposedGroups]
     """Groups between which there is neither agreement nor contradiction are not listed."""
+    largest_share: float = 0.0
+    """The largest share of contradicted points (`share`) at which two groups were joined."""
 
 
 def share(tested: np.ndarray, contradicted: np.ndarray) -> np.ndarray:
@@ -54,9 +53,10 @@ def share(tested: np.ndarray, contradicted: np.ndarray) -> np.ndarray:
     return np.where(enough, np.minimum(ratio, ratio.T), np.nan)
 
 
-def _sure(agreement: Agreement, rows: slice) -> np.ndarray:
+def _sure(agreement: Agreement, rows: slice, most: float) -> tuple[np.ndarray, np.ndarray]:
     """float (r, v): how surely some groups and all others are one, the lower the surer; inf where
-    they are not, or where too little was tested."""
+    more than a share of `most` is contradicted, or where too little was tested. And these shares,
+    float (r, v)."""
 
     def shares(more: int) -> np.ndarray:
         beyond = agreement.beyond_light(rows) + more
@@ -68,10 +68,12 @@ def _sure(agreement: Agreement, rows: slice) -> np.ndarray:
         enough = np.minimum(agreement.tested[rows], agreement.tested.T[rows]) >= MIN_TESTED
         return np.where(enough, np.minimum(forth, back), np.inf)
 
-    return np.where(shares(0) <= MAX_CONTRADICTED, shares(1), np.inf)
+    contradicted = shares(0)
+    allowed = np.isfinite(contradicted) & (contradicted <= most)
+    return np.where(allowed, shares(1), np.inf), contradicted
 
 
-def group_views(agreement: Agreement) -> Grouping:
+def group_views(agreement: Agreement, *, most: float = MAX_CONTRADICTED) -> Grouping:
     """Join views to groups, those first that agree most surely.
 
     In each step, the two groups are joined whose share of contradictions is surely lowest: one
@@ -79,35 +81,46 @@ def group_views(agreement: Agreement) -> Grouping:
     of groups are sums over their views, and what the light explains is subtracted from the sums.
     It ends when only groups are left that contradict each other, or about which nothing can be
     said. The order of views has an effect only among equals.
+
+    Args:
+      most: groups are joined if no larger share of their points is contradicted.
     """
     count = len(agreement.tested)
     groups: dict[int, list[int]] = {k: [k] for k in range(count)}
-    now, sure = agreement.copied(), _sure(agreement, slice(None))
+    now, (sure, shares) = agreement.copied(), _sure(agreement, slice(None), most)
     sure[np.tril_indices(count)] = np.inf
+    largest = 0.0
     while len(groups) > 1:
         first, second = (int(k) for k in np.unravel_index(np.argmin(sure), sure.shape))
         if not np.isfinite(sure[first, second]):
             break
+        largest = max(largest, float(shares[first, second]))
         groups[first] = sorted(groups[first] + groups.pop(second))
         now.join(first, second)
         # Only the shares of the joined group have changed.
-        row = _sure(now, slice(first, first + 1))[0]
+        (row,), (own,) = _sure(now, slice(first, first + 1), most)
         row[[k for k in range(count) if k not in groups or k == first]] = np.inf
+        shares[first], shares[:, first] = own, own
         sure[:first, first], sure[first, first:] = row[:first], row[first:]
         sure[second], sure[:, second] = np.inf, np.inf
     members = list(groups.values())
     left = [*groups]
     agreement = Agreement(*(each[np.ix_(left, left)] for each in now))
     tested, contradicted = agreement.tested, agreement.beyond_light()
-    shares = share(tested, contradicted)
-    found = []
+    left_over, found = share(tested, contradicted), []
     for i, j in zip(*np.triu_indices(len(members), 1), strict=True):
-        if not np.isnan(shares[i, j]):
+        if not np.isnan(left_over[i, j]):
             ratios = [contradicted[a, b] / tested[a, b] for a, b in ((i, j), (j, i))]
             a, b = (i, j) if ratios[0] <= ratios[1] else (j, i)
             both = (members[i], members[j])
             found.append(OpposedGroups(both, int(tested[a, b]), int(contradicted[a, b])))
-    return Grouping(sorted(members, key=lambda group: (-len(group), group)), found)
+    in_order = sorted(members, key=lambda group: (-len(group), group))
+    return Grouping(in_order, found, largest)
+
+
+def disagreement(agreement: Agreement) -> float:
+    """The largest share of contradicted points at which groups of views are joined to one."""
+    return group_views(agreement, most=float("inf")).largest_share
 
 
 def parts(grouping: Grouping, view: np.ndarray, point: np.ndarray) -> list[list[int]]:

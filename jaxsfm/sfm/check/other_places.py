@@ -16,7 +16,7 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import agreement
-from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
+from jaxsfm.sfm.check.doubt import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import OtherPlace
 from jaxsfm.sfm.check.thinning import thinned_points
 from jaxsfm.sfm.refine.candidates import may_show

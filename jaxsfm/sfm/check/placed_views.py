@@ -29,9 +29,8 @@ class Placed(NamedTuple):
     """Views that were placed, and the pairs of photos that test their places."""
 
     full_size: Mapping[str, bool]
-    """By the name of the view: whether its place rests on details at full size
-    (`Placement.rests_on_details`). If not, noise hides them there, and what the view does not show
-    says nothing."""
+    """By the name of the view: whether its place rests on details at full size. If not, noise hides
+    them there, and what the view does not show says nothing."""
     neighbours: Collection[Pair]
     """Pairs of photos that follow each other and that COLMAP verified."""
     matches: Mapping[Pair, PairResult]

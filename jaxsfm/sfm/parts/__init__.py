@@ -1,1 +1,1 @@
-"""It maps many photos in parts that overlap, and makes one model of the models of the parts."""
+"""It adjusts a long row of photos in parts that overlap, whose frames are then found together."""

@@ -6,8 +6,7 @@ models are bent. So the frames of all models are found together: they bring the 
 share as near to each other as they can.
 """
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +14,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import lil_array
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.colmap.model import Model
 from jaxsfm.sfm.evaluation import Similarity
-from jaxsfm.sfm.model_join import MIN_SHARED, find_join
 
 SAMPLE = 60
 """So many points that two models share say how these lie to each other."""
@@ -50,34 +47,6 @@ def after(outer: Similarity, inner: Similarity) -> Similarity:
     turned = outer.rotation @ inner.rotation
     moved = outer.moved_points(inner.translation[None])[0]
     return Similarity(outer.scale * inner.scale, turned, moved)
-
-
-def shared_points(
-    models: Sequence[Model], *, error_px: float
-) -> dict[tuple[int, int], SharedPoints]:
-    """What each pair of models shares, if they agree (`jaxsfm.sfm.model_join`).
-
-    Args:
-      error_px: points fall together if they are this near in the photos, pixels of the views.
-    """
-    names = [{view.name for view in model.views} for model in models]
-    found = {}
-    for i, j in itertools.combinations(range(len(models)), 2):
-        common = names[i] & names[j]
-        if len(common) < MIN_SHARED:
-            continue
-        (first, _), (second, _) = (models[k].part(common) for k in (i, j))
-        join = find_join(first, second, error_px=error_px)
-        if join.frame is None or join.agreed < join.needed:
-            continue
-        same = join.points.select(np.flatnonzero(join.frame.agree))
-        same = same.select(np.unique(np.linspace(0, len(same.first) - 1, SAMPLE).astype(int)))
-        found[i, j] = SharedPoints(
-            first.tracks.points[same.first],
-            second.tracks.points[same.second],
-            join.frame.similarity,
-        )
-    return found
 
 
 def common_frames(

@@ -1,4 +1,4 @@
-"""Parts of a graph of photos: each small enough to be mapped alone, and overlapping with the next.
+"""Parts of a graph of photos: each small enough to be adjusted alone, and overlapping the next.
 
 A part that is too large is cut in two. Its photos are put in order of their distance from a photo
 at its edge, where strong pairs are short ways, and the cut goes where the pairs across it are
@@ -7,14 +7,11 @@ number of photos. Where parts are cut, each gets the photos of the other that ha
 it.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
-
-from jaxsfm.io.pairs import Pair
 
 SLACK = 0.25
 """A cut may lie so many sizes of a part beside the place where all parts would be equal, and a part
@@ -30,19 +27,6 @@ class Graph(NamedTuple):
     """Sorted."""
     weights: csr_array
     """float64 (n, n), symmetric: the number of matches of each pair."""
-
-
-def graph_of(matches: Mapping[Pair, int]) -> Graph:
-    """The graph of pairs with their numbers of matches. Pairs without matches do not count."""
-    some = {pair: count for pair, count in sorted(matches.items()) if count > 0}
-    names = sorted({name for pair in some for name in pair})
-    index = {name: k for k, name in enumerate(names)}
-    ends = np.asarray([[index[a], index[b]] for a, b in some], np.int64).reshape(-1, 2)
-    counts = np.asarray([*some.values()], float)
-    rows, columns = np.concatenate([ends, ends[:, ::-1]]).T
-    shape = (len(names), len(names))
-    weights = coo_array((np.r_[counts, counts], (rows, columns)), shape=shape).tocsr()
-    return Graph(names, csr_array(weights))
 
 
 def overlapping_parts(graph: Graph, *, size: int, overlap: int) -> list[list[str]]:

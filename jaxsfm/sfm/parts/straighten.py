@@ -21,7 +21,6 @@ from jaxsfm.colmap.view import View
 from jaxsfm.sfm.evaluation import Similarity, umeyama
 from jaxsfm.sfm.model_join import MIN_SHARED
 from jaxsfm.sfm.parts.frames import SharedPoints, common_frames
-from jaxsfm.sfm.parts.merge import homes
 from jaxsfm.sfm.parts.partition import Graph, overlapping_parts
 
 TOGETHER = 20
@@ -127,6 +126,19 @@ def shared_views(first: Sequence[View], second: Sequence[View]) -> SharedPoints 
             return None
         tips.append(np.concatenate([centres, (centres[:, None] + length * axes).reshape(-1, 3)]))
     return SharedPoints(tips[0], tips[1], umeyama(tips[1], tips[0]))
+
+
+def homes(models: Mapping[int, Model]) -> dict[str, tuple[int, View]]:
+    """For each photo, the number of the model in which it has most observations, the first of equal
+    ones, and its view there."""
+    most: dict[str, int] = {}
+    found: dict[str, tuple[int, View]] = {}
+    for number, model in models.items():
+        seen = np.bincount(model.tracks.view, minlength=len(model.views))
+        for view, count in zip(model.views, seen.tolist(), strict=True):
+            if count > most.get(view.name, -1):
+                most[view.name], found[view.name] = count, (number, view)
+    return found
 
 
 def _incidence(row: np.ndarray, column: np.ndarray, shape: tuple[int, int]) -> csr_array:

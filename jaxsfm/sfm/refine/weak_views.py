@@ -21,7 +21,6 @@ from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, Evidence, matched_points
 from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.refine.octave_pose import (
     MIN_COUNT,
-    MIN_SHARE,
     OctavePose,
     PoseHypothesis,
     follow,
@@ -48,18 +47,10 @@ class Placement:
     """Median distance of where they agree from where the pose puts them, working pixels."""
     held: int | None = None
     """A number: it was in the model before, and was taken out because it had no more observations
-    than these. None: it was not. An image that the mapper had left out gets a `doubt` instead."""
+    than these. None: it was not."""
     doubt: str = ""
-    """What speaks against the place, in words; the image was taken out again. Empty if nothing
-    does."""
-
-    def rests_on_details(self) -> bool:
-        """Whether the place rests on details at full size, which the image shows where it agrees.
-
-        Full size may determine a pose best although noise hides most there: in a night photo of
-        entry-P10, 106 of 18 012 points agree, and the pose is right.
-        """
-        return self.octave_px == 1 and self.agreed >= MIN_SHARE * self.candidates
+    """Why an image without a place was not registered (`jaxsfm.sfm.register.lost`), in words. Empty
+    if it was."""
 
 
 def _structure(model: Model, weak: Sequence[int]) -> tuple[Model, np.ndarray]:

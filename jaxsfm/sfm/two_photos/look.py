@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxsfm.config import Config
 from jaxsfm.io.features import ImageFeatures
-from jaxsfm.io.images import ImageFile, working_size
+from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photo_views import PhotoView
 from jaxsfm.matching.pair_matching import match_features
@@ -97,23 +97,6 @@ def look(
     return Look(
         moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views
     )
-
-
-def evidence_of_photos(
-    found: PairResult, images: tuple[ImageFile, ImageFile], *, config: Config
-) -> float:
-    """The evidence of the matches of two whole photos, without their features.
-
-    Args:
-      found: what `match_features` gave for the photos with this config.
-    """
-
-    def described(image: ImageFile) -> Described:
-        size = working_size(image.upright_size, config.max_size, config.enlarge)
-        columns, rows = (side // config.fine_stride for side in size)
-        return Described(rows, columns, 1 / float(np.mean(np.divide(image.upright_size, size))))
-
-    return total(_evidence(found, (described(images[0]), described(images[1])), config))
 
 
 def _evidence(

@@ -1,0 +1,151 @@
+"""Laws of the matching of a run's photos: at which size, which pairs, and what becomes of them."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from pair_results import counts, job_and_images, result
+
+from jaxsfm.config import preset
+from jaxsfm.io import orientation
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import Pair, exhaustive_pairs
+from jaxsfm.io.store import Store
+from jaxsfm.report.run_inputs import RunIdentity
+from jaxsfm.runs import run_photos
+from jaxsfm.runs.job import Job
+from jaxsfm.runs.matching_looks import MatchedPairs, match_pairs
+from jaxsfm.runs.run_photos import CLOSEST, LostMatcher, RunPhotos
+from jaxsfm.runs.turned_photos import turned
+
+TRIED = {pair: counts(30) for pair in exhaustive_pairs("abcd")}
+
+
+def photos_in(folder: Path, names: str = "abcd") -> RunPhotos:
+    """The photos of a run that is never computed."""
+    unused: Any = None
+    job = Job(
+        store=Store(folder, {}),
+        weights=unused,
+        config=preset("default"),
+        engine=unused,
+        execution=unused,
+        seed=7,
+    )
+    images = {
+        name: ImageFile(name=name, path=Path(name), size=(8, 8), sha256=name) for name in names
+    }
+    return RunPhotos(
+        job=job,
+        identity=RunIdentity(version="1", config={}, images={n: n for n in names}),
+        images=images,
+        pairs=exhaustive_pairs(names),
+    )
+
+
+@pytest.fixture
+def looks(monkeypatch) -> list:
+    """The job, the pairs and the store of every closer look; each gives matches of its pairs."""
+    done: list = []
+
+    def look_closer(job: Job, images: dict, pairs: Any, *, store: Store) -> dict:
+        assert sorted(images) == [*"abcd"]
+        done.append((job, list(pairs), store))
+        return {pair: result(pair) for pair in done[-1][1]}
+
+    monkeypatch.setattr(run_photos, "look_closer", look_closer)
+    return done
+
+
+def test_lost_photos_are_matched_at_full_size_with_photos_that_have_a_place(looks, tmp_path):
+    found = LostMatcher(photos_in(tmp_path), TRIED)({"d"}, {"a", "b"}, set())
+    ((job, pairs, store),) = looks
+    assert [*found] == pairs == [("a", "d"), ("b", "d")]
+    assert job.config == preset("default")
+    assert job.store.identity["config"] == preset("default").matching()
+    assert store.identity["config"]["closer_looks"] == 4
+
+
+def test_nothing_is_matched_where_nothing_is_lost_or_nothing_has_a_place(looks, tmp_path):
+    for lost, placed in (({}, {*"abcd"}), ({*"abcd"}, {})):
+        assert LostMatcher(photos_in(tmp_path), TRIED)(lost, placed, set()) == {}
+    assert not looks
+
+
+def test_no_pair_is_looked_at_twice(looks, tmp_path):
+    """A photo that has found a place is a new partner of the others."""
+    match = LostMatcher(photos_in(tmp_path), TRIED)
+    assert [*match({"c", "d"}, {"a", "b"}, set())] == [
+        ("a", "c"), ("b", "c"), ("a", "d"), ("b", "d")
+    ]  # fmt: skip
+    assert [*match({"d"}, {"a", "b", "c"}, set())] == [("c", "d")]
+    assert match({"d"}, {"a", "b", "c"}, set()) == {} and len(looks) == 2
+
+
+def test_pairs_that_were_found_to_be_false_are_not_looked_at(looks, tmp_path):
+    match = LostMatcher(photos_in(tmp_path), TRIED)
+    assert [*match({"d"}, {"a", "b", "c"}, {("a", "d")})] == [("b", "d"), ("c", "d")]
+    assert match({"d"}, {"a"}, {("a", "d")}) == {}
+
+
+def test_at_full_size_each_photo_is_matched_with_its_best_partners(monkeypatch, tmp_path):
+    """Of equal partners, those with most tentative matches are better."""
+    names = "abcdefghijklmn"
+    photos = photos_in(tmp_path, names)
+    before = {
+        pair: counts(abs(names.index(pair[0]) - names.index(pair[1])) // 2, k)
+        for k, pair in enumerate(exhaustive_pairs(names))
+    }
+    asked: dict[str, Any] = {}
+
+    def match(job: Job, images: Any, pairs: list[Pair], seconds: dict) -> tuple[dict, dict]:
+        asked.update(config=job.config, pairs=pairs)
+        return {pair: counts(99) for pair in pairs}, {}
+
+    monkeypatch.setattr(run_photos, "match_pairs", match)
+    found = photos.match_at_full_size(before, {})
+    best = set()
+    for name in names:
+        own = [pair for pair in before if name in pair]
+        own.sort(key=lambda pair: (before[pair].num_inliers, before[pair].num_tentative))
+        best |= {*own[-CLOSEST:]}
+    assert asked["pairs"] == sorted(best) and best < {*before}
+    assert found.described == asked["config"] == preset("default")
+    assert found.counts == dict.fromkeys(sorted(best), counts(99))
+
+
+@pytest.mark.parametrize("sideways", ["", "b"])
+def test_photos_are_matched_again_if_some_are_turned(monkeypatch, tmp_path, sideways):
+    photos, matched = photos_in(tmp_path), MatchedPairs(Any, Any, TRIED)  # type: ignore[arg-type]
+    found = {name: turned(photos.images[name], 1) for name in sideways}
+    monkeypatch.setattr(run_photos, "find_turned", lambda trials, counts: found)
+    asked: list = []
+
+    def match(job: Job, images: Any, pairs: list[Pair], seconds: dict) -> tuple[dict, dict]:
+        asked.append({name: image.orientation for name, image in images.items()})
+        return {}, {}
+
+    monkeypatch.setattr(run_photos, "match_pairs", match)
+    now, again = photos.upright(matched, {})
+    if not sideways:
+        assert now is photos and again is matched and not asked
+        return
+    upright = orientation.UPRIGHT
+    assert asked == [{"a": upright, "b": 6, "c": upright, "d": upright}]
+    assert again.store.identity["orientations"] == now.identity.orientations == {"b": 6}
+    assert now.job.store.identity["orientations"] == {"b": 6} and now.pairs == photos.pairs
+
+
+def test_a_photo_that_cannot_be_decoded_any_more_has_no_counts():
+    """Its pairs may have been matched before."""
+    pairs = [("a", "b"), ("a", "c"), ("b", "c"), ("c", "d")]
+    kept = {pairs[0]: result(pairs[0]), pairs[1]: result(pairs[1])}
+    job: Any = SimpleNamespace(
+        store=SimpleNamespace(load_matches=kept.get),
+        progress=False,
+        extract_missing=lambda images: {"b": "gone"},
+        match_missing=lambda images, pairs: map(result, pairs),
+    )
+    found, lost = match_pairs(job, job_and_images()[1], pairs, {})
+    assert lost == {"b": "gone"} and [*found] == [("a", "c"), ("c", "d")]
