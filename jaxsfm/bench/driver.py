@@ -3,7 +3,8 @@
 `python -m jaxsfm.bench.driver --photos 1000,10000,100000` takes the matches of a simulated street
 (`jaxsfm.bench.simulated`) as if workers had computed them, and runs what the driver of a run does
 with them: it chooses similar photos, puts the pairs in order, keeps and reads the matches, writes
-COLMAP's database, verifies the pairs, and decides which pairs to trust. Each number of photos is measured in a process of its own, whose largest memory is reported.
+COLMAP's database, verifies the pairs, and decides which pairs to trust. Each number of photos is
+measured in a process of its own, whose largest memory is reported.
 """
 
 import argparse

@@ -176,8 +176,8 @@ class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
         for all of them.
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
       without: Leave out these steps of all runs. upright: photos that are stored sideways are
-        turned. map-again: the second mapping. split: models in which photos contradict each other are
-        split. second-places: photos are looked for in other places. register: photos without a
+        turned. map-again: the second mapping. split: models in which photos contradict each other
+        are split. second-places: photos are looked for in other places. register: photos without a
         place are registered in the refined models.
       out: Folder for photos that are made, for databases and for models. A later call makes only
         the runs that have no report there.

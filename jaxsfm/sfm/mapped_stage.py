@@ -156,7 +156,7 @@ def map_trusted(
         write_models(made.models, folder / SPARSE)
         write_outcomes(folder / OUTCOMES, made.checks)
 
-    key = digest(verified.key, *_settings(given), _plain(trust))
+    key = digest(verified.key, *mapping_settings(given), _plain(trust))
     folder = kept.folder.stage(name, key, compute)
     return MappedModels(
         trust=trust,
@@ -173,7 +173,7 @@ def mapper_of(
     return Mapper(verified.pairs, config=given.config, options=given.options, on_image=on_image)
 
 
-def _settings(given: MatchedPhotos) -> list[Json]:
+def mapping_settings(given: MatchedPhotos) -> list[Json]:
     """What a mapping depends on besides its pairs."""
     config = given.config
     aligning = config.refinement or Refinement()

@@ -27,6 +27,7 @@ from jaxsfm.sfm.mapped_stage import (
     StageCache,
     VerifiedStage,
     mapper_of,
+    mapping_settings,
 )
 from jaxsfm.sfm.mapping import MappedModels, Mapper, MappingFigures
 from jaxsfm.sfm.told_apart import told_apart
@@ -100,7 +101,7 @@ def settle(
         stage_files.write_mapping(folder, figures)
 
     models = [fingerprint(model) for each in made if each is not None for model in each.models]
-    key = digest(verified.key, models, given.config.checked, sorted(without))
+    key = digest(verified.key, *mapping_settings(given), models, sorted(without))
     folder = kept.folder.stage("settled", key, compute)
     return SettledModels(stage_files.read_mapping(folder), folder, key)
 

@@ -66,7 +66,7 @@ def test_the_driver_is_measured_stage_by_stage(tmp_path, monkeypatch):
     monkeypatch.setattr(driver, "NEAREST", 5)
     row = driver.measure(30, tmp_path)
     assert row["photos"] == 30 and row["pairs"] == len(SimulatedStreet(30).pairs())
-    assert row["trusted pairs"] > 100 and row["number of parts"] == 1
+    assert row["trusted pairs"] > 100
     assert all(row[stage] >= 0 for stage in ("keep", "read", "verification", "view graph"))
     json.dumps(row)
 

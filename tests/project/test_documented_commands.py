@@ -46,7 +46,15 @@ LONG = (
     "weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
-        for name in ("strecha", "daynight", "ambiguous", "collection", "sequence", "recall")
+        for name in (
+            "ledger",
+            "strecha",
+            "daynight",
+            "ambiguous",
+            "collection",
+            "sequence",
+            "recall",
+        )
     ),
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
@@ -59,7 +67,7 @@ INDENTED = re.compile(r"^ {4}(?:\.venv/bin/)?(jaxsfm [a-z-].*)$", re.MULTILINE)
 INLINE = re.compile(r"`(jaxsfm [a-z]+ [^`]*--[^`]*)`")
 FOLDERS = (
     *("PHOTOS", "OTHER_PHOTOS", "images", "FOLDER", "DIR", "SETS", "SCENES"),
-    *("FRAMES", "OXFORD", "PAIRS", "SEQUENCES", "POINTS"),
+    *("FRAMES", "OXFORD", "PAIRS", "SEQUENCES", "POINTS", "DATA"),
 )
 """Names of folders in the documentation."""
 SHELL = {

@@ -34,7 +34,8 @@ def photos_in(folder: Path, names: str = "abcd") -> RunPhotos:
         seed=7,
     )
     images = {
-        name: ImageFile(name=name, path=Path(name), size=(8, 8), sha256=name) for name in names
+        name: ImageFile(name=name, path=Path(name), size=(1600, 1200), sha256=name)
+        for name in names
     }
     return RunPhotos(
         job=job,

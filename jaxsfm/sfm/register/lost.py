@@ -7,6 +7,7 @@ with the best partners at full size.
 """
 
 import dataclasses
+import logging
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -42,6 +43,8 @@ from jaxsfm.sfm.settled_stage import SettledModels
 if TYPE_CHECKING:
     import pycolmap
 
+logger = logging.getLogger("jaxsfm")
+
 SHORTLIST = 20
 """A photo is located among so many photos of a model at most, those with most matches, as `extend`
 does by default."""
@@ -72,8 +75,7 @@ def register_lost(
         of the run have to do.
     """
     names = {image.name for image in given.images}
-    refined = [k for k, done in enumerate(made.refinement) if done is not None]
-    if not refined or not names - registered_in_any(made.models):
+    if not any(made.refinement) or not names - registered_in_any(made.models):
         return made
 
     def compute(folder: Path) -> None:
@@ -81,15 +83,21 @@ def register_lost(
         found.register(believed_matches(given, settled))
         if match_lost is not None:
             # A photo that was registered may be the partner of another one.
-            while more := match_lost(found.lost(), found.placed(), settled.figures.misleading()):
-                if not found.register(more):
-                    break
+            false, more = settled.figures.misleading(), True
+            while more and (lost := found.lost()):
+                more = found.register(match_lost(lost, found.placed(), false))
         write_refined(folder, found.outcome())
 
     models = [fingerprint(model) for model in made.models]
     settings = [*refinement_settings(given.config), match_lost is not None]
     key = digest(settled.key, *settings, given.config.closer_looks, models)
-    folder = kept.folder.stage("registered", key, compute)
+    try:
+        folder = kept.folder.stage("registered", key, compute)
+    except (
+        ImageError
+    ) as error:  # a photo of a model was deleted since; perhaps it is back next time
+        logger.warning("no photos were registered: %s", error)
+        return made
     refinement, order = stage_files.read_refinement(folder)
     checks = [made.mapping.checks[k] for k in order]
     return dataclasses.replace(
@@ -101,15 +109,14 @@ def register_lost(
 
 
 class _Registration:
-    """Refined models that take up photos."""
+    """Refined models that take up photos. Models that were not refined take up none."""
 
     def __init__(self, given: MatchedPhotos, settled: SettledModels, made: Reconstructed) -> None:
         self._given, self._made = given, made
         self._photos = Photos(given.images, given.config)
         self._cameras = read_images(settled.database)
-        opened_models = [opened(model, self._photos)[0] for model in made.models]
-        self._models: list[Model] = opened_models
-        self._changed: set[int] = set()
+        self._refined = [k for k, done in enumerate(made.refinement) if done is not None]
+        self._models: list[Model] = [opened(made.models[k], self._photos)[0] for k in self._refined]
         self._images = DeviceImages(self._photos.gray)
         self._outcomes: dict[str, Localization] = {}
         self._placed: dict[str, int] = {}
@@ -117,7 +124,7 @@ class _Registration:
 
     def placed(self) -> set[str]:
         """The photos with a place."""
-        return {view.name for model in self._models for view in model.views}
+        return registered_in_any(self._made.models) | self._placed.keys()
 
     def lost(self) -> set[str]:
         """The photos without a place that can be read."""
@@ -144,9 +151,8 @@ class _Registration:
             seed=self._given.options.seed,
         )
         self._models = grown.models
-        self._changed |= set(grown.placed.values())
         self._outcomes |= grown.located
-        self._placed |= grown.placed
+        self._placed |= {name: self._refined[k] for name, k in grown.placed.items()}
         return bool(grown.placed)
 
     def _unregistered(
@@ -162,17 +168,18 @@ class _Registration:
         if not partners:
             return None
         try:
-            size = self._photos.working_size(name)
+            self._photos.gray(name)
         except ImageError:  # deleted since; it is in no model anyway
             self._unreadable.add(name)
             return None
+        size, scale = self._photos.working_size(name)
         image_id, camera = self._cameras[name]
         views, shared = [], False
         for model in self._models:
             cameras = {view.camera.camera_id: view.camera for view in model.views}
             shared |= camera.camera_id in cameras
             refined = cameras.get(camera.camera_id, camera)
-            views.append(View.without_pose(name, image_id, refined, size[0], Pixels(size[1])))
+            views.append(View.without_pose(name, image_id, refined, size, Pixels(scale)))
         shortlist = sorted(partners, key=lambda other: (-partners[other], other))[:SHORTLIST]
         own_camera = self._given.options.refine_intrinsics and not shared
         return UnregisteredView(views, own_camera, sorted(shortlist))
@@ -180,8 +187,8 @@ class _Registration:
     def outcome(self) -> RefinedModels:
         """The models with the photos that were registered, the one with most photos first."""
         models: list[pycolmap.Reconstruction] = list(self._made.models)
-        for k in sorted(self._changed):
-            models[k] = self._models[k].to_colmap()
+        for k in sorted({*self._placed.values()}):
+            models[k] = self._models[self._refined.index(k)].to_colmap()
             colour_points(models[k], self._photos.rgb)
         order = sorted(range(len(models)), key=lambda k: -models[k].num_reg_images())
         figures = [self._figures(k) for k in range(len(models))]
@@ -190,13 +197,12 @@ class _Registration:
     def _figures(self, k: int) -> RefinementFigures | None:
         """What was done to a model, with the photos that were looked for. Photos that have no place
         stand in the first model that was refined."""
-        done, refined = self._made.refinement[k], self._made.refinement
+        done = self._made.refinement[k]
         if done is None:
             return None
-        first = next(i for i, each in enumerate(refined) if each is not None)
         rows = {row.name: row for row in done.placed}
         for name, found in self._outcomes.items():
-            if self._placed.get(name, first) == k:
+            if self._placed.get(name, self._refined[0]) == k:
                 own = _row(name, found)
                 # A photo without a place keeps the reason for which it was taken out.
                 rows[name] = own if found.trusted else rows.get(name, own)
