@@ -82,7 +82,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     "refine/plane_geometry": (REFINE, WEAK),
     "refine/track_alignment": (DEVICE, REFINE, WEAK),
     "refine/weak_views": (WEAK,),
-    "register/grow": ("tests/sfm/test_new_points.py", "tests/runs/test_extend.py"),
+    "register/grow": (
+        "tests/sfm/test_new_points.py",
+        "tests/sfm/test_refused_places.py",
+        "tests/runs/test_extend.py",
+    ),
+    "register/lost": ("tests/sfm/test_lost_views.py",),
     "register/locate_view": ("tests/sfm/test_single_view.py", "tests/sfm/test_new_points.py"),
     "register/place": ("tests/sfm/test_new_points.py", "tests/runs/test_localize.py"),
     "register/triangulate": ("tests/sfm/test_new_points.py",),

@@ -175,10 +175,11 @@ class FakeGrow:
 
     def __init__(self, rendered: Room, *plan: list[str]) -> None:
         self.views = {view.name: view for view in rendered.views}
-        self.plan, self.wanted = [*plan], list[list[str]]()
+        self.plan, self.wanted = [*plan], list[dict[str, list[str]]]()
+        """Of each call, the photos to register and their partners."""
 
     def __call__(self, models, wanted, matches, images, **_) -> ExtendedModels:
-        self.wanted.append(sorted(wanted))
+        self.wanted.append({name: list(each.shortlist) for name, each in wanted.items()})
         new = [name for name in self.plan.pop(0) if name in wanted]
         model = models[0].with_views([*models[0].views, *(self.views[name] for name in new)])
         located = {
@@ -233,3 +234,20 @@ def test_without_a_lost_photo_nothing_is_matched_and_nothing_kept(rendered, run)
     given = run(model_with(rendered, range(5)))
     assert given.registered(lambda *_: pytest.fail("no photo is lost")) is given.made
     assert not (Path(given.kept.folder.path) / "stages" / "registered").exists()
+
+
+@pytest.mark.parametrize(("most", "partners"), [(1, ["1.png"]), (3, ["0.png", "1.png", "4.png"])])
+def test_a_photo_is_located_among_photos_with_a_place_before_others(
+    rendered, run, monkeypatch, most, partners
+):
+    """It has most matches with photos that are lost themselves."""
+    matches = all_matches(rendered)
+    counts = [
+        matches[min(name, LOST), max(name, LOST)].num_inliers for name in NAMES if name != LOST
+    ]
+    assert counts[0] < counts[1] < counts[2] < counts[3]
+    grow = FakeGrow(rendered, [])
+    monkeypatch.setattr(module, "grow", grow)
+    monkeypatch.setattr(module, "SHORTLIST", most)
+    run(model_with(rendered, [0, 1])).registered()
+    assert grow.wanted[0][LOST] == partners

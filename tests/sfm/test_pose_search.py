@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from room_scene import SIZE, Room, exact_model, images_of, sizes
+from room_scene import SIZE, Room, exact_model, images_of
 from scipy.spatial.transform import Rotation
 from wall_scene import matched
 
@@ -303,7 +303,6 @@ def test_the_refinement_searches_around_views_that_it_cannot_place(rendered, muc
         whole.with_views(views),
         [NIGHT_NAME],
         images_of(scene),
-        sizes(scene),
         refinement=REFINEMENT,
         refine_intrinsics=False,
         evidence=NO_EVIDENCE,

@@ -254,12 +254,12 @@ def test_all_points_return_if_the_passes_end_early(rendered):
 
 
 def test_working_sizes_are_widths_and_heights(rendered):
-    from jaxsfm.sfm.refine.passes import NO_EVIDENCE, _working_sizes
+    from jaxsfm.sfm.refine.passes import _working_sizes
 
     def read(name):
         return np.zeros((30, 40), np.float32), (2.0, 2.5)
 
-    sizes, _ = _working_sizes(noisy_model(rendered, 1.0), read, NO_EVIDENCE)
+    sizes = _working_sizes(noisy_model(rendered, 1.0), read)
     assert set(sizes.values()) == {((40, 30), (2.0, 2.5))}
 
 

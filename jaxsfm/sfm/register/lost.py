@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger("jaxsfm")
 
 SHORTLIST = 20
-"""A photo is located among so many photos of a model at most, those with most matches, as `extend`
-does by default."""
+"""A photo is located among so many photos at most, as `extend` does by default: first those with a
+place, and of these first those with most matches."""
 
 
 class MatchLost(Protocol):
@@ -180,9 +180,10 @@ class _Registration:
             shared |= camera.camera_id in cameras
             refined = cameras.get(camera.camera_id, camera)
             views.append(View.without_pose(name, image_id, refined, size, Pixels(scale)))
-        shortlist = sorted(partners, key=lambda other: (-partners[other], other))[:SHORTLIST]
+        placed = self.placed()
+        ranked = sorted(partners, key=lambda other: (other not in placed, -partners[other], other))
         own_camera = self._given.options.refine_intrinsics and not shared
-        return UnregisteredView(views, own_camera, sorted(shortlist))
+        return UnregisteredView(views, own_camera, sorted(ranked[:SHORTLIST]))
 
     def outcome(self) -> RefinedModels:
         """The models with the photos that were registered, the one with most photos first."""
