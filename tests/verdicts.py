@@ -1,4 +1,4 @@
-"""Checks of models with each of the verdicts, made up."""
+"""Checks of models with each of the verdicts, and a photo that was taken out, made up."""
 
 import dataclasses
 
@@ -11,6 +11,7 @@ from jaxsfm.sfm.check.model_check import (
     OtherPlace,
     VerdictColour,
 )
+from jaxsfm.sfm.refine.weak_views import Placement
 
 NAMES = [f"checked{k}.jpg" for k in range(9)]
 
@@ -47,3 +48,16 @@ def outcome(*parts: list[str]) -> Checked:
     ]
     check = ModelCheck(groups=[*parts], contradictions=against, other_places=[])
     return Checked(check, {}, {}, set(), set(), [*parts])
+
+
+def taken_out(name: str) -> Placement:
+    """What became of a photo that the refinement took out."""
+    return Placement(
+        name=name,
+        registered=True,
+        octave_px=None,
+        candidates=160,
+        agreed=8,
+        error_px=None,
+        held=3,
+    )

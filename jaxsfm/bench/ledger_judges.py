@@ -1,8 +1,7 @@
 """How `bench ledger` judges models: which photos are right, and what the outcome is.
 
 Each judge divides a model's photos into groups that are right in themselves, the largest first. The
-model is right if the first group has at least `SAME_SHARE` of them, as in
-`jaxsfm.bench.outcomes.judge`, which has the same outcomes.
+outcome follows from the sizes of the groups (`jaxsfm.bench.outcomes.outcome_of`).
 
 * Places: photos of a group have their reference poses up to one similarity.
 * Rotations: they are turned as in the reference, up to the rotation between the two worlds, as in
@@ -19,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from jaxsfm.bench.collection import differences, right_photos
 from jaxsfm.bench.ledger_sets import Judge
-from jaxsfm.bench.outcomes import WHOLE, Outcome
+from jaxsfm.bench.outcomes import Outcome, is_right, outcome_of
 from jaxsfm.colmap.poses import Poses
 from jaxsfm.io.pair_selection import natural
-from jaxsfm.sfm.check.common_places import MIN_PHOTOS, SAME_SHARE, groups
+from jaxsfm.sfm.check.common_places import MIN_PHOTOS, groups
 from jaxsfm.sfm.evaluation import pair_names
 
 LedgerOutcome = Outcome | Literal["not judged", "ended in an error"]
@@ -71,13 +70,10 @@ def judged(
 def _judged(divided: Sequence[list[list[str]]], photos: int, noticed: bool) -> Judged:
     """The outcome for models in groups; smaller models than `MIN_PHOTOS` are left out."""
     large = [each for each in divided if sum(map(len, each)) >= MIN_PHOTOS]
-    if not large:
-        return Judged("no model", 0)
-    good = [each for each in large if len(each[0]) >= SAME_SHARE * sum(map(len, each))]
+    sizes = [[len(group) for group in each] for each in large]
+    good = [each for each, own in zip(large, sizes, strict=True) if is_right(own)]
     right = len({name for each in good for name in each[0]})
-    if len(good) < len(large):
-        return Judged("wrong, noticed" if noticed else "wrong, not noticed", right)
-    return Judged("right" if sum(map(len, large[0])) >= WHOLE * photos else "split", right)
+    return Judged(outcome_of(sizes, photos, noticed=noticed), right)
 
 
 def rotation_groups(model: Poses, truth: Poses) -> list[list[str]]:

@@ -40,7 +40,7 @@ from jaxsfm.bench.ordinary_parts import (
     walls,
 )
 from jaxsfm.bench.ordinary_photos import Look, OrdinaryScene, ordinary_photo
-from jaxsfm.bench.scene_folder import write_scene_folder
+from jaxsfm.bench.scene_folder import ScenePhotos, check_scene, write_scene_folder
 from jaxsfm.bench.synthetic import TexturedPlane, look_at
 from jaxsfm.bench.walls import moved
 from jaxsfm.colmap.poses import CameraPose
@@ -235,8 +235,7 @@ def ordinary_scene(name: str, seed: int) -> OrdinaryScene:
     Raises:
       ValueError: there is no such scene.
     """
-    if name not in SCENES:
-        raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}")
+    check_scene(name, SCENES)
     kind = name.removeprefix(PREFIX)
     rng, light = (
         np.random.default_rng([seed, zlib.crc32(kind.encode()), part]) for part in range(2)
@@ -267,15 +266,10 @@ def ordinary_scene(name: str, seed: int) -> OrdinaryScene:
 
 
 def write_ordinary(folder: Path, name: str, seed: int, size: tuple[int, int]) -> None:
-    """Write a scene in the layout of Strecha's sets: images/ with K.txt, and gt_dense_cameras/.
+    """Write a scene that is called as in `SCENES` (`write_scene_folder`)."""
 
-    A folder that is there already stays as it is.
+    def draw() -> ScenePhotos:
+        scene = ordinary_scene(name, seed)
+        return ScenePhotos(scene.poses, lambda i: ordinary_photo(scene, i, size))
 
-    Args:
-      name: one of `SCENES`.
-      size: width and height of the photos, pixels.
-    """
-    if folder.is_dir():
-        return
-    scene = ordinary_scene(name, seed)
-    write_scene_folder(folder, scene.poses, lambda i: ordinary_photo(scene, i, size), size)
+    write_scene_folder(folder, draw, size)

@@ -70,9 +70,25 @@ def judge(models: Sequence[Poses], truth: Poses, *, noticed: bool) -> Judgement:
       noticed: whether the run says that its model may be wrong.
     """
     judged = [model for model in models if len(pair_names(model, truth)) >= MIN_PHOTOS]
-    if not judged:
-        return Judgement("no model", [])
     sizes = [[len(group) for group in groups(model, truth)] for model in judged]
-    if any(each[0] < SAME_SHARE * sum(each) for each in sizes):
-        return Judgement("wrong, noticed" if noticed else "wrong, not noticed", sizes)
-    return Judgement("right" if sum(sizes[0]) >= WHOLE * len(truth) else "split", sizes)
+    return Judgement(outcome_of(sizes, len(truth), noticed=noticed), sizes)
+
+
+def is_right(sizes: Sequence[int]) -> bool:
+    """Whether a model is right that is made of groups of these sizes, the largest first."""
+    return sizes[0] >= SAME_SHARE * sum(sizes)
+
+
+def outcome_of(sizes: Sequence[Sequence[int]], photos: int, *, noticed: bool) -> Outcome:
+    """The outcome of a reconstruction.
+
+    Args:
+      sizes: those of the groups of each model that is judged, the largest first.
+      photos: the number of photos that should be registered.
+      noticed: whether the run says that its model may be wrong.
+    """
+    if not sizes:
+        return "no model"
+    if not all(map(is_right, sizes)):
+        return "wrong, noticed" if noticed else "wrong, not noticed"
+    return "right" if sum(sizes[0]) >= WHOLE * photos else "split"

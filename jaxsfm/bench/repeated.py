@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.scene_folder import write_scene_folder
+from jaxsfm.bench.scene_folder import ScenePhotos, check_scene, write_scene_folder
 from jaxsfm.bench.synthetic import TexturedPlane, look_at, render
 from jaxsfm.bench.walls import moved, posters, shift, texture, turn, wall
 from jaxsfm.colmap.poses import CameraPose
@@ -150,8 +150,7 @@ def repeated_scene(name: str, seed: int) -> RepeatedScene:
     Raises:
       ValueError: there is no such scene.
     """
-    if name not in SCENES:
-        raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}")
+    check_scene(name, SCENES)
     kind, _, suffix = name.removeprefix(PREFIX).partition("-")
     rng = np.random.default_rng([seed, zlib.crc32(kind.encode())])
     scene = KINDS[kind](rng, seed)
@@ -160,17 +159,10 @@ def repeated_scene(name: str, seed: int) -> RepeatedScene:
 
 
 def write_repeated(folder: Path, name: str, seed: int, size: tuple[int, int]) -> None:
-    """Write a scene in the layout of Strecha's sets: images/ with K.txt, and gt_dense_cameras/.
+    """Write a scene that is called as in `SCENES` (`write_scene_folder`)."""
 
-    A folder that is there already stays as it is.
+    def draw() -> ScenePhotos:
+        scene = repeated_scene(name, seed)
+        return ScenePhotos(scene.poses, lambda i: render(scene.planes, scene.poses[i], size))
 
-    Args:
-      name: one of `SCENES`.
-      size: width and height of the photos, pixels.
-    """
-    if folder.is_dir():
-        return
-    scene = repeated_scene(name, seed)
-    write_scene_folder(
-        folder, scene.poses, lambda i: render(scene.planes, scene.poses[i], size), size
-    )
+    write_scene_folder(folder, draw, size)

@@ -216,13 +216,35 @@ def best_pairs(num_inliers: Mapping[Pair, int], n: int) -> set[Pair]:
 
 def component_of(seeds: Iterable[str], edges: Iterable[Pair]) -> set[str]:
     """Return all images that can be reached from `seeds` along `edges`, `seeds` included."""
-    neighbours: dict[str, set[str]] = {}
+    return _reached(seeds, _beside(edges))
+
+
+def components(names: Iterable[str], edges: Iterable[Pair]) -> list[set[str]]:
+    """The groups of images that edges join, the largest first, then by the first name.
+
+    An image without an edge is a group by itself.
+    """
+    beside, found, done = _beside(edges), list[set[str]](), set[str]()
+    for name in sorted(names):
+        if name not in done:
+            found.append(_reached([name], beside))
+            done |= found[-1]
+    return sorted(found, key=lambda group: (-len(group), min(group)))
+
+
+def _beside(edges: Iterable[Pair]) -> dict[str, set[str]]:
+    """The images that edges join each image with."""
+    beside: dict[str, set[str]] = {}
     for a, b in edges:
-        neighbours.setdefault(a, set()).add(b)
-        neighbours.setdefault(b, set()).add(a)
+        beside.setdefault(a, set()).add(b)
+        beside.setdefault(b, set()).add(a)
+    return beside
+
+
+def _reached(seeds: Iterable[str], beside: Mapping[str, set[str]]) -> set[str]:
     reached, queue = set(seeds), list(seeds)
     while queue:
-        for name in neighbours.get(queue.pop(), set()) - reached:
+        for name in beside.get(queue.pop(), set()) - reached:
             reached.add(name)
             queue.append(name)
     return reached

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaxsfm.config import Config
 from jaxsfm.core.types import Status
-from jaxsfm.io.pairs import Pair, component_of
+from jaxsfm.io.pairs import Pair, components
 from jaxsfm.report.run_results import ClosestPair, Component, PairRow, ViewGraph
 from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG
 
@@ -101,14 +101,8 @@ def photo_groups(names: Iterable[str], rows: Sequence[PairRow]) -> list[PhotoGro
     """All groups of the photos `names`, of which `rows` are pairs; the largest group first. A photo
     without a trusted pair is a group by itself."""
     trusted = [row.pair for row in rows if row.trusted]
-    joined = {name for pair in trusted for name in pair}
-    group_of: dict[str, PhotoGroup] = {}
-    groups: list[PhotoGroup] = []
-    for name in sorted(names):
-        if name not in group_of:
-            images = component_of([name], trusted) if name in joined else [name]
-            groups.append(PhotoGroup(frozenset(images)))
-            group_of |= dict.fromkeys(images, groups[-1])
+    groups = [PhotoGroup(frozenset(images)) for images in components(names, trusted)]
+    group_of = {name: group for group in groups for name in group.images}
     for row in sorted(rows, key=lambda row: row.pair):
         one, other = (group_of[name] for name in row.pair)
         if one is not other:
@@ -116,7 +110,7 @@ def photo_groups(names: Iterable[str], rows: Sequence[PairRow]) -> list[PhotoGro
             other.crossing.append(row)
         elif row.trusted:
             one.inside.append(row)
-    return sorted(groups, key=lambda group: (-len(group.images), min(group.images)))
+    return groups
 
 
 def view_graph_report(

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from jaxsfm.io import orientation
 from jaxsfm.io.images import ImageFile, named
-from jaxsfm.io.pairs import Pair, PairCounts, component_of, make_pair
+from jaxsfm.io.pairs import Pair, PairCounts, components, make_pair
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.matching_looks import job_of_look, match_pairs
@@ -87,12 +87,7 @@ def largest_group(names: Collection[str], counts: Mapping[Pair, PairCounts]) -> 
     If no pair is strong, it is the photo with most verified matches.
     """
     strong = [pair for pair, found in counts.items() if found.num_inliers >= LEAST_INLIERS]
-    left, best = sorted({name for pair in strong for name in pair}), set[str]()
-    while left:
-        group = set(component_of({left[0]}, strong))
-        best = group if len(group) > len(best) else best
-        left = [name for name in left if name not in group]
-    return best or {_best_matched(names, counts)}
+    return components(names, strong)[0] if strong else {_best_matched(names, counts)}
 
 
 def _best_matched(names: Collection[str], counts: Mapping[Pair, PairCounts]) -> str:

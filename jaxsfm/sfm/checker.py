@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -56,17 +56,11 @@ class Checker(NamedTuple):
     """Gives a model the points of all matches. The mapper's own points are few, and do not show
     small differences."""
 
-    def check(
-        self, models: "Sequence[pycolmap.Reconstruction]", refuted: Collection[Pair]
-    ) -> list[Checked | None]:
-        """The checks of models; None where one was not checked.
-
-        Args:
-          refuted: the pairs that earlier checks have refuted.
-        """
+    def check(self, models: "Sequence[pycolmap.Reconstruction]") -> list[Checked | None]:
+        """The checks of models; None where one was not checked."""
         if not self.config.checked:
             return [None] * len(models)
-        matches = self._matches(refuted)
+        matches = self._matches()
         checks = []
         for each in models:
             if each.num_reg_images() < MIN_VIEWS:
@@ -92,7 +86,7 @@ class Checker(NamedTuple):
         try:
             found = second_places(
                 *self._opened(model),
-                self._matches(()),
+                self._matches(),
                 self._refinement(),
                 done.against,
             )
@@ -104,9 +98,9 @@ class Checker(NamedTuple):
     def _opened(self, model: "pycolmap.Reconstruction") -> tuple[Model, DeviceImages]:
         return opened(self.with_all_points(model), self.given.photos)
 
-    def _matches(self, refuted: Collection[Pair]) -> VerifiedMatches:
+    def _matches(self) -> VerifiedMatches:
         given = self.given
-        return VerifiedMatches(given.matches, given.two_views.keys(), refuted, self.seed)
+        return VerifiedMatches(given.matches, given.two_views.keys(), (), self.seed)
 
     def _refinement(self) -> Refinement:
         return self.config.refinement or Refinement()

@@ -53,19 +53,15 @@ class KeptRefinement(NamedTuple):
         return Refined(model, Model.from_colmap(model, before.model.sizes)), PassFigures(**row)
 
     def finished(
-        self, model: "pycolmap.Reconstruction", refine: Callable[[], RefinedModel], about: list[Any]
+        self, model: "pycolmap.Reconstruction", refine: Callable[[], RefinedModel]
     ) -> RefinedModel:
-        """What `refine` gives for a model, which may have been done before.
-
-        Args:
-          about: what the outcome depends on besides the model; JSON.
-        """
+        """What `refine` gives for a model, which may have been done before."""
 
         def compute(folder: Path) -> None:
             after, done = refine()
             self._write(folder, after, done and dataclasses.asdict(done))
 
-        after, row = self._kept("refined", compute, [fingerprint(model), *about])
+        after, row = self._kept("refined", compute, [fingerprint(model)])
         return after, None if row is None else figures_from_json(row)
 
     def _write(

@@ -232,7 +232,7 @@ class Mapper:
                 shutil.copyfile(database, source)
                 keep_inliers(source, mapper_matches(read_inliers(source)))
             models = run_mapper(source, options, on_image=self._on_image)
-        checks = self.checker(database).check(models, ())
+        checks = self.checker(database).check(models)
         return MappedModels(trust=trust, database=database, models=models, checks=checks)
 
     def checker(self, database: Path) -> Checker:

@@ -84,7 +84,7 @@ def refine_models(
         if steps is None:
             return refining.refined(model)
         kept = KeptRefinement(steps, f"model-{number}", believed.database)
-        return kept.finished(model, lambda: refining.refined(model, kept.run_pass), [])
+        return kept.finished(model, lambda: refining.refined(model, kept.run_pass))
 
     made = [refine(number, model) for number, model in enumerate(models)]
     # Images may have been taken out: the first model is again the one with most.

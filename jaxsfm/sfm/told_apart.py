@@ -81,7 +81,7 @@ def _parts(
                 refine_intrinsics=options.refine_intrinsics,
                 threads=options.threads,
             )
-            (again,) = checker.check([alone], ())
+            (again,) = checker.check([alone])
             if again is not None:
                 parts, names = _parts((alone, again), checker, options)
                 made += parts

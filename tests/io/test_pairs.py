@@ -7,7 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.pairs import best_pairs, exhaustive_pairs, make_pair, read_pairs
+from jaxsfm.io.pairs import (
+    best_pairs,
+    component_of,
+    components,
+    exhaustive_pairs,
+    make_pair,
+    read_pairs,
+)
 
 NAMES = ["a.jpg", "b.jpg", "c d.jpg", "c", "d.jpg", "é/ü.jpg"]
 
@@ -157,3 +164,15 @@ def test_many_best_pairs_are_all_with_inliers(counts):
 def test_fewer_than_one_best_pair_is_refused(n):
     with pytest.raises(ValueError, match="at least 1"):
         best_pairs({}, n)
+
+
+@given(st.sets(st.tuples(st.integers(0, 8), st.integers(0, 8)), max_size=14))
+def test_the_groups_that_edges_join_are_the_components_of_their_images_the_largest_first(rows):
+    names, edges = (
+        [f"{k}" for k in range(9)],
+        [make_pair(f"{a}", f"{b}") for a, b in rows if a != b],
+    )
+    found = components(names, edges)
+    assert sorted(name for group in found for name in group) == names
+    assert all(group == component_of({name}, edges) for group in found for name in group)
+    assert found == sorted(found, key=lambda group: (-len(group), min(group)))

@@ -11,7 +11,7 @@ import pytest
 from room_run import NAMES, model_with, room_photos
 from room_scene import Room, other_scene
 from test_new_points import all_matches
-from verdicts import check_of
+from verdicts import check_of, taken_out
 
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.model_images import fingerprint, registered
@@ -32,15 +32,7 @@ from jaxsfm.sfm.stage_files import VerificationFigures
 from jaxsfm.sfm.view_graph import Verdict
 
 LOST = NAMES[3]
-OUT = Placement(
-    name=LOST,
-    registered=True,
-    octave_px=None,
-    candidates=160,
-    agreed=8,
-    error_px=None,
-    held=3,
-)
+OUT = taken_out(LOST)
 REFINED = RefinementFigures(passes=[], placed=[])
 TAKEN_OUT = RefinementFigures(passes=[], placed=[OUT])
 

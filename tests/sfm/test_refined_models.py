@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from room_scene import SIZE, noisy_model, read_of
+from verdicts import taken_out
 
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_images import part_of, registered
@@ -13,21 +14,11 @@ from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module
 from jaxsfm.sfm.refine.evidence import Evidence
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.refined_models import Believed, RefinedModels, refine_models
 
 NAMES = [f"{k}.png" for k in range(5)]
 DATABASE, OPTIONS = Path("d.db"), MapOptions(seed=3)
-OUT = Placement(
-    name=NAMES[4],
-    registered=True,
-    octave_px=None,
-    candidates=160,
-    agreed=8,
-    error_px=None,
-    held=3,
-)
-TAKEN_OUT = RefinementFigures(passes=[], placed=[OUT])
+TAKEN_OUT = RefinementFigures(passes=[], placed=[taken_out(NAMES[4])])
 STAYS = RefinementFigures(passes=[], placed=[])
 
 

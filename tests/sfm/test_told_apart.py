@@ -24,7 +24,7 @@ class FakeChecker:
         self.parts = {frozenset(sum(each, [])): each for each in parts}
         self.unchecked, self.asked = unchecked, []
 
-    def check(self, models, refuted) -> list[Checked | None]:
+    def check(self, models) -> list[Checked | None]:
         (names,) = (frozenset(registered(model)) for model in models)
         self.asked.append(names)
         if names == self.unchecked:

@@ -34,7 +34,7 @@ class DoubtCurve:
 
 
 CURVE = DoubtCurve(half=0.058, power=0.87, most=0.39)
-"""Fitted to the first mappings of drawn scenes of the half that chooses, 31 right ones and six
+"""Fitted to the first mappings of drawn scenes of the half that chooses, 31 right ones and five
 wrong ones whose photos contradict each other (docs/decisions/one-road.md). The limit lies between
 them: right models have a disagreement of up to 0.029, and wrong ones of 0.042 and more."""
 MAX_CONTRADICTED = CURVE.most_contradicted()

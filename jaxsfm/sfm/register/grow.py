@@ -7,9 +7,8 @@ Places that the view itself or its neighbours contradict are given up
 (`jaxsfm.sfm.register.triangulate`), in which the next round locates further views.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
@@ -18,12 +17,10 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.placed_views import Placed, doubts
 from jaxsfm.sfm.photo_order import neighbours
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.octave_pose import MIN_COUNT, MIN_SHARE
+from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
 from jaxsfm.sfm.register.locate_view import Localization
 from jaxsfm.sfm.register.place import Place, UnregisteredView, best_place, place_in
 from jaxsfm.sfm.register.triangulate import new_points
-
-_NOT_TRUSTED: dict[str, Any] = {"trusted": False, "octave_px": None, "points": None}
 
 
 class ExtendedModels(NamedTuple):
@@ -91,8 +88,8 @@ def grow(
             own = {name: place for name, place in fresh.items() if place.model == k}
             against = _against(_with_placed(models[k], own), own, matches, images, refinement)
             for name, why in against.items():
-                refused = dataclasses.replace(own.pop(name).found, **_NOT_TRUSTED, why=why)
-                tried[name][k] = fresh[name]._replace(found=refused)
+                place = own.pop(name)
+                tried[name][k] = place._replace(found=place.found.refused(why))
             if own:
                 model = _with_placed(models[k], own)
                 more = new_points(model, own, matches, images, refinement=refinement)
@@ -114,11 +111,10 @@ def _held(located: Localization) -> Localization:
     count = 0 if located.points is None else len(located.points.rows)
     if not located.trusted or count >= MIN_COUNT:
         return located
-    why = (
+    return located.refused(
         f"alignment finds {located.agreed} of the {located.candidates} points that it would show "
         f"there, but only {count} of them hold it (needed: {MIN_COUNT})"
     )
-    return dataclasses.replace(located, **_NOT_TRUSTED, why=why)
 
 
 def _against(
@@ -129,10 +125,7 @@ def _against(
     refinement: Refinement | None,
 ) -> dict[str, str]:
     """What speaks against the places of new views in a model, in words, by name."""
-    details = {
-        name: found.octave_px == 1 and found.agreed >= MIN_SHARE * found.candidates
-        for name, found in ((name, place.found) for name, place in own.items())
-    }
+    details = {name: place.found.rests_on_details for name, place in own.items()}
     placed = Placed(details, neighbours(matches.keys()), matches)
     return doubts(model, images, refinement or Refinement(), placed)
 

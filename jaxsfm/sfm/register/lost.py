@@ -93,9 +93,7 @@ def register_lost(
     key = digest(settled.key, *settings, given.config.closer_looks, models)
     try:
         folder = kept.folder.stage("registered", key, compute)
-    except (
-        ImageError
-    ) as error:  # a photo of a model was deleted since; perhaps it is back next time
+    except ImageError as error:  # a photo of a model is gone; perhaps it is back next time
         logger.warning("no photos were registered: %s", error)
         return made
     refinement, order = stage_files.read_refinement(folder)
@@ -133,10 +131,11 @@ class _Registration:
 
     def register(self, matches: Mapping[Pair, PairResult]) -> bool:
         """Register lost photos by these matches, original pixels; says whether any was."""
+        placed = self.placed()
         wanted = {
             name: view
             for name in sorted(self.lost())
-            if (view := self._unregistered(name, matches)) is not None
+            if (view := self._unregistered(name, placed, matches)) is not None
         }
         own = {name for each in wanted.values() for name in each.shortlist} | wanted.keys()
         pairs = [p for p in matches if wanted.keys() & set(p) and own >= set(p)]
@@ -156,9 +155,13 @@ class _Registration:
         return bool(grown.placed)
 
     def _unregistered(
-        self, name: str, matches: Mapping[Pair, PairResult]
+        self, name: str, placed: Collection[str], matches: Mapping[Pair, PairResult]
     ) -> UnregisteredView | None:
-        """A lost photo with the camera that it has in each model; None if it cannot be used."""
+        """A lost photo with the camera that it has in each model; None if it cannot be used.
+
+        Args:
+          placed: the photos with a place.
+        """
         partners = {
             other: matches[pair].num_inliers
             for pair in matches
@@ -180,7 +183,6 @@ class _Registration:
             shared |= camera.camera_id in cameras
             refined = cameras.get(camera.camera_id, camera)
             views.append(View.without_pose(name, image_id, refined, size, Pixels(scale)))
-        placed = self.placed()
         ranked = sorted(partners, key=lambda other: (other not in placed, -partners[other], other))
         own_camera = self._given.options.refine_intrinsics and not shared
         return UnregisteredView(views, own_camera, sorted(ranked[:SHORTLIST]))
