@@ -14,12 +14,13 @@ from jaxsfm.errors import UserError
 EngineName = Literal["local", "ray"]
 Mapper = Literal["incremental", "global"]
 """COLMAP's mappers."""
-Step = Literal["upright", "map-again", "split", "second-places", "register"]
+Step = Literal["upright", "map-again", "split", "second-places", "refine", "register"]
 """The steps of a run that can be left out, to see what they are worth (`jaxsfm.sfm.road`).
 
 upright: photos that are stored sideways are turned. map-again: the second mapping. split: models in
 which photos contradict each other are split. second-places: photos are looked for in other places.
-register: photos without a place are registered in the refined models.
+refine: the models are refined. register: photos without a place are registered in the refined
+models.
 """
 CameraSharing = Literal["auto", "single", "folder", "photo"]
 """Which photos share one camera (`jaxsfm.colmap.cameras`)."""

@@ -5,6 +5,7 @@ are also reconstructed with RootSIFT and COLMAP's mapper, once, in OUT/SET/seed0
 whose report is there is not made again; only its models are judged again.
 """
 
+import dataclasses
 import datetime
 import subprocess
 import tempfile
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 import jaxsfm
 from jaxsfm.bench.figures import Cells, collect
 from jaxsfm.bench.ledger_judges import Judged, judged
+from jaxsfm.bench.ledger_parts import NOTHING_AFTER, part_runs
 from jaxsfm.bench.ledger_photos import SetPhotos
 from jaxsfm.bench.ledger_runs import (
     SECONDS,
@@ -181,6 +183,9 @@ def _run_options(options: LedgerOptions, seed: int) -> RunOptions:
 def _set_rows(each: LedgerSet, out: Path, options: LedgerOptions) -> Iterator[LedgerRow]:
     """The rows of a set, one for each seed."""
     home, left_out = out / each.name, "+".join(options.without)
+    if options.parts:
+        yield from _part_rows(each, home, options)
+        return
     end = f"-without-{left_out}" if left_out else ""
     folders = {seed: home / f"seed{seed}{end}" / "run" for seed in range(options.seeds)}
     if options.only_judge:
@@ -196,6 +201,15 @@ def _set_rows(each: LedgerSet, out: Path, options: LedgerOptions) -> Iterator[Le
                 _with_rootsift(each, run, home, report)
         rootsift = rootsift_figures(each, given, home / "seed0" / "rootsift")
         yield {**judged_row(each, given, seed, folder, rootsift), "without": left_out}
+
+
+def _part_rows(each: LedgerSet, home: Path, options: LedgerOptions) -> Iterator[LedgerRow]:
+    """The rows of parts of a set; their seeds are the numbers of the parts."""
+    chosen = dataclasses.replace(_run_options(options, 0), without=NOTHING_AFTER, progress=False)
+    run = LedgerRun(each.photos(home), chosen, each.max_size)
+    count, whole = options.parts if each.real else 0, home / "seed0" / "run"
+    for number, part, folder in part_runs(run, home / "parts", whole, count):
+        yield {**judged_row(each, part, number, folder, None), "without": "parts"}
 
 
 def bench_ledger(options: LedgerOptions) -> LedgerFigures:

@@ -54,11 +54,12 @@ def as_strecha(folder: Path, home: Path) -> SetPhotos:
     return SetPhotos(folder / "images", found.truth, found.camera, "exhaustive")
 
 
-def as_frames(folder: Path, home: Path, *, first: int | None = None) -> SetPhotos:
-    """Photos with NAME.pose.txt and K.txt beside them; all, or links to so many first ones."""
+def as_frames(folder: Path, home: Path, *, every: int = 1, first: int | None = None) -> SetPhotos:
+    """Photos with NAME.pose.txt and K.txt beside them; all, or links to each so-many-th one, or to
+    so many first ones."""
     truth, camera, photos = read_poses(folder, option="--root"), str(folder / "K.txt"), folder
-    if first is not None:
-        names = [path.name for path in chosen_frames(folder, 1, 0).mapped[:first]]
+    if first is not None or every > 1:
+        names = [path.name for path in chosen_frames(folder, every, 0).mapped[:first]]
         with writing(f"--out {home}"):
             photos = linked(folder, names, home / "photos")
         truth = of_photos(truth, names)

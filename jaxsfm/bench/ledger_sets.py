@@ -38,8 +38,9 @@ CASTLE, TURNED = "castle-P19", "Herz-Jesus-P8"
 AMBIGUOUS_SIZES, HARD_SIZES = (600, 800), (1000, 1280, 1600)
 """The limits of the longer side of the photos at which the castle is mapped, pixels. At the small
 ones its courtyard is taken for its own mirror."""
-FRAMES = 50
-"""So many first frames of the kitchen are a set of their own."""
+EVERY, FRAMES = 10, 50
+"""Each so-many-th frame of the kitchen, and so many first ones, are sets of their own. The first
+frames show the same from nearly one place."""
 
 
 class LedgerSet(NamedTuple):
@@ -77,11 +78,12 @@ class LedgerSet(NamedTuple):
 
 def _ordinary_sets(root: Path) -> list[LedgerSet]:
     strecha, kitchen = root / "strecha", root / "kitchen"
-    some = partial(as_frames, first=FRAMES)
+    some, first = partial(as_frames, every=EVERY), partial(as_frames, first=FRAMES)
     return [
         *(LedgerSet(name, "ordinary", strecha / name, as_strecha) for name in STRECHA),
         *(LedgerSet(name, "ordinary", root / name, as_frames) for name in WITH_POSES),
-        LedgerSet(f"kitchen{FRAMES}", "ordinary", kitchen, some, judge="rotations"),
+        LedgerSet(f"kitchen-every{EVERY}", "ordinary", kitchen, some, judge="rotations"),
+        LedgerSet(f"kitchen-first{FRAMES}", "ordinary", kitchen, first, judge="rotations"),
         LedgerSet("kitchen", "ordinary", kitchen, as_frames, judge="rotations"),
         *(LedgerSet(name, "ordinary", root / name, as_photos) for name in WITHOUT_POSES),
         LedgerSet("sacre_coeur", "ordinary", root / "sacre_coeur", as_phototourism),

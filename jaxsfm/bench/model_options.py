@@ -177,8 +177,12 @@ class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
       without: Leave out these steps of all runs. upright: photos that are stored sideways are
         turned. map-again: the second mapping. split: models in which photos contradict each other
-        are split. second-places: photos are looked for in other places. register: photos without a
-        place are registered in the refined models.
+        are split. second-places: photos are looked for in other places. refine: the models are
+        refined. register: photos without a place are registered in the refined models.
+      parts: Map so many parts of each set of photos, and check them, instead of the whole set.
+        Nothing follows the check: the first mapping is not mended, refined or looked at again. This
+        says how often the check is wrong. 0: the whole sets. A rendered scene has one part, which
+        is all of it.
       out: Folder for photos that are made, for databases and for models. A later call makes only
         the runs that have no report there.
       markdown: Write the table to this file, with a line for each set.
@@ -190,6 +194,7 @@ class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
     seeds: int = 3
     threads: int = -1
     without: tuple[Step, ...] = ()
+    parts: int = 0
     out: Path | None = None
     markdown: Path | None = None
     only_judge: bool = False
@@ -199,6 +204,10 @@ class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
         check_threads(self.threads)
         if self.only_judge and self.out is None:
             raise UserError("--only-judge needs --out, the folder of the runs")
+        if self.parts < 0:
+            raise UserError(f"--parts must be at least 0; got {self.parts}")
+        if self.parts and self.only_judge:
+            raise UserError("--parts makes runs, so it cannot be used with --only-judge")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

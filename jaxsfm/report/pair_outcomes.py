@@ -8,7 +8,7 @@ from jaxsfm.config import Config
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, components
 from jaxsfm.report.run_results import ClosestPair, Component, PairRow, ViewGraph
-from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG
+from jaxsfm.sfm.limits import TRUST
 
 COLMAP_MIN_INLIERS = 15
 """The fewest inliers of a pair that COLMAP verifies: its default, which this package keeps."""
@@ -49,10 +49,10 @@ class PairOutcomes(NamedTuple):
                 return f"{row.colmap_inliers} inliers, but they give no relative pose"
             return (
                 f"{row.colmap_inliers} inliers, but its rotation differs from that of stronger "
-                f"pairs by {verdict.rotation_error_deg:.0f} deg ({TOLERANCE_DEG:.0f} deg are "
+                f"pairs by {verdict.rotation_error_deg:.0f} deg ({TRUST.rotation_deg:.0f} deg are "
                 f"allowed), and its strength is {verdict.strength:.3f}"
-                + f" (a pair of strength {STRONG} or more may have any rotation)"
-                * (verdict.strength < STRONG)
+                + f" (a pair of strength {TRUST.strong} or more may have any rotation)"
+                * (verdict.strength < TRUST.strong)
             )
         if row.inliers and row.handed_on:
             return (

@@ -19,16 +19,12 @@ from jaxsfm.io.pairs import Pair, PairCounts, PairResult
 from jaxsfm.io.store import Store
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.runs.job import Job
+from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.two_photos.matched import match_photos
 from jaxsfm.sfm.two_photos.pair_looks import HOPELESS
 from jaxsfm.sfm.two_photos.plane_looks import one_match_each
 
-CLOSER = 3
-"""Pairs of a photo that are looked at closer. Each takes up to a minute on two cores."""
-WORTH_A_TRY = 60.0
-"""Matches of a pair count if they have at least this evidence. They are more often wrong than right
-then: alignment has to confirm the place that they give."""
-KEPT_FEATURES = CLOSER + 1
+KEPT_FEATURES = REGISTER.partners + 1
 """Photos whose features are in memory: those of one photo and of its partners."""
 
 
@@ -75,7 +71,7 @@ def _matched(job: Job, features: tuple[ImageFeatures, ImageFeatures]) -> PairRes
     found = match_photos(
         job.weights, *features, config=job.config, seed=job.seed, worth_closer=HOPELESS
     )
-    if found.evidence < WORTH_A_TRY:
+    if found.evidence < REGISTER.evidence:
         return without_matches(found.result)
     first, second = (job.config.fine_stride * float(np.mean(each.scale)) for each in features)
     return one_match_each(found.result, (first, second))
@@ -114,7 +110,7 @@ def pairs_to_look_at(
             for pair in closest_pairs(name, counts)
             if set(pair) - {name} <= set(placed) and counts[pair].num_tentative >= least
         ]
-        found |= dict.fromkeys(own[:CLOSER])
+        found |= dict.fromkeys(own[: REGISTER.partners])
     return list(found)
 
 

@@ -20,12 +20,9 @@ from jaxsfm.runs.matching_looks import (
     match_pairs,
 )
 from jaxsfm.runs.turned_photos import Trials, find_turned
+from jaxsfm.sfm.limits import REGISTER
 
 logger = logging.getLogger("jaxsfm")
-
-CLOSEST = 10
-"""If no model was made of photos at a small size, each photo is matched with so many others at full
-size: those with which it has most matches."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,7 +49,11 @@ class RunPhotos:
         Args:
           before: the counts of the pairs at a small size.
         """
-        best = {pair for name in self.images for pair in closest_pairs(name, before)[:CLOSEST]}
+        best = {
+            pair
+            for name in self.images
+            for pair in closest_pairs(name, before)[: REGISTER.partners_without_model]
+        }
         job = job_of_look(self.job, self.identity, self.job.config)
         counts, _ = match_pairs(job, self.images, sorted(best), seconds)
         return MatchedPairs(job.store, job.config, counts)

@@ -1,8 +1,9 @@
 """Photos that are stored sideways without a note in EXIF: which ones, and by how much.
 
 VGG does not recognise turned content, so a photo that is turned against the others has no strong
-pair with them. Before the first mapping, the quarter turns of such photos are tried: a few photos
-of the largest group that strong pairs join are matched with them at a small size.
+pair with them, and photos that strong pairs join are stored alike. Before the first mapping, the
+quarter turns of one photo of each group are tried: it is matched at a small size with a few photos
+of the largest group.
 """
 
 import dataclasses
@@ -15,18 +16,9 @@ from jaxsfm.io.pairs import Pair, PairCounts, components, make_pair
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.matching_looks import job_of_look, match_pairs
+from jaxsfm.sfm.limits import UPRIGHT
 
 logger = logging.getLogger("jaxsfm")
-
-TRIAL_SIZE = 400
-"""Longer side of the photos in a trial, pixels. A trial of a photo then costs about as much as its
-description at 800 px."""
-PARTNERS = 8
-"""Photos that a trial matches."""
-LEAST_INLIERS = 60
-"""A pair is strong, and a turn is believed, with so many verified matches. Those of a trial are
-summed over all partners. A turn must have twice as many as any other one. Strangers have a plane of
-26 by accident, rarely two."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,14 +35,14 @@ class Trials:
         inliers = [self._inliers(name, partners, quarters) for quarters in range(4)]
         best = max(range(4), key=lambda quarters: inliers[quarters])
         others = max(count for quarters, count in enumerate(inliers) if quarters != best)
-        return best if inliers[best] >= max(LEAST_INLIERS, 2 * others) else 0
+        return best if inliers[best] >= max(UPRIGHT.least_inliers, 2 * others) else 0
 
     def _inliers(self, name: str, partners: Sequence[str], quarters: int) -> int:
         """The verified matches of a turned photo with its partners."""
         images = {other: self.images[other] for other in partners}
         images[name] = turned(self.images[name], quarters)
         config = self.job.config
-        config = dataclasses.replace(config, max_size=min(TRIAL_SIZE, config.max_size))
+        config = dataclasses.replace(config, max_size=min(UPRIGHT.trial_px, config.max_size))
         look = job_of_look(self.job, self.identity.with_images([images[name]]), config)
         pairs = [make_pair(name, other) for other in partners]
         counts, _ = match_pairs(look.here(), images, pairs, self.seconds)
@@ -70,24 +62,39 @@ def find_turned(trials: Trials, counts: Mapping[Pair, PairCounts]) -> dict[str, 
       counts: of the pairs that were tried.
     """
     images = trials.images
-    upright = largest_group(images, counts)
-    turns = {
-        name: quarters
-        for name in sorted(images.keys() - upright)
-        if (quarters := trials.turn_of(name, partners(name, sorted(upright), counts)))
-    }
+    upright, *others = groups_stored_alike(images, counts)
+    turns = dict[str, int]()
+    for group in others:
+        name = min(group, key=lambda each: _far(each, upright, counts))
+        quarters = trials.turn_of(name, partners(name, sorted(upright), counts))
+        turns |= dict.fromkeys(group, quarters) if quarters else {}
     if turns:
-        logger.info("stored sideways, turned and matched again: %s", named([*turns]))
-    return {name: turned(images[name], quarters) for name, quarters in turns.items()}
+        logger.info("stored sideways, turned and matched again: %s", named(sorted(turns)))
+    return {name: turned(images[name], quarters) for name, quarters in sorted(turns.items())}
 
 
-def largest_group(names: Collection[str], counts: Mapping[Pair, PairCounts]) -> set[str]:
-    """The largest group of photos that strong pairs join; of equal ones, the first by name.
+def groups_stored_alike(
+    names: Collection[str], counts: Mapping[Pair, PairCounts]
+) -> list[set[str]]:
+    """Groups of photos that strong pairs join, the largest first; of equal ones, the first by name.
 
-    If no pair is strong, it is the photo with most verified matches.
+    If no pair is strong, the photo with most verified matches comes first.
     """
-    strong = [pair for pair, found in counts.items() if found.num_inliers >= LEAST_INLIERS]
-    return components(names, strong)[0] if strong else {_best_matched(names, counts)}
+    strong = [pair for pair, found in counts.items() if found.num_inliers >= UPRIGHT.least_inliers]
+    groups = components(names, strong)
+    if not strong:
+        best = _best_matched(names, counts)
+        groups.sort(key=lambda group: best not in group)
+    return groups
+
+
+def _far(
+    name: str, others: Collection[str], counts: Mapping[Pair, PairCounts]
+) -> tuple[int, int, str]:
+    """The lower, the more matches a photo has with others; verified ones count first."""
+    found = [counts[pair] for pair in (make_pair(name, each) for each in others) if pair in counts]
+    verified = sum(each.num_inliers for each in found)
+    return -verified, -sum(each.num_tentative for each in found), name
 
 
 def _best_matched(names: Collection[str], counts: Mapping[Pair, PairCounts]) -> str:
@@ -110,7 +117,7 @@ def partners(name: str, upright: Sequence[str], counts: Mapping[Pair, PairCounts
         return (found.num_inliers, found.num_tentative) if found else (0, 0)
 
     close = sorted(upright, key=lambda other: (*(-c for c in closeness(other)), other))
-    chosen = close[: PARTNERS // 2]
-    rest = sorted(close[PARTNERS // 2 :])
-    step = max(1, -(-len(rest) // (PARTNERS - len(chosen) or 1)))
+    chosen = close[: UPRIGHT.partners // 2]
+    rest = sorted(close[UPRIGHT.partners // 2 :])
+    step = max(1, -(-len(rest) // (UPRIGHT.partners - len(chosen) or 1)))
     return [*chosen, *rest[::step]]

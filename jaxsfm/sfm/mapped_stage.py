@@ -62,6 +62,10 @@ class MatchedPhotos:
     def __post_init__(self) -> None:
         self.cameras.check_fits(self.images)
 
+    def unrefined(self) -> "MatchedPhotos":
+        """The same photos, whose models are not refined."""
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, refinement=None))
+
 
 class VerifiedStage(NamedTuple):
     """The verified pairs, in the folder of their stage."""

@@ -27,9 +27,10 @@ from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Basis, Contradiction, ModelCheck
 from jaxsfm.sfm.checker import Checker, VerifiedPairs
+from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.mapper_matches import mapper_matches
 from jaxsfm.sfm.photo_order import follow, neighbours, ordered, orders
-from jaxsfm.sfm.view_graph import STRONG, Verdict, strengths, trusted_pairs
+from jaxsfm.sfm.view_graph import Verdict, strengths, trusted_pairs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -268,7 +269,7 @@ class Mapper:
         strength of 0.0002, and all others that follow each other 0.7 to 1.
         """
         strength = strengths(self._geometries())
-        return {pair for pair in neighbours(strength.keys()) if strength[pair] >= STRONG}
+        return {pair for pair in neighbours(strength.keys()) if strength[pair] >= TRUST.strong}
 
     def _geometries(self) -> dict[Pair, PairGeometry]:
         return {pair: view.geometry for pair, view in self.given.two_views.items()}

@@ -14,16 +14,7 @@ from statistics import mode
 from scipy.cluster.hierarchy import DisjointSet
 
 from jaxsfm.io.pairs import Pair, make_pair
-
-EQUAL_STEPS = 0.5
-"""Numbers are those of a sequence if so many of their steps are equal: some photos may be missing,
-but the identifiers of a photo site have no equal steps."""
-MIN_NUMBERED = 5
-"""Fewer photos have no order worth following."""
-
-MOST_NUMBERED = 0.5
-"""The order says how to join all photos if so many of them are numbered. Of the 135 photos of
-statue, 8 are: frames of a video."""
+from jaxsfm.sfm.limits import ORDER
 
 Order = list[str]
 """Names of photos, one taken after the other."""
@@ -43,14 +34,16 @@ def orders(names: Iterable[str]) -> list[Order]:
     for numbered in rows.values():
         numbers = sorted(numbered)
         steps = [after - before for before, after in itertools.pairwise(numbers)]
-        if len(numbers) >= MIN_NUMBERED and steps.count(mode(steps)) >= EQUAL_STEPS * len(steps):
+        if len(numbers) >= ORDER.least_numbered and steps.count(
+            mode(steps)
+        ) >= ORDER.equal_steps * len(steps):
             found.append([numbered[number] for number in numbers])
     return found
 
 
 def ordered(found: Iterable[Order], names: Collection[str]) -> bool:
     """Whether the orders say how to join all photos."""
-    return len({name for order in found for name in order}) >= MOST_NUMBERED * len(names)
+    return len({name for order in found for name in order}) >= ORDER.numbered_share * len(names)
 
 
 def follow(found: Iterable[Order], pairs: Mapping[Pair, float]) -> set[Pair]:

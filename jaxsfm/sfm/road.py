@@ -79,6 +79,8 @@ def walk(
         settled = settle(given, verified, (first, second), kept, without=without)
     with watch.stage("refinement"):
         # 7. Move the keypoints to a fraction of a pixel.
+        if "refine" in without:
+            given = given.unrefined()
         made = refine_settled(given, verified, settled, database, kept, watch.on_pass)
     if "register" in without or given.config.refinement is None:
         return made

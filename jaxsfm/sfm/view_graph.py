@@ -12,8 +12,9 @@ are compared, the strongest first:
    the pairs between them vote, with their strengths, on the rotation between the groups; the
    largest group of agreeing votes decides.
 3. The rotations of all images are then averaged over the agreeing pairs (robustly), and a pair
-   whose own rotation is further than `TOLERANCE_DEG` from them is dropped, unless it is strong:
-   then its rotation may be poor (a plane, a guessed focal length), but its matches are sound.
+   whose own rotation is further than `TRUST.rotation_deg` from them is dropped, unless it is
+   strong: then its rotation may be poor (a plane, a guessed focal length), but its matches are
+   sound.
 4. A pair that alone joins two groups of photos agrees with the averaged rotations whatever its own
    rotation is. If it is not strong, nothing speaks for it, and it is dropped.
 
@@ -30,18 +31,8 @@ import numpy as np
 
 from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.io.pairs import Pair, make_pair
+from jaxsfm.sfm.limits import TRUST
 
-STRONG = 0.3
-"""A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09 before
-weak ones lost strength (`WEAK`)."""
-WEAK, STEEPNESS = 0.25, 2.5
-"""A pair loses half of its strength if its weight is this share of the median of all images' best
-pairs. The odds of what it keeps grow with this power of the weight. In 30 runs of castle-P19 at
-five sizes, 461 of 2982 false pairs were trusted without this, and 2 are with it
-(docs/decisions/view-graph.md)."""
-TOLERANCE_DEG = 15.0
-"""Largest error of a trusted pair's rotation against the averaged ones. Two-view rotations of true
-pairs are off by 0.3 deg (median), those of weak pairs by 10."""
 MAX_VOTES = 500
 """At most so many pairs between two groups vote, the strongest ones: the cost is quadratic."""
 
@@ -75,9 +66,9 @@ def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
         for image in pair:
             best[image] = max(best.get(image, 0.0), w)
     known = [w for w in best.values() if w > 0]
-    half = WEAK * float(np.median(known)) if known else 0.0
+    half = TRUST.weak * float(np.median(known)) if known else 0.0
     return {
-        (a, b): float(w / np.sqrt(best[a] * best[b]) / (1 + (half / w) ** STEEPNESS))
+        (a, b): float(w / np.sqrt(best[a] * best[b]) / (1 + (half / w) ** TRUST.steepness))
         if w > 0
         else 0.0
         for (a, b), w in weight.items()
@@ -107,7 +98,7 @@ def trusted_pairs(
             reason = "no relative pose"
         else:
             error = float(_error_deg(pair, geometries, rotations))
-            if error > TOLERANCE_DEG and (strict or strength[pair] < STRONG):
+            if error > TRUST.rotation_deg and (strict or strength[pair] < TRUST.strong):
                 reason = (
                     f"its rotation is {error:.0f} deg from the one that stronger pairs give "
                     f"(its strength is {strength[pair]:.3f} of 1)"
@@ -119,7 +110,7 @@ def trusted_pairs(
             reason=reason,
         )
     for pair in bridges([pair for pair, verdict in verdicts.items() if verdict.trusted]):
-        if strength[pair] < STRONG:
+        if strength[pair] < TRUST.strong:
             why = (
                 f"it alone joins two groups of photos, and it is weak (its strength is "
                 f"{strength[pair]:.3f} of 1)"
@@ -205,7 +196,7 @@ def _grow(
         turned = np.where(swap[:, None, None], relative[rows].transpose(0, 2, 1), relative[rows])
         # From the world of b to the world of a, as each pair determines it.
         moves = rotations[in_a].transpose(0, 2, 1) @ turned.transpose(0, 2, 1) @ rotations[in_b]
-        close = rotation_angle_deg(moves[:, None], moves[None]) < TOLERANCE_DEG
+        close = rotation_angle_deg(moves[:, None], moves[None]) < TRUST.rotation_deg
         # Among equals the first one wins, which is the strongest.
         winner = int(np.argmax(close @ votes[rows]))
         move = mean_rotation(moves[close[winner]], votes[rows][close[winner]])

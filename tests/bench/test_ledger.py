@@ -174,10 +174,13 @@ def test_every_second_photo_of_the_turned_set_shows_the_same_in_the_direction_of
         np.testing.assert_allclose(pose.centre, true.centre, atol=1e-6)
 
 
-def test_the_first_frames_of_a_sequence_have_their_poses(street_sequence, tmp_path):
-    given = as_frames(street_sequence, tmp_path, first=4)
+@pytest.mark.parametrize(
+    ("chosen", "part"), [({"first": 4}, slice(4)), ({"every": 2}, slice(None, None, 2))]
+)
+def test_some_frames_of_a_sequence_have_their_poses(street_sequence, tmp_path, chosen, part):
+    given = as_frames(street_sequence, tmp_path, **chosen)
     names = sorted(path.name for path in given.photos.iterdir())
-    assert names == sorted(path.name for path in street_sequence.glob("*.png"))[:4]
+    assert names == sorted(path.name for path in street_sequence.glob("*.png"))[part]
     assert given.truth and sorted(given.truth) == [Path(name).stem for name in names]
 
 

@@ -1,6 +1,7 @@
 """Second tries of the mapper, and scenes that make the first one hard."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -179,7 +180,7 @@ def test_only_a_draft_asks_for_more_parallax(monkeypatch, tmp_path, scene, draft
     options = dataclasses.replace(ONE, draft=draft, scale=10.0)
     assert mapper.run_mapper(tmp_path / "d.db", options) == []
     own = mapper.incremental_options(options).mapper.filter_min_tri_angle
-    (p,) = given
+    p = given[0]
     assert p.triangulation.min_angle == p.mapper.filter_min_tri_angle
     assert (p.mapper.filter_min_tri_angle > own) == draft
 
@@ -206,25 +207,28 @@ def planar_results(count=5, points=200):
     return seen
 
 
+def matched_everywhere(names, seen):
+    """Matches of all pairs of photos that show the same 200 points at these pixels."""
+    cells = np.tile(np.arange(200, dtype=np.int32)[:, None], (1, 2))
+    return {
+        (names[i], names[j]): PairResult(
+            pair=(names[i], names[j]),
+            cells=cells,
+            keypoints0=seen[i].astype(np.float32),
+            keypoints1=seen[j].astype(np.float32),
+            plane=np.zeros(200, np.int32),
+            homographies=np.eye(3)[None],
+            num_tentative=200,
+            num_dropped=0,
+            status=Status.VERIFIED,
+        )
+        for i, j in itertools.combinations(range(5), 2)
+    }
+
+
 def test_a_planar_scene_is_mapped_whole(tmp_path, scene):
     """A facade: every initial pair is planar."""
-    seen = planar_results()
-    names = scene.names
-    cells = np.tile(np.arange(200, dtype=np.int32)[:, None], (1, 2))
-    results = {}
-    for i in range(5):
-        for j in range(i + 1, 5):
-            results[names[i], names[j]] = PairResult(
-                pair=(names[i], names[j]),
-                cells=cells,
-                keypoints0=seen[i].astype(np.float32),
-                keypoints1=seen[j].astype(np.float32),
-                plane=np.zeros(200, np.int32),
-                homographies=np.eye(3)[None],
-                num_tentative=200,
-                num_dropped=0,
-                status=Status.VERIFIED,
-            )
+    results = matched_everywhere(scene.names, planar_results())
     write_database(tmp_path / "d.db", scene.images, results, scene.cameras)
     two_views = verified(tmp_path / "d.db", ONE)
     assert all(view.planar for view in two_views.values())
@@ -308,3 +312,17 @@ def test_images_that_are_taken_out_leave_no_point_with_fewer_than_two_observatio
     assert min(left.values()) >= 2 and left.keys() < before.keys()
     seen = {e.image_id for point in model.points3D.values() for e in point.track.elements}
     assert seen == set(model.reg_image_ids())
+
+
+def test_photos_from_nearly_one_place_are_mapped(tmp_path, scene):
+    """The rays of no pair meet at the 4 degrees that COLMAP asks for at the least."""
+    rng = np.random.default_rng(0)
+    xyz = np.c_[rng.uniform(-1, 1, (200, 2)), rng.uniform(4, 7, 200)]
+    seen = [(xyz - [0.06 * k, 0, 0]) @ np.diag([1280.0, 1280, 1]) for k in range(5)]
+    seen = [each[:, :2] / each[:, 2:] + [511.5, 383.5] for each in seen]
+    results = matched_everywhere(scene.names, seen)
+    write_database(tmp_path / "d.db", scene.images, results, scene.cameras)
+    views = verified(tmp_path / "d.db", ONE)
+    assert 1 < max(view.tri_angle_deg for view in views.values()) < 4
+    (found,) = mapper.run_mapper(tmp_path / "d.db", ONE)
+    assert found.num_reg_images() == 5 and found.compute_mean_reprojection_error() < 0.01

@@ -19,9 +19,10 @@ from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import ModelRow, PairRow
 from jaxsfm.report.summary import component_lines, help_lines
 from jaxsfm.sfm.check.model_check import ModelCheck
+from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
-from jaxsfm.sfm.view_graph import STRONG, TOLERANCE_DEG, Verdict
+from jaxsfm.sfm.view_graph import Verdict
 
 REPORT = RunReport.from_json(
     json.loads((Path(__file__).parent / "report_of_format_1.json").read_text())
@@ -362,9 +363,9 @@ def test_an_untrusted_pair_says_by_how_much_it_missed():
     for part in (
         "28 inliers",
         "40 deg",
-        f"{TOLERANCE_DEG:.0f} deg are allowed",
+        f"{TRUST.rotation_deg:.0f} deg are allowed",
         "0.050",
-        str(STRONG),
+        str(TRUST.strong),
     ):
         assert part in missed
     (row,) = found["lost"]

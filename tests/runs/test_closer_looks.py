@@ -12,7 +12,8 @@ from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.store import Store
 from jaxsfm.runs import closer_looks
-from jaxsfm.runs.closer_looks import CLOSER, look_closer, pairs_to_look_at, without_matches
+from jaxsfm.runs.closer_looks import look_closer, pairs_to_look_at, without_matches
+from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.two_photos.pair_looks import HOPELESS
 
 
@@ -28,7 +29,7 @@ def test_the_strongest_pairs_with_placed_photos_are_looked_at():
     tried |= {("blank", "lost"): counts(0, 25), ("bare", "lost"): counts(0, 26)}
     find = functools.partial(pairs_to_look_at, counts=tried, least=26)
     found = find(["lost"], ["a", "b", "c", "d"])
-    assert found == [("b", "lost"), ("d", "lost"), ("a", "lost")] and CLOSER == 3
+    assert found == [("b", "lost"), ("d", "lost"), ("a", "lost")] and REGISTER.partners == 3
     both = find(["other", "lost"], ["a", "lost", "other"])
     assert both == [("lost", "other"), ("a", "lost")]  # each pair once
     assert find(["lost"], ["x"]) == []

@@ -16,8 +16,9 @@ from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs import run_photos
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.matching_looks import MatchedPairs, match_pairs
-from jaxsfm.runs.run_photos import CLOSEST, LostMatcher, RunPhotos
+from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
 from jaxsfm.runs.turned_photos import turned
+from jaxsfm.sfm.limits import REGISTER
 
 TRIED = {pair: counts(30) for pair in exhaustive_pairs("abcd")}
 
@@ -110,7 +111,7 @@ def test_at_full_size_each_photo_is_matched_with_its_best_partners(monkeypatch, 
     for name in names:
         own = [pair for pair in before if name in pair]
         own.sort(key=lambda pair: (before[pair].num_inliers, before[pair].num_tentative))
-        best |= {*own[-CLOSEST:]}
+        best |= {*own[-REGISTER.partners_without_model :]}
     assert asked["pairs"] == sorted(best) and best < {*before}
     assert found.described == asked["config"] == preset("default")
     assert found.counts == dict.fromkeys(sorted(best), counts(99))

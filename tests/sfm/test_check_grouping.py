@@ -12,14 +12,13 @@ from strategies import rng_of, seeds
 from jaxsfm.sfm.check.agreement import Agreement
 from jaxsfm.sfm.check.grouping import (
     MAX_CONTRADICTED,
-    MIN_SHARED,
-    MIN_TESTED,
     Grouping,
     OpposedGroups,
     group_views,
     parts,
     share,
 )
+from jaxsfm.sfm.limits import CHECK
 
 
 def counts(views: int, pairs: dict[tuple[int, int], tuple[int, int]]) -> Agreement:
@@ -54,7 +53,7 @@ def test_views_are_grouped_as_by_a_slow_search_among_sets(seed):
     undecided = rng.integers(0, 40, tested.shape)
     found = Agreement(tested, contradicted, undecided)
     got = group_views(found)
-    want = grouped(tested, contradicted, undecided, MAX_CONTRADICTED, MIN_TESTED)
+    want = grouped(tested, contradicted, undecided, MAX_CONTRADICTED, CHECK.least_tested)
     assert [set(group) for group in got.groups] == want[0]
     said = {
         frozenset(map(frozenset, c.groups)): (c.tested, c.contradicted) for c in got.contradictions
@@ -113,7 +112,7 @@ def test_a_passer_by_who_hides_points_in_one_photo_contradicts_nobody():
     assert group_views(counts(3, pairs)).groups == [[0, 1], [2]]
 
 
-@pytest.mark.parametrize(("tested", "said"), [(MIN_TESTED - 1, 0), (MIN_TESTED, 1)])
+@pytest.mark.parametrize(("tested", "said"), [(CHECK.least_tested - 1, 0), (CHECK.least_tested, 1)])
 def test_too_few_tests_say_nothing(tested, said):
     """Neither that two views contradict each other, nor that they agree."""
     against = counts(2, {(0, 1): (tested, tested), (1, 0): (1000, 1000)})
@@ -186,7 +185,7 @@ def test_no_part_holds_groups_that_contradict_each_other_and_none_could_be_joine
     for one, other in itertools.combinations(range(len(found)), 2):
         between = [(a, b) for a, b in pairs if {at[a], at[b]} == {one, other}]
         opposed = any(pair in against for pair in between)
-        assert opposed or sum(shared[pair] for pair in between) < MIN_SHARED
+        assert opposed or sum(shared[pair] for pair in between) < CHECK.least_shared
     order = rng.permutation(len(groups)).tolist()
     place = {old: new for new, old in enumerate(order)}
     turned = opposing([groups[k] for k in order], *((place[a], place[b]) for a, b in against))
@@ -194,7 +193,9 @@ def test_no_part_holds_groups_that_contradict_each_other_and_none_could_be_joine
     assert [len(part) for part in found] == sorted(map(len, found), reverse=True)
 
 
-@pytest.mark.parametrize(("shared", "count"), [(MIN_SHARED - 1, 3), (MIN_SHARED, 2)])
+@pytest.mark.parametrize(
+    ("shared", "count"), [(CHECK.least_shared - 1, 3), (CHECK.least_shared, 2)]
+)
 def test_a_group_goes_with_the_one_that_it_shares_points_with(shared, count):
     """Group 2 contradicts nobody; groups 0 and 1 share more, but contradict each other."""
     groups = [[0, 1], [2, 3], [4]]
@@ -203,7 +204,7 @@ def test_a_group_goes_with_the_one_that_it_shares_points_with(shared, count):
 
 
 def test_points_that_several_views_of_a_group_see_count_once():
-    seen = observed({(0, 1, 2, 3): MIN_SHARED - 1})
+    seen = observed({(0, 1, 2, 3): CHECK.least_shared - 1})
     assert len(parts(opposing([[0, 1], [2, 3]]), *seen)) == 2
 
 

@@ -22,16 +22,10 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.check.other_places import (
-    MIN_AGREED,
-    MIN_INLIERS,
-    Refused,
-    Surface,
-    other_place,
-    other_places,
-)
-from jaxsfm.sfm.check.pair_fit import MIN_MATCHES, pair_fits
+from jaxsfm.sfm.check.other_places import Refused, Surface, other_place, other_places
+from jaxsfm.sfm.check.pair_fit import pair_fits
 from jaxsfm.sfm.evaluation import Similarity
+from jaxsfm.sfm.limits import CHECK, SECOND_PLACES
 from jaxsfm.sfm.refine import plane_geometry
 
 NAMES = [f"{k}.png" for k in range(6)]
@@ -84,7 +78,9 @@ def test_matches_that_are_displaced_do_not_fit(wall, share, fits):
     assert fit(wall, displaced(result, 3.0)) == pytest.approx(fits, abs=0.05)  # as at night
 
 
-@pytest.mark.parametrize(("count", "said"), [(MIN_MATCHES - 1, False), (MIN_MATCHES, True)])
+@pytest.mark.parametrize(
+    ("count", "said"), [(CHECK.least_matches - 1, False), (CHECK.least_matches, True)]
+)
 def test_a_pair_with_few_matches_has_no_share(wall, count, said):
     assert (fit(wall, true_matches(wall, 0, 1, most=count)) is not None) == said
 
@@ -211,7 +207,10 @@ def test_matches_that_put_a_view_where_it_is_give_no_second_place(equal):
     assert places(seen, against) == [] and places(seen, refused()) == []
 
 
-@pytest.mark.parametrize(("count", "found"), [(MIN_INLIERS - 1, 0), (MIN_INLIERS + 5, 1)])
+@pytest.mark.parametrize(
+    ("count", "found"),
+    [(SECOND_PLACES.least_inliers - 1, 0), (SECOND_PLACES.least_inliers + 5, 1)],
+)
 def test_few_matches_give_no_second_place(equal, count, found):
     seen = equal
     twins = twin_matches(seen.model, 0, 3, TURNED)
@@ -221,7 +220,13 @@ def test_few_matches_give_no_second_place(equal, count, found):
     assert sum(other_place(*view, k) is not None for k in (0, 3)) == 2 * found
 
 
-@pytest.mark.parametrize(("points", "found"), [(MIN_AGREED - 5, False), (MIN_AGREED + 60, True)])
+@pytest.mark.parametrize(
+    ("points", "found"),
+    [
+        (SECOND_PLACES.least_agreed - 5, False),
+        (SECOND_PLACES.least_agreed + 60, True),
+    ],
+)
 def test_a_place_from_which_few_points_are_seen_is_no_second_place(equal, points, found):
     """All matches agree in it; that is not enough."""
     rows = np.flatnonzero((equal.plane == 0) | (np.cumsum(equal.plane == 1) <= points))

@@ -18,6 +18,7 @@ from jaxsfm.colmap.model_images import fingerprint, registered
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.work_folder import WorkFolder
+from jaxsfm.sfm.limits import RegisterLimits
 from jaxsfm.sfm.mapped_stage import MatchedPhotos, StageCache
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
@@ -238,6 +239,6 @@ def test_a_photo_is_located_among_photos_with_a_place_before_others(
     assert counts["1.png"] < counts["2.png"] < counts["0.png"] < counts["4.png"]
     grow = FakeGrow(rendered, [])
     monkeypatch.setattr(module, "grow", grow)
-    monkeypatch.setattr(module, "SHORTLIST", most)
+    monkeypatch.setattr(module, "REGISTER", RegisterLimits(shortlist=most))
     run(model_with(rendered, [1, 2])).registered()
     assert grow.wanted[0][LOST] == partners

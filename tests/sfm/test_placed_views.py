@@ -15,7 +15,8 @@ from wall_scene import (
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.sfm.check import placed_views
 from jaxsfm.sfm.check.other_places import Surface
-from jaxsfm.sfm.check.placed_views import MIN_CONTRADICTED, MOST_CONTRADICTED, Placed, doubts
+from jaxsfm.sfm.check.placed_views import Placed, doubts
+from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.refine.plane_geometry import normals
 
 NEW = 3
@@ -69,13 +70,20 @@ def test_a_view_that_shows_something_else_is_doubted_by_its_numbers(wrong):
     surface = Surface(wrong.model, normals(wrong.model, neighbours=16))
     tested, contradicted = placed_views.shown_by(surface.few(), wrong.images, REFINEMENT, NEW)
     assert f"of {tested} points" in why and why.endswith(f"instead of {contradicted}")
-    assert MIN_CONTRADICTED <= contradicted and contradicted > MOST_CONTRADICTED * tested
+    assert (
+        REGISTER.least_contradicted <= contradicted
+        and contradicted > REGISTER.contradicted_share * tested
+    )
     assert doubted(wrong, full_size=False) == {}  # noise may hide the poster
 
 
 @pytest.mark.parametrize(
     ("tested", "contradicted", "doubtful"),
-    [(200, MIN_CONTRADICTED - 1, False), (200, MIN_CONTRADICTED, True), (400, 59, False)],
+    [
+        (200, REGISTER.least_contradicted - 1, False),
+        (200, REGISTER.least_contradicted, True),
+        (400, 59, False),
+    ],
 )
 def test_few_contradictions_are_no_reason_to_doubt(
     right, monkeypatch, tested, contradicted, doubtful

@@ -193,6 +193,7 @@ EVERY = ["verify", "map", "map", "split", "second places", "refine", "register"]
         ("map-again", ["verify", "map", "split", "second places", "refine", "register"]),
         ("split", ["verify", "map", "map", "second places", "refine", "register"]),
         ("second-places", ["verify", "map", "map", "split", "refine", "register"]),
+        ("refine", EVERY[:-1]),
         ("register", EVERY[:-1]),
     ],
 )

@@ -17,8 +17,9 @@ from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Contradiction
 from jaxsfm.sfm.checker import VerifiedPairs
+from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
-from jaxsfm.sfm.view_graph import STRONG, Verdict, strengths
+from jaxsfm.sfm.view_graph import Verdict, strengths
 
 LETTERS = [*"abcdefghij"]
 TURNED = np.diag([-1.0, 1.0, -1.0])
@@ -223,5 +224,5 @@ def test_weak_neighbours_say_nothing():
     pairs = {**dict.fromkeys(chain(NUMBERED), 700), ("2.jpg", "3.jpg"): 20, ("0.jpg", "2.jpg"): 700}
     given = views(pairs)
     strength = strengths({pair: view.geometry for pair, view in given.items()})
-    assert strength["2.jpg", "3.jpg"] < STRONG < strength["1.jpg", "2.jpg"]
+    assert strength["2.jpg", "3.jpg"] < TRUST.strong < strength["1.jpg", "2.jpg"]
     assert mapper(given).following() == {*chain(NUMBERED)} - {("2.jpg", "3.jpg")}

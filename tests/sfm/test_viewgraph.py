@@ -13,15 +13,8 @@ from strategies import rng_of, seeds
 from jaxsfm.colmap.two_views import PairGeometry, spread
 from jaxsfm.io.pairs import component_of
 from jaxsfm.sfm import view_graph
-from jaxsfm.sfm.view_graph import (
-    STEEPNESS,
-    STRONG,
-    WEAK,
-    mean_rotation,
-    rotation_angle_deg,
-    strengths,
-    trusted_pairs,
-)
+from jaxsfm.sfm.limits import TRUST
+from jaxsfm.sfm.view_graph import mean_rotation, rotation_angle_deg, strengths, trusted_pairs
 
 
 def ring(rng, count=8, *, noise_deg=0.5):
@@ -175,7 +168,7 @@ def test_a_strong_pair_needs_a_right_rotation_only_where_it_is_asked_for():
     strict, default = trusted_pairs(pairs, strict=True), trusted_pairs(pairs)
     assert all(verdict.trusted for verdict in default.values())
     assert [pair for pair, verdict in strict.items() if not verdict.trusted] == [false]
-    assert strict[false].strength > STRONG and "deg" in strict[false].reason
+    assert strict[false].strength > TRUST.strong and "deg" in strict[false].reason
     assert not any(verdict.refuted for verdict in strict.values())
 
 
@@ -212,7 +205,7 @@ def test_groups_that_pairs_join_are_those_of_a_search_through_all_pairs(seed):
         turn = Rotation.from_rotvec([0, 2, 0]) if rng.random() < 0.4 else Rotation.identity()
         noise = Rotation.from_rotvec(rng.normal(0, 0.02, 3))
         pairs[a, b] = (noise * rotations[b] * turn * rotations[a].inv(), float(rng.uniform(1, 2)))
-    expected = grown_rotations(pairs, 5, view_graph.TOLERANCE_DEG)
+    expected = grown_rotations(pairs, 5, TRUST.rotation_deg)
     with mock.patch.object(view_graph, "MAX_VOTES", 5):
         found = view_graph._grow(
             list(pairs),
@@ -261,11 +254,11 @@ def test_strength_is_relative_to_the_best_pairs_of_both_images_and_of_all_others
         ("c", "d"): PairGeometry(num_inliers=100, rotation=np.eye(3), spread=0.25),
     }
     got = strengths(pairs)
-    half = WEAK * np.median([400, 400, 100, 50])
+    half = TRUST.weak * np.median([400, 400, 100, 50])
     for pair, (weight, best) in zip(
         pairs, ((400, 400), (100, 200), (50, 50 * 2**0.5)), strict=True
     ):
-        assert got[pair] == pytest.approx(weight / best / (1 + (half / weight) ** STEEPNESS))
+        assert got[pair] == pytest.approx(weight / best / (1 + (half / weight) ** TRUST.steepness))
     assert strengths({}) == {}
     nothing = PairGeometry(num_inliers=0, rotation=None)
     more = strengths({**pairs, ("e", "f"): nothing, ("g", "h"): nothing, ("i", "j"): nothing})
@@ -278,7 +271,7 @@ def test_the_best_pair_of_an_image_is_weak_if_all_of_its_pairs_are():
     alone = ("0.jpg", "night.jpg")
     for inliers, strong in ((250, False), (1500, True)):
         got = strengths(pairs | {alone: PairGeometry(num_inliers=inliers, rotation=np.eye(3))})
-        assert (got[alone] > STRONG) == strong
+        assert (got[alone] > TRUST.strong) == strong
 
 
 def test_spread_counts_covered_cells():

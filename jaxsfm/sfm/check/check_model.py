@@ -14,16 +14,15 @@ from jaxsfm.sfm.check.doubt import CURVE, MAX_CONTRADICTED
 from jaxsfm.sfm.check.grouping import Grouping, disagreement, group_views, parts, share
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.check.other_places import Refused, Surface, other_places
-from jaxsfm.sfm.check.pair_fit import LOWER_FITS, MIN_FIT, pair_fits
+from jaxsfm.sfm.check.pair_fit import pair_fits
 from jaxsfm.sfm.check.scale import shrunk
 from jaxsfm.sfm.check.thinning import thinned
+from jaxsfm.sfm.limits import CHECK
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 
 MIN_POINTS = 30
 """A model with fewer points is not checked."""
-MIN_CONTRADICTED = 10
-"""Fewer contradictions between two photos do not refute their pair."""
 CHECKED_BY = (
     "radius",
     "iterations",
@@ -98,7 +97,7 @@ def check_model(
     normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     fits = pair_fits(model, normal, given.matches, given.pairs)
     refuted, suspected = {}, {}
-    for least in (MIN_FIT, *LOWER_FITS) if contradictions else ():
+    for least in (CHECK.fit, *CHECK.lower_fits) if contradictions else ():
         fitting = [p for p, fit in fits.items() if fit >= least and p not in given.refuted]
         refuted = _refuted(found, names, fitting)
         suspected = {
@@ -117,7 +116,7 @@ def check_model(
         shrunk=near,
         doubt=CURVE.probability(disagreement(found)),
     )
-    agreeing = {pair for pair, fit in fits.items() if fit >= MIN_FIT}
+    agreeing = {pair for pair, fit in fits.items() if fit >= CHECK.fit}
     explained = {p for p in agreeing if not any(each.joined_by(p) for each in contradictions)}
     whole = parts(grouping, seen.view, seen.point)
     apart = [sorted(names[k] for k in part) for part in whole]
@@ -156,7 +155,7 @@ def _refuted(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pa
         a, b = (index[name] for name in pair)
         counts = [(against[i, j], found.tested[i, j]) for i, j in ((a, b), (b, a))]
         least, tested = min(counts)
-        if shares[a, b] > MAX_CONTRADICTED and least >= MIN_CONTRADICTED:
+        if shares[a, b] > MAX_CONTRADICTED and least >= CHECK.least_contradicted:
             refuted[pair] = Contradiction(
                 images=[pair[0]], others=[pair[1]], tested=int(tested), contradicted=int(least)
             )

@@ -8,15 +8,7 @@ import numpy as np
 
 from jaxsfm.sfm.check.agreement import Agreement
 from jaxsfm.sfm.check.doubt import MAX_CONTRADICTED
-
-MIN_TESTED = 30
-"""Fewer tested points say nothing about two groups."""
-
-MIN_SHARED = 100
-"""Two groups that do not contradict each other are one part if they see at least so many of the
-same points. The mapper is given at least as many matches of a pair, if it has them. False pairs
-give common points, too: of groups of *statue* with 30 or more, 15 of 25 that do not belong together
-and 4 of 23 that do see fewer than 100."""
+from jaxsfm.sfm.limits import CHECK
 
 
 class OpposedGroups(NamedTuple):
@@ -48,7 +40,7 @@ def share(tested: np.ndarray, contradicted: np.ndarray) -> np.ndarray:
     If two places were taken for one, points of either are missing in the views of the other. But
     what hides points in one photo, such as a passer-by, has no points of its own in other photos.
     """
-    enough = np.minimum(tested, tested.T) >= MIN_TESTED
+    enough = np.minimum(tested, tested.T) >= CHECK.least_tested
     ratio = contradicted / np.maximum(tested, 1)
     return np.where(enough, np.minimum(ratio, ratio.T), np.nan)
 
@@ -65,7 +57,7 @@ def _sure(agreement: Agreement, rows: slice, most: float) -> tuple[np.ndarray, n
             each / np.maximum(tests, 1)
             for each, tests in ((beyond, agreement.tested[rows]), (back, agreement.tested.T[rows]))
         )
-        enough = np.minimum(agreement.tested[rows], agreement.tested.T[rows]) >= MIN_TESTED
+        enough = np.minimum(agreement.tested[rows], agreement.tested.T[rows]) >= CHECK.least_tested
         return np.where(enough, np.minimum(forth, back), np.inf)
 
     contradicted = shares(0)
@@ -126,8 +118,8 @@ def disagreement(agreement: Agreement) -> float:
 def parts(grouping: Grouping, view: np.ndarray, point: np.ndarray) -> list[list[int]]:
     """Parts of a model in which no groups contradict each other.
 
-    Groups are joined if they see `MIN_SHARED` of the same points, those first that share most. A
-    group is not joined to a part with a group that it contradicts.
+    Groups are joined if they see `CHECK.least_shared` of the same points, those first that share
+    most. A group is not joined to a part with a group that it contradicts.
 
     Args:
       view, point: int (o,), the view of each observation and its point.
@@ -150,7 +142,7 @@ def parts(grouping: Grouping, view: np.ndarray, point: np.ndarray) -> list[list[
         shared = np.asarray([[np.sum(a & b) for b in seen] for a in seen])
         shared[opposed] = 0
         first, second = np.unravel_index(np.argmax(shared), shared.shape)
-        if shared[first, second] < MIN_SHARED:
+        if shared[first, second] < CHECK.least_shared:
             break
         members[first] = sorted(members[first] + members.pop(second))
         seen[first] |= seen[second]

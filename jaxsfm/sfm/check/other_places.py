@@ -19,28 +19,11 @@ from jaxsfm.sfm.check.agreement import agreement
 from jaxsfm.sfm.check.doubt import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import OtherPlace
 from jaxsfm.sfm.check.thinning import thinned_points
+from jaxsfm.sfm.limits import SECOND_PLACES
 from jaxsfm.sfm.refine.candidates import may_show
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.view_graph import rotation_angle_deg
-
-MIN_INLIERS = 30
-"""Fewer matches give no second place: the fewest inliers from which COLMAP's mapper adds a photo.
-"""
-MIN_SUPPORT = 15
-"""A pair speaks for a second place if so many of its matches agree with it: the fewest inliers that
-COLMAP verifies."""
-MIN_INLIER_SHARE = 0.25
-"""A second place has the support of this share of the matches of the pairs that the model does not
-agree with. Looking for rarer ones took ten of forty seconds on castle-P19."""
-TESTED_PER_VIEW = 250
-"""The points of the model, per view, that are tested in a second place."""
-MIN_AGREED = 50
-"""The least number of points that the photo must show, seen from its second place."""
-OTHER_ROTATION_DEG = 15.0
-"""A place is another one if it is turned by more..."""
-OTHER_DISTANCE = 0.2
-"""... or moved by more than this share of the distance to the points that it shows."""
 
 
 class Refused(NamedTuple):
@@ -61,7 +44,7 @@ class Surface(NamedTuple):
 
     def few(self) -> "Surface":
         """So many of the points as are tested in a second place."""
-        rows = thinned_points(self.model, per_view=TESTED_PER_VIEW)
+        rows = thinned_points(self.model, per_view=SECOND_PLACES.tested_per_view)
         tracks = self.model.tracks.select_points(rows)
         return Surface(self.model.with_tracks(tracks), self.normal[rows])
 
@@ -102,20 +85,23 @@ def other_place(
         max_error_px=MATCH_ERROR_PX,
         estimate_focal_length=False,
         seed=refused.seed,
-        min_inlier_share=MIN_INLIER_SHARE,
+        min_inlier_share=SECOND_PLACES.inlier_share,
     )
     if there is None or not _elsewhere(view, there, points):
         return None
     support = [_support(there, *part) for part in parts]
-    if sum(support) < MIN_INLIERS:
+    if sum(support) < SECOND_PLACES.least_inliers:
         return None
     partners = [
         a if b == view.name else b
         for (a, b), count in zip(own, support, strict=True)
-        if count >= MIN_SUPPORT
+        if count >= SECOND_PLACES.least_support
     ]
     tested, contradicted = shown_by(few.with_view(k, there), images, refinement, k)
-    if tested - contradicted < MIN_AGREED or contradicted > MAX_CONTRADICTED * tested:
+    if (
+        tested - contradicted < SECOND_PLACES.least_agreed
+        or contradicted > MAX_CONTRADICTED * tested
+    ):
         return None
     return OtherPlace(
         image=view.name,
@@ -137,7 +123,9 @@ def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
     away = np.linalg.norm(there.centre - view.centre)
     distance = np.median(np.linalg.norm(points - there.centre, axis=1))
     turned = rotation_angle_deg(there.rotation, view.rotation)
-    return bool(turned > OTHER_ROTATION_DEG or away > OTHER_DISTANCE * distance)
+    return bool(
+        turned > SECOND_PLACES.rotation_deg or away > SECOND_PLACES.distance_share * distance
+    )
 
 
 def shown_by(few: Surface, images: DeviceImages, refinement: Refinement, k: int) -> tuple[int, int]:

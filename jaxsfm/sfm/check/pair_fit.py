@@ -6,17 +6,8 @@ import numpy as np
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.sfm.limits import CHECK
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
-
-MIN_FIT = 0.5
-"""A pair agrees with a model if at least this share of its matches fits."""
-LOWER_FITS = (0.25, 0.1)
-"""If no such pair joins two groups that contradict each other, they were joined by pairs of which
-less fits, and the limit is lowered in these steps. On castle-P19 at 600 px with the preset
-`robust`, no false pair fits by a half, because the mapper has bent the model between them."""
-MIN_MATCHES = 15
-"""Fewer matches on the surface of the model say nothing: the fewest inliers that COLMAP verifies.
-"""
 
 
 def pair_fits(
@@ -50,6 +41,6 @@ def pair_fits(
             at, _ = view.project(points)
             own += len(xy)
             fitting += int((np.linalg.norm(at - xy, axis=1) < MATCH_ERROR_PX).sum())
-        if own >= 2 * MIN_MATCHES:
+        if own >= 2 * CHECK.least_matches:
             found[pair] = fitting / own
     return found

@@ -13,16 +13,10 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.other_places import Surface, shown_by
-from jaxsfm.sfm.check.pair_fit import MIN_FIT, pair_fits
+from jaxsfm.sfm.check.pair_fit import pair_fits
+from jaxsfm.sfm.limits import CHECK, REGISTER
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
-
-MOST_CONTRADICTED = 0.15
-"""A place is doubtful if the view contradicts a larger share of the points that it should show. Of
-79 views of right models (castle-P19 at 1280 px, Sacre Coeur, kitchen), three do so to more than
-0.09, with 12, 35 and 106 points; a view before the wrong wall of a rendered box, to 0.25."""
-MIN_CONTRADICTED = 50
-"""Fewer points are no reason to doubt a place: they may be passers-by."""
 
 
 class Placed(NamedTuple):
@@ -51,7 +45,7 @@ def doubts(
     following = [pair for pair in placed.neighbours if placed.full_size.keys() & set(pair)]
     fits = pair_fits(model, normal, placed.matches, following)
     few, found = Surface(model, normal).few(), {}
-    for pair in sorted(pair for pair, fit in fits.items() if fit < MIN_FIT):
+    for pair in sorted(pair for pair, fit in fits.items() if fit < CHECK.fit):
         for name in placed.full_size.keys() & set(pair):
             (other,) = set(pair) - {name}
             found[name] = f"its matches with its neighbour {shown_name(other)} do not agree with it"
@@ -59,7 +53,7 @@ def doubts(
         if view.name in found or not placed.full_size.get(view.name):
             continue
         tested, contradicted = shown_by(few, images, refinement, k)
-        if contradicted >= max(MIN_CONTRADICTED, MOST_CONTRADICTED * tested):
+        if contradicted >= max(REGISTER.least_contradicted, REGISTER.contradicted_share * tested):
             found[view.name] = (
                 f"of {tested} points that it should show there, it shows something else instead of "
                 f"{contradicted}"

@@ -24,6 +24,7 @@ from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.store import digest
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.checker import opened
+from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.mapped_stage import SPARSE, MatchedPhotos, StageCache
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.passes import RefinementFigures
@@ -44,10 +45,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 logger = logging.getLogger("jaxsfm")
-
-SHORTLIST = 20
-"""A photo is located among so many photos at most, as `extend` does by default: first those with a
-place, and of these first those with most matches."""
 
 
 class MatchLost(Protocol):
@@ -185,7 +182,7 @@ class _Registration:
             views.append(View.without_pose(name, image_id, refined, size, Pixels(scale)))
         ranked = sorted(partners, key=lambda other: (other not in placed, -partners[other], other))
         own_camera = self._given.options.refine_intrinsics and not shared
-        return UnregisteredView(views, own_camera, sorted(ranked[:SHORTLIST]))
+        return UnregisteredView(views, own_camera, sorted(ranked[: REGISTER.shortlist]))
 
     def outcome(self) -> RefinedModels:
         """The models with the photos that were registered, the one with most photos first."""

@@ -1,0 +1,89 @@
+"""Parts of the sets of `bench ledger`, mapped and checked: how often is the check wrong?
+
+A part is photos that stand near each other in the order of their names, with gaps. Each part is
+mapped once, and nothing mends, splits or refines the model before it is judged. A few sets give
+many models in this way, most of them right. They are not independent of each other: parts of one
+set share photos and matches.
+"""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxsfm.bench.frames import linked
+from jaxsfm.bench.ledger_photos import SetPhotos
+from jaxsfm.bench.ledger_runs import LedgerRun, reconstruct_set
+from jaxsfm.io.photo_folder import find_images
+from jaxsfm.io.work_folder import RECORD
+from jaxsfm.options import Step
+from jaxsfm.sfm.evaluation import of_photos
+
+NOTHING_AFTER: tuple[Step, ...] = (
+    "upright",
+    "map-again",
+    "split",
+    "second-places",
+    "refine",
+    "register",
+)
+"""What a run leaves out so that its first mapping is judged as it is."""
+LEAST, MOST = 5, 16
+"""Sizes of parts, photos. Smaller ones say little, and larger ones are much alike."""
+WITHIN = 2
+"""A part is drawn from so many times as many photos that follow each other."""
+KEPT = ("features", "matches", "photos")
+"""The folders of a part's run that the next one uses."""
+
+
+def part_of(names: Sequence[str], number: int) -> list[str]:
+    """The photos of a part, sorted; it depends on the names and the number alone.
+
+    Args:
+      names: of all photos, in order; more than `LEAST`.
+    """
+    random = np.random.default_rng(number)
+    size = int(random.integers(LEAST, min(MOST, len(names) - 1) + 1))
+    reach = min(WITHIN * size, len(names))
+    start = int(random.integers(0, len(names) - reach + 1))
+    return sorted(names[start + k] for k in random.choice(reach, size, replace=False))
+
+
+def part_runs(
+    run: LedgerRun, home: Path, whole: Path, count: int
+) -> Iterator[tuple[int, SetPhotos, Path]]:
+    """Map parts of a set; yields the number of each, its photos, and the folder of its run.
+
+    The folder is used again for the next part. Matches of the whole set are used where they fit.
+
+    Args:
+      run: of the whole set; its options are those of the parts.
+      home: a folder for the runs.
+      whole: the folder of a run of the whole set, if there is one.
+      count: the number of parts. 0, or a set that is too small: the only part is the whole set.
+    """
+    given, folder = run.given, home / "run"
+    truth, names = given.truth, sorted(find_images(given.photos))
+    if truth is not None:
+        names = [name for name in names if of_photos(truth, [name])]
+    if not folder.exists() and (whole / RECORD).is_file() and (whole / "matches").is_dir():
+        shutil.copytree(whole / "matches", folder / "matches")
+        shutil.copyfile(whole / RECORD, folder / RECORD)
+    divided = count > 0 and len(names) > LEAST
+    for number in range(count if divided else 1):
+        _forget_results(folder)
+        part = part_of(names, number) if divided else names
+        photos = linked(given.photos, part, home / "photos")
+        each = given._replace(photos=photos, truth=truth and of_photos(truth, part))
+        reconstruct_set(run._replace(given=each), folder)
+        yield number, each, folder
+
+
+def _forget_results(folder: Path) -> None:
+    """Leave nothing of a run but what it has of photos and pairs."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.is_dir() and path.name not in KEPT:
+            shutil.rmtree(path)
+        elif path.is_file() and path.name != RECORD:
+            path.unlink()

@@ -1,0 +1,134 @@
+"""The thresholds of the road, step by step.
+
+Here is every number by which a step decides something about photos, pairs and models. The steps
+are those of `jaxsfm.sfm.road`. How patches are compared is said in `jaxsfm.sfm.check.agreement`,
+how a pose is followed in `jaxsfm.sfm.refine.octave_pose`, and when a model is doubted in
+`jaxsfm.sfm.check.doubt`.
+"""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class UprightLimits:
+    """Photos that are stored sideways."""
+
+    trial_px: int = 400
+    """Longer side of the photos in a trial, pixels. A trial of a photo then costs about as much as
+    its description at 800 px."""
+    partners: int = 8
+    """Photos that a trial matches."""
+    least_inliers: int = 60
+    """A pair is strong, and a turn is believed, with so many verified matches. Those of a trial are
+    summed over all partners. A turn must have twice as many as any other one. Strangers have a
+    plane of 26 by accident, rarely two."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrustLimits:
+    """Which pairs are trusted."""
+
+    strong: float = 0.3
+    """A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09 before
+    weak ones lost strength (`weak`)."""
+    weak: float = 0.25
+    """A pair loses half of its strength if its weight is this share of the median of all images'
+    best pairs."""
+    steepness: float = 2.5
+    """The odds of what it keeps grow with this power of the weight. In 30 runs of castle-P19 at
+    five sizes, 461 of 2982 false pairs were trusted without `weak`, and 2 are with it
+    (docs/decisions/view-graph.md)."""
+    rotation_deg: float = 15.0
+    """Largest error of a trusted pair's rotation against the averaged ones. Two-view rotations of
+    true pairs are off by 0.3 deg (median), those of weak pairs by 10."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OrderLimits:
+    """When the names of photos say in which order they were taken."""
+
+    equal_steps: float = 0.5
+    """Numbers are those of a sequence if so many of their steps are equal: some photos may be
+    missing, but the identifiers of a photo site have no equal steps."""
+    least_numbered: int = 5
+    """Fewer photos have no order worth following."""
+    numbered_share: float = 0.5
+    """The order says how to join all photos if so many of them are numbered. Of the 135 photos of
+    statue, 8 are: frames of a video."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CheckLimits:
+    """Whether the photos of a model agree with it."""
+
+    fit: float = 0.5
+    """A pair agrees with a model if at least this share of its matches fits."""
+    lower_fits: tuple[float, ...] = (0.25, 0.1)
+    """If no such pair joins two groups that contradict each other, they were joined by pairs of
+    which less fits, and the limit is lowered in these steps. On castle-P19 at 600 px with the
+    preset `robust`, no false pair fits by a half, because the mapper has bent the model between
+    them."""
+    least_matches: int = 15
+    """A pair with fewer matches on the surface of the model says nothing: the fewest inliers that
+    COLMAP verifies."""
+    least_tested: int = 30
+    """Fewer tested points say nothing about two groups."""
+    least_contradicted: int = 10
+    """Fewer contradictions between two photos do not reject their pair."""
+    least_shared: int = 100
+    """Two groups that do not contradict each other are one part if they see at least so many of the
+    same points. The mapper is given at least as many matches of a pair, if it has them. False pairs
+    give common points, too: of groups of *statue* with 30 or more, 15 of 25 that do not belong
+    together and 4 of 23 that do see fewer than 100."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SecondPlaceLimits:
+    """Whether a photo fits into a model in a second place."""
+
+    least_inliers: int = 30
+    """Fewer matches give no second place: the fewest inliers from which COLMAP's mapper adds a
+    photo."""
+    least_support: int = 15
+    """A pair speaks for a second place if so many of its matches agree with it: the fewest inliers
+    that COLMAP verifies."""
+    inlier_share: float = 0.25
+    """A second place has the support of this share of the matches of the pairs that the model does
+    not agree with. Looking for rarer ones took ten of forty seconds on castle-P19."""
+    tested_per_view: int = 250
+    """The points of the model, per view, that are tested in a second place."""
+    least_agreed: int = 50
+    """The least number of points that the photo must show, seen from its second place."""
+    rotation_deg: float = 15.0
+    """A place is another one if it is turned by more..."""
+    distance_share: float = 0.2
+    """... or moved by more than this share of the distance to the points that it shows."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RegisterLimits:
+    """The registration of photos that have no place."""
+
+    shortlist: int = 20
+    """A photo is located among so many photos at most, as `extend` does by default: first those
+    with a place, and of these first those with most matches."""
+    partners: int = 3
+    """A lost photo is matched at full size with so many others. Each pair takes up to a minute on
+    two cores."""
+    evidence: float = 60.0
+    """Matches of a pair count if they have at least this evidence. They are more often wrong than
+    right then: alignment has to confirm the place that they give."""
+    contradicted_share: float = 0.15
+    """A place is doubtful if the view contradicts a larger share of the points that it should show.
+    Of 79 views of right models (castle-P19 at 1280 px, Sacre Coeur, kitchen), three do so to more
+    than 0.09, with 12, 35 and 106 points; a view before the wrong wall of a rendered box, to 0.25.
+    """
+    least_contradicted: int = 50
+    """Fewer points are no reason to doubt a place: they may be passers-by."""
+    partners_without_model: int = 10
+    """If no model was made of photos at a small size, each photo is matched with so many others at
+    full size: those with which it has most matches."""
+
+
+UPRIGHT, TRUST, ORDER = UprightLimits(), TrustLimits(), OrderLimits()
+CHECK, SECOND_PLACES, REGISTER = CheckLimits(), SecondPlaceLimits(), RegisterLimits()
