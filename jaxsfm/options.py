@@ -19,8 +19,8 @@ Step = Literal["upright", "map-again", "split", "second-places", "refine", "regi
 
 upright: photos that are stored sideways are turned. map-again: the second mapping. split: models in
 which photos contradict each other are split. second-places: photos are looked for in other places.
-refine: the models are refined. register: photos without a place are registered in the refined
-models.
+refine: the models are refined; without it they have points of a share of the matches, and no photos
+are registered. register: photos without a place are registered in the refined models.
 """
 CameraSharing = Literal["auto", "single", "folder", "photo"]
 """Which photos share one camera (`jaxsfm.colmap.cameras`)."""

@@ -47,7 +47,8 @@ def part_of(names: Sequence[str], number: int) -> list[str]:
     size = int(random.integers(LEAST, min(MOST, len(names) - 1) + 1))
     reach = min(WITHIN * size, len(names))
     start = int(random.integers(0, len(names) - reach + 1))
-    return sorted(names[start + k] for k in random.choice(reach, size, replace=False))
+    inside = random.choice(reach, size, replace=False)
+    return sorted(names[start + int(k)] for k in inside)
 
 
 def part_runs(

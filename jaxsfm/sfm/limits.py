@@ -1,9 +1,10 @@
-"""The thresholds of the road, step by step.
+"""The numbers by which steps of the road decide about photos, pairs and models, step by step.
 
-Here is every number by which a step decides something about photos, pairs and models. The steps
-are those of `jaxsfm.sfm.road`. How patches are compared is said in `jaxsfm.sfm.check.agreement`,
-how a pose is followed in `jaxsfm.sfm.refine.octave_pose`, and when a model is doubted in
-`jaxsfm.sfm.check.doubt`.
+Other numbers stand where they are used. How many photos a mapping may leave out, and from which
+pairs it may start, is said in `jaxsfm.colmap.mapper`; when a model is doubted in
+`jaxsfm.sfm.check.doubt`; how patches are compared in `jaxsfm.sfm.check.agreement`; when a view is
+weak in `jaxsfm.sfm.refine.one_pass`; and how a pose is followed and trusted in
+`jaxsfm.sfm.refine.octave_pose`.
 """
 
 import dataclasses
@@ -17,11 +18,12 @@ class UprightLimits:
     """Longer side of the photos in a trial, pixels. A trial of a photo then costs about as much as
     its description at 800 px."""
     partners: int = 8
-    """Photos that a trial matches."""
+    """So many photos of the largest group are matched with the photo that is tried. A group may be
+    a walk around a building, so a few of them might show other sides."""
     least_inliers: int = 60
     """A pair is strong, and a turn is believed, with so many verified matches. Those of a trial are
-    summed over all partners. A turn must have twice as many as any other one. Strangers have a
-    plane of 26 by accident, rarely two."""
+    summed over all partners. A turn must have twice as many as any other one. Two photos of
+    different things often have one plane of 26 matches by accident, rarely two."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,18 +31,19 @@ class TrustLimits:
     """Which pairs are trusted."""
 
     strong: float = 0.3
-    """A pair with more strength is trusted, whatever its rotation. False pairs reached 0.09 before
-    weak ones lost strength (`weak`)."""
+    """In the first mapping, a pair with so much strength may have any rotation. False pairs reached
+    0.09 before weak ones lost strength (`weak`)."""
     weak: float = 0.25
     """A pair loses half of its strength if its weight is this share of the median of all images'
     best pairs."""
     steepness: float = 2.5
-    """The odds of what it keeps grow with this power of the weight. In 30 runs of castle-P19 at
-    five sizes, 461 of 2982 false pairs were trusted without `weak`, and 2 are with it
-    (docs/decisions/view-graph.md)."""
+    """A pair keeps 1 / (1 + (h / weight) ^ steepness) of its strength, where h is `weak` times the
+    median weight of all images' best pairs. In 30 runs of castle-P19 at five sizes, 461 of 2982
+    false pairs were trusted without this, and 2 are with it (docs/decisions/view-graph.md)."""
     rotation_deg: float = 15.0
-    """Largest error of a trusted pair's rotation against the averaged ones. Two-view rotations of
-    true pairs are off by 0.3 deg (median), those of weak pairs by 10."""
+    """Largest error of a trusted pair's rotation against the averaged ones, unless the pair is
+    strong. Two-view rotations of true pairs are off by 0.3 deg (median), those of weak pairs by
+    10."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,9 +80,8 @@ class CheckLimits:
     """Fewer contradictions between two photos do not reject their pair."""
     least_shared: int = 100
     """Two groups that do not contradict each other are one part if they see at least so many of the
-    same points. The mapper is given at least as many matches of a pair, if it has them. False pairs
-    give common points, too: of groups of *statue* with 30 or more, 15 of 25 that do not belong
-    together and 4 of 23 that do see fewer than 100."""
+    same points. False pairs give common points, too. On *statue*, 48 pairs of groups have 30 common
+    points or more; 15 of the 25 wrong ones and 4 of the 23 right ones have fewer than 100."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,14 +95,14 @@ class SecondPlaceLimits:
     """A pair speaks for a second place if so many of its matches agree with it: the fewest inliers
     that COLMAP verifies."""
     inlier_share: float = 0.25
-    """A second place has the support of this share of the matches of the pairs that the model does
-    not agree with. Looking for rarer ones took ten of forty seconds on castle-P19."""
+    """Some pairs of a photo do not agree with the model. At least this share of their matches must
+    agree with the second place. Looking for rarer ones took ten of forty seconds on castle-P19."""
     tested_per_view: int = 250
     """The points of the model, per view, that are tested in a second place."""
     least_agreed: int = 50
     """The least number of points that the photo must show, seen from its second place."""
     rotation_deg: float = 15.0
-    """A place is another one if it is turned by more..."""
+    """A place is another one if it is turned by more than trusted rotations may differ..."""
     distance_share: float = 0.2
     """... or moved by more than this share of the distance to the points that it shows."""
 

@@ -1,9 +1,11 @@
 """Mappings of all photos: which pairs each trusts, what its check says, and which one is better.
 
 The first mapping trusts the pairs on which most others agree (`jaxsfm.sfm.view_graph`). If its
-photos contradict each other, a second one is made without the pairs that the check rejected. If the
-photos are numbered in the order in which they were taken, pairs of photos that follow each other
-come first in it (`jaxsfm.sfm.photo_order`). There is no third one.
+photos contradict each other, a second one is made without the pairs that the check rejected, and
+strong pairs have to agree with the others, too. If the photos are numbered in the order in which
+they were taken, pairs of photos that follow each other come first in it
+(`jaxsfm.sfm.photo_order`). If many photos were left out, the second one has the same pairs, and the
+mapper does all that it can. There is no third one.
 """
 
 import dataclasses

@@ -1,8 +1,9 @@
 """The road from matches to models, step by step.
 
-`walk` is the whole road. Each step is a function that is described where it is written, and what a
-step decides is decided nowhere else. A step in `Step` can be skipped by name, which says what it is
-worth (`jaxsfm bench ledger --without STEP`).
+`walk` has all steps but the first two, which describe and match the photos and turn those that are
+stored sideways (`jaxsfm.runs.run_photos`). Each step is a function that is described where it is
+written. A step in `Step` can be skipped by name, which says what it is worth (`jaxsfm bench ledger
+--without STEP`).
 """
 
 import contextlib
@@ -63,28 +64,28 @@ def walk(
     """
     watch = watch or Watch()
     with watch.stage("mapping"):
-        # 1. Let COLMAP verify each pair.
+        # 3. Let COLMAP verify each pair.
         verified = verify_matches(given, kept)
         mapper = mapper_of(given, verified)
-        # 2. Trust the pairs on which most others agree.
+        # 4. Trust the pairs on which most others agree.
         trust = mapper.trust_votes()
-        # 3. Map them, and 4. ask whether the photos agree with the models.
+        # 5. Map them, and ask whether the photos agree with the models.
         first = map_trusted(given, verified, trust, "mapped", kept, watch.on_image)
-        # 5. Map once more, if something speaks against the models or photos are left out.
+        # 6. Map once more, if something speaks against the models or many photos are left out.
         second = None
         if "map-again" not in without:
             second = _map_again(given, verified, mapper, first, kept)
-        # 6. Keep the better mapping. Split it where photos still contradict each other, and look
-        # for second places of photos.
+        # 7. Keep the better mapping, and split it where photos still contradict each other.
+        # 8. Look for second places of photos.
         settled = settle(given, verified, (first, second), kept, without=without)
     with watch.stage("refinement"):
-        # 7. Move the keypoints to a fraction of a pixel.
+        # 9. Move the keypoints to a fraction of a pixel.
         if "refine" in without:
             given = given.unrefined()
         made = refine_settled(given, verified, settled, database, kept, watch.on_pass)
     if "register" in without or given.config.refinement is None:
         return made
-    # 8. Register the photos that have no place. 9. The verdict follows from the checks.
+    # 10. Register the photos that have no place. The verdict follows from the checks.
     with watch.stage("registration"):
         return register_lost(given, settled, made, kept, match_lost)
 
@@ -98,8 +99,9 @@ def _map_again(
 ) -> MappedModels | None:
     """A second mapping; None if nothing calls for one.
 
-    Photos that contradict each other, or their neighbours, call for other pairs. Photos that were
-    left out call for more effort with the same pairs.
+    Photos that contradict each other, or their neighbours, call for other pairs. If more photos
+    were left out than `jaxsfm.colmap.mapper.complete` allows, they call for more effort with the
+    same pairs.
     """
     if not given.config.checked:
         return None

@@ -185,14 +185,15 @@ def test_only_a_draft_asks_for_more_parallax(monkeypatch, tmp_path, scene, draft
     assert (p.mapper.filter_min_tri_angle > own) == draft
 
 
-def test_a_model_of_images_that_a_larger_one_has_is_left_out(monkeypatch, tmp_path):
+def test_a_model_that_brings_few_new_images_is_left_out(monkeypatch, tmp_path):
     """Of two models of the same images, the one with more points stays."""
-    found = [model("abc"), model("abcde"), model("fgh", 5), model("fgh", 9), model("xa")]
+    found = [model("abc"), model("abcde"), model("fgh", 5), model("fgh", 9), model("xyza")]
+    found += [model("wva"), model("uv", 9), model("ut", 5)]
     monkeypatch.setattr(
         mapper.pycolmap, "incremental_mapping", lambda *_, **__: dict(enumerate(found))
     )
     models = mapper.run_mapper(tmp_path / "d.db", ONE)
-    assert models == [found[1], found[3], found[4]]
+    assert models == [found[1], found[4], found[3], found[6]]
 
 
 def planar_results(count=5, points=200):
