@@ -21,9 +21,10 @@ class UprightLimits:
     """So many photos of the largest group are matched with the photo that is tried. A group may be
     a walk around a building, so a few of them might show other sides."""
     least_inliers: int = 60
-    """A pair is strong, and a turn is believed, with so many verified matches. Those of a trial are
-    summed over all partners. A turn must have twice as many as any other one. Two photos of
-    different things often have one plane of 26 matches by accident, rarely two."""
+    """A pair is strong if it has so many verified matches, and `TrustLimits.strong` of the strength
+    that it could have. A turn is believed with so many matches, summed over all partners, and twice
+    as many as any other turn has. Two photos of different things often have one plane of 26 matches
+    by accident, rarely two."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -60,7 +60,12 @@ def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
     """The strength of every pair, 0 .. 1 (see the module)."""
-    weight = {p: g.num_inliers * np.sqrt(g.spread) for p, g in geometries.items()}
+    weight = {p: float(g.num_inliers * np.sqrt(g.spread)) for p, g in geometries.items()}
+    return relative_strengths(weight)
+
+
+def relative_strengths(weight: Mapping[Pair, float]) -> dict[Pair, float]:
+    """The strength of every pair, 0 .. 1, by the weights of all pairs."""
     best: dict[str, float] = {}
     for pair, w in weight.items():
         for image in pair:
