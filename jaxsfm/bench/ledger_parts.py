@@ -6,7 +6,6 @@ many models in this way, most of them right. They are not independent of each ot
 set share photos and matches.
 """
 
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -15,8 +14,9 @@ import numpy as np
 from jaxsfm.bench.frames import linked
 from jaxsfm.bench.ledger_photos import SetPhotos
 from jaxsfm.bench.ledger_runs import LedgerRun, reconstruct_set
+from jaxsfm.bench.strecha_models import take_matches
+from jaxsfm.bench.subset_models import forget_results
 from jaxsfm.io.photo_folder import find_images
-from jaxsfm.io.work_folder import RECORD
 from jaxsfm.options import Step
 from jaxsfm.sfm.evaluation import of_photos
 
@@ -33,8 +33,6 @@ LEAST, MOST = 5, 16
 """Sizes of parts, photos. Smaller ones say little, and larger ones are much alike."""
 WITHIN = 2
 """A part is drawn from so many times as many photos that follow each other."""
-KEPT = ("features", "matches", "photos")
-"""The folders of a part's run that the next one uses."""
 
 
 def part_of(names: Sequence[str], number: int) -> list[str]:
@@ -68,23 +66,13 @@ def part_runs(
     truth, names = given.truth, sorted(find_images(given.photos))
     if truth is not None:
         names = [name for name in names if of_photos(truth, [name])]
-    if not folder.exists() and (whole / RECORD).is_file() and (whole / "matches").is_dir():
-        shutil.copytree(whole / "matches", folder / "matches")
-        shutil.copyfile(whole / RECORD, folder / RECORD)
+    take_matches(folder, whole)
     divided = count > 0 and len(names) > LEAST
     for number in range(count if divided else 1):
-        _forget_results(folder)
+        if folder.is_dir():
+            forget_results(folder)
         part = part_of(names, number) if divided else names
         photos = linked(given.photos, part, home / "photos")
         each = given._replace(photos=photos, truth=truth and of_photos(truth, part))
         reconstruct_set(run._replace(given=each), folder)
         yield number, each, folder
-
-
-def _forget_results(folder: Path) -> None:
-    """Leave nothing of a run but what it has of photos and pairs."""
-    for path in folder.iterdir() if folder.is_dir() else ():
-        if path.is_dir() and path.name not in KEPT:
-            shutil.rmtree(path)
-        elif path.is_file() and path.name != RECORD:
-            path.unlink()

@@ -104,7 +104,10 @@ def dense_models(
     models, before = [], set[str]()
     for subset in scene.subsets:
         names = {*subset.day, subset.night}
-        _forget_results(work, features=len(before) <= FEATURES and not names.isdisjoint(before))
+        if len(before) <= FEATURES and not names.isdisjoint(before):
+            forget_results(work)
+        else:
+            shutil.rmtree(work, ignore_errors=True)
         before = names if not work.exists() else before | names
         report = reconstruct_folder(
             linked(scene.folder, names, photos), work, config=method_config(method), options=given
@@ -117,11 +120,8 @@ def dense_models(
     return models
 
 
-def _forget_results(work: Path, *, features: bool) -> None:
-    """Leave nothing of a run, or nothing but its features and matches."""
-    if not features:
-        shutil.rmtree(work, ignore_errors=True)
-        return
+def forget_results(work: Path) -> None:
+    """Leave nothing of a run but its features and matches."""
     for path in work.iterdir():
         if path.is_dir() and path.name not in KEPT:
             shutil.rmtree(path)
