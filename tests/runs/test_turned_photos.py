@@ -77,6 +77,13 @@ def test_the_largest_group_is_the_largest_that_strong_pairs_join(strong):
     assert groups_stored_alike("gfedcba", dict(reversed(tried.items())))[0] == found
 
 
+@pytest.mark.parametrize(("between", "groups"), [(262, [{*"ab"}, {*"xy"}]), (2000, [{*"abxy"}])])
+def test_few_matches_beside_those_of_the_best_pairs_join_no_photos(between, groups):
+    """The false pairs of turned photos of Herz-Jesus-P8 have up to 262 beside 2924."""
+    tried = {("a", "b"): counts(2924), ("x", "y"): counts(2924), ("b", "x"): counts(between)}
+    assert groups_stored_alike("abxy", tried) == groups
+
+
 def test_without_a_strong_pair_it_is_the_photo_with_most_verified_matches():
     tried = {("a", "b"): counts(10), ("b", "c"): counts(20), ("a", "d"): counts(29)}
     assert groups_stored_alike("dcba", tried)[0] == {"a"}
