@@ -14,6 +14,7 @@ from jaxsfm.sfm.check.model_check import (
     ModelCheck,
     OtherPlace,
     VerdictColour,
+    repeats,
 )
 
 MAX_FINDINGS = 3
@@ -181,8 +182,6 @@ def _other_model(other: Alternative) -> Finding:
     )
     if not other.elsewhere:
         text = f"alternative/0 is another mapping, which follows {FOLLOWS[other.basis]}"
-    if other.contradicted:
-        text += f"; photos contradict each other at {other.contradicted} of its points"
     return Finding(text, other.elsewhere, [])
 
 
@@ -220,7 +219,7 @@ def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
         way = f"from {named(check.alternative.elsewhere)} to the other photos"
     elif check.apart and check.verdict == "amber":
         way = f"from {shown_name(check.apart[0][0])} to {shown_name(check.apart[0][1])}"
-    elif check.told_apart and check.verdict == "amber":
+    elif repeats(check.told_apart) and check.verdict == "amber":
         way = f"from {named(check.told_apart[0])} to {named(check.told_apart[1])}"
     else:
         return ""
@@ -245,7 +244,7 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
             "do not trust distances in this model; look where these photos and the others meet, "
             "add photos that show what both show, and run the same command again"
         )
-    if colour == "amber" and check.told_apart:
+    if colour == "amber" and repeats(check.told_apart):
         way = (
             " (alternative/0 is one way, which photos contradict)" if other and other.whole else ""
         )

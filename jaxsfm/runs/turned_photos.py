@@ -33,10 +33,7 @@ class Trials:
 
     def turn_of(self, name: str, partners: Sequence[str]) -> int:
         """The quarter turns clockwise with which a photo matches; 0 if none is clear."""
-        inliers = [self._inliers(name, partners, quarters) for quarters in range(4)]
-        best = max(range(4), key=lambda quarters: inliers[quarters])
-        others = max(count for quarters, count in enumerate(inliers) if quarters != best)
-        return best if inliers[best] >= max(UPRIGHT.least_inliers, 2 * others) else 0
+        return clear_turn([self._inliers(name, partners, quarters) for quarters in range(4)])
 
     def _inliers(self, name: str, partners: Sequence[str], quarters: int) -> int:
         """The verified matches of a turned photo with its partners."""
@@ -48,6 +45,18 @@ class Trials:
         pairs = [make_pair(name, other) for other in partners]
         counts, _ = match_pairs(look.here(), images, pairs, self.seconds)
         return sum(found.num_inliers for found in counts.values())
+
+
+def clear_turn(inliers: Sequence[int]) -> int:
+    """The number of quarter turns with clearly the most matches; 0 if there is none.
+
+    Args:
+      inliers: the verified matches after 0, 1, 2 and 3 quarter turns.
+    """
+    best = max(range(4), key=lambda quarters: inliers[quarters])
+    others = max(count for quarters, count in enumerate(inliers) if quarters != best)
+    needed = max(UPRIGHT.least_inliers, UPRIGHT.times_others * others)
+    return best if inliers[best] >= needed else 0
 
 
 def turned(image: ImageFile, quarters: int) -> ImageFile:

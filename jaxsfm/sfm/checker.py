@@ -14,7 +14,7 @@ from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model, second_places
-from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck
+from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck, repeats
 from jaxsfm.sfm.refine.device_images import DeviceImages
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Checker(NamedTuple):
         They are not looked for if photos contradict each other, here or in other models: this
         speaks against the model already.
         """
-        if check.contradictions or check.told_apart:
+        if check.contradictions or repeats(check.told_apart):
             return check
         try:
             found = second_places(

@@ -22,9 +22,12 @@ class UprightLimits:
     a walk around a building, so a few of them might show other sides."""
     least_inliers: int = 60
     """A pair is strong if it has so many verified matches, and `TrustLimits.strong` of the strength
-    that it could have. A turn is believed with so many matches, summed over all partners, and twice
-    as many as any other turn has. Two photos of different things often have one plane of 26 matches
-    by accident, rarely two."""
+    that it could have. A turn is believed with so many matches, summed over all partners. Two
+    photos of different things often have one plane of 26 matches by accident, rarely two."""
+    times_others: float = 1.5
+    """... and if it has so many times the matches of any other turn. Photos beside far partners
+    of their sets: a wrong turn never had more than 0.91 times those of the right one
+    (docs/decisions/photos.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

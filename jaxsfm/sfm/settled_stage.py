@@ -17,7 +17,7 @@ from jaxsfm.io.store import digest
 from jaxsfm.options import Step
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
-from jaxsfm.sfm.check.model_check import Alternative, ModelCheck
+from jaxsfm.sfm.check.model_check import Alternative, ModelCheck, repeats
 from jaxsfm.sfm.checker import Checker
 from jaxsfm.sfm.mapped_stage import (
     ALTERNATIVE,
@@ -133,8 +133,9 @@ def _settled(
         checks = _with_second_places(checker, best, checks)
     if not checks or checks[0] is None:
         return _Settled(best.models, checks, [])
-    shown = whole if parts else other
-    told = _alternative(shown, whole=bool(parts), check=checks[0], best=best)
+    split = repeats(parts)
+    shown = whole if split else other
+    told = _alternative(shown, whole=split, check=checks[0], best=best)
     if shown is None or told is None:
         return _Settled(best.models, checks, [])
     checks[0] = dataclasses.replace(checks[0], alternative=told)
@@ -162,7 +163,8 @@ def _with_second_places(
 def _alternative(
     other: MappedModels | None, *, whole: bool, check: ModelCheck, best: MappedModels
 ) -> Alternative | None:
-    """What another mapping says of the best model; None if the two agree.
+    """What another mapping says of the best model; None if the two agree, or if its photos
+    contradict each other: then it explains them no better.
 
     Args:
       other: the mapping; None if there is no other one.
@@ -175,10 +177,12 @@ def _alternative(
     theirs, now = model_poses(other.models[0]), check.photos()
     if whole:
         elsewhere = sorted(theirs.keys() - now)
+    elif other.contradicted():
+        return None
     else:
         ours = model_poses(best.models[0])
         same, *others = groups({n: p for n, p in ours.items() if n in theirs}, theirs) or [[]]
-        if len(same) >= SAME_SHARE * len(ours.keys() & theirs.keys()) and not other.contradicted():
+        if len(same) >= SAME_SHARE * len(ours.keys() & theirs.keys()):
             return None
         elsewhere = sorted(name for group in others for name in group)
     return Alternative(

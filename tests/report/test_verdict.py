@@ -125,23 +125,30 @@ def test_a_model_of_which_the_photos_show_few_points_is_amber():
 
 def test_the_model_that_was_told_apart_is_shown_as_one_way_to_join_the_groups():
     whole = Alternative(basis="order", images=8, elsewhere=NAMES[3:], contradicted=9, whole=True)
-    groups = [NAMES[:3], NAMES[3:]]
+    groups = [NAMES[:3], NAMES[3:5]]
     check = dataclasses.replace(check_of("green"), told_apart=groups, alternative=whole)
     lines = verdict_lines([model_verdict(check)])
     assert lines[1] == (
         "other model      alternative/0 has 8 photos in one model, as they were before they were "
         "told apart; photos contradict each other at 9 of its points"
     )
-    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}" in lines[3]
+    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in lines[3]
     assert "look at each model by itself" in lines[4] and "alternative/0" in lines[4]
 
 
-def test_a_red_model_points_to_the_other_one_and_to_what_speaks_against_it():
-    other = dataclasses.replace(OTHER, basis="pairs", contradicted=7)
+def test_a_photo_that_was_told_apart_alone_leaves_the_others_green():
+    groups = [NAMES[:3], NAMES[3:4]]
+    check = dataclasses.replace(check_of("green"), told_apart=groups)
+    assert check.verdict == "green"
+    assert dataclasses.replace(check, told_apart=[*groups, NAMES[4:5]]).verdict == "green"
+    assert dataclasses.replace(check, told_apart=[*groups, NAMES[4:6]]).verdict == "amber"
+
+
+def test_a_red_model_points_to_the_other_one():
+    other = dataclasses.replace(OTHER, basis="pairs")
     verdict = model_verdict(dataclasses.replace(check_of("red"), alternative=other))
     lines = verdict_lines([verdict])
     assert "another mapping, which follows most of the pairs" in lines[2]
-    assert lines[2].endswith("; photos contradict each other at 7 of its points")
     assert "look whether alternative/0 is the right one" in lines[-1]
 
 

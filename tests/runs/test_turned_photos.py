@@ -11,7 +11,7 @@ from pair_results import counts
 
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import component_of, exhaustive_pairs
-from jaxsfm.runs.turned_photos import find_turned, groups_stored_alike
+from jaxsfm.runs.turned_photos import clear_turn, find_turned, groups_stored_alike
 from jaxsfm.sfm.limits import UPRIGHT
 
 STRONG, WEAK = counts(UPRIGHT.least_inliers), counts(UPRIGHT.least_inliers - 1)
@@ -64,6 +64,22 @@ def test_the_photo_of_a_group_that_is_tried_is_most_like_the_upright_ones():
     weak = {("a", "d"): counts(20), ("d", "f"): counts(20), ("a", "e"): counts(30)}
     find_turned(trials, upright | weak | {("c", "d"): STRONG, ("d", "e"): STRONG})
     assert [*trials.asked] == [*"dx"]
+
+
+@pytest.mark.parametrize(
+    ("inliers", "turn"),
+    [
+        ((1151, 432, 2237, 411), 2),  # photo 16 of temple_sparse_ring, which is upside down
+        ((1000, 0, 1499, 0), 0),
+        ((0, 1000, 0, 1500), 3),
+        ((2000, 0, 1000, 0), 0),
+        ((0, UPRIGHT.least_inliers - 1, 0, 0), 0),
+        ((0, UPRIGHT.least_inliers, 0, 0), 1),
+        ((0, 0, 0, 0), 0),
+    ],
+)
+def test_a_turn_is_clear_with_enough_matches_and_more_than_all_others(inliers, turn):
+    assert clear_turn(inliers) == turn
 
 
 @given(st.lists(st.sampled_from(exhaustive_pairs("abcdefg")), min_size=1))

@@ -1,6 +1,7 @@
 """The outcome of the check of a model, and the verdict that follows from it."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 from jaxsfm.io.pairs import Pair
@@ -11,7 +12,7 @@ MIN_VIEWS = 3
 VerdictColour = Literal["green", "amber", "red"]
 """Green: nothing speaks against the model. Amber: another model may explain the photos as well.
 Some fit into the model in a second place, another model was made, photos that follow each other do
-not agree with the model, photos of the run contradicted each other and were told apart, a part of
+not agree with the model, groups of photos contradicted each other and were told apart, a part of
 the model has shrunk, or the photos do not show enough of its points to refine it. Red: groups of
 its photos contradict each other."""
 
@@ -73,6 +74,17 @@ class Alternative:
     model itself does not follow."""
 
 
+def repeats(told_apart: Sequence[Sequence[str]]) -> bool:
+    """Whether groups of photos that were told apart say that the scene repeats itself, so that it
+    may do so elsewhere, too.
+
+    Photos that agree with each other, and contradict others that agree with each other, show two
+    places that were taken for one. A photo that contradicts all others was put down badly, and it
+    has lost its place.
+    """
+    return sum(len(group) > 1 for group in told_apart) > 1
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelCheck:
     """What the photos of a model say of it."""
@@ -90,8 +102,7 @@ class ModelCheck:
     told_apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Groups of photos, the largest first, that were in one model with others which they
     contradict. Each group of three photos or more is in a model without the others now. They are
-    the same for all models of a run: where there are any, the scene repeats itself, also
-    elsewhere."""
+    the same for all models of a run (`repeats`)."""
     shrunk: list[str] = dataclasses.field(default_factory=list)
     """Photos that see their points so much nearer than others that a part of the model has shrunk
     (`jaxsfm.sfm.check.scale`). Sorted."""
@@ -112,7 +123,7 @@ class ModelCheck:
 
     def doubted(self) -> bool:
         """Whether more speaks against the model than photos that follow each other (`apart`)."""
-        elsewhere = self.other_places, self.alternative, self.told_apart
+        elsewhere = self.other_places, self.alternative, repeats(self.told_apart)
         return any((self.contradictions, *elsewhere, self.shrunk))
 
     def photos(self) -> set[str]:
