@@ -100,7 +100,7 @@ class Checker(NamedTuple):
 
     def _matches(self) -> VerifiedMatches:
         given = self.given
-        return VerifiedMatches(given.matches, given.two_views.keys(), (), self.seed)
+        return VerifiedMatches(given.matches, given.two_views.keys(), self.seed)
 
     def _refinement(self) -> Refinement:
         return self.config.refinement or Refinement()

@@ -96,7 +96,7 @@ def test_a_part_that_shrinks_keeps_its_pixels_and_is_found_by_the_check():
     assert shrunk(seen.model) == [] and shrunk(model) == names(3, 4, 5)
     results = [true_matches(seen.model, a, b) for a in range(6) for b in range(a + 1, 6)]
     matches = {result.pair: result for result in results}
-    given = VerifiedMatches(matches, matches.keys(), frozenset(), 0)
+    given = VerifiedMatches(matches, matches.keys(), 0)
     found = check_model(model, seen.images, given, REFINEMENT)
     assert found is not None and found.check.shrunk == names(3, 4, 5)
     assert found.check.verdict != "green" and found.check.doubted()

@@ -43,8 +43,6 @@ class VerifiedMatches(NamedTuple):
     """By pair, original pixels."""
     pairs: Collection[Pair]
     """Those that COLMAP verified."""
-    refuted: Collection[Pair]
-    """Those of them that earlier checks have refuted."""
     seed: int
     """For RANSAC."""
 
@@ -54,8 +52,7 @@ class Checked(NamedTuple):
 
     check: ModelCheck
     refuted: dict[Pair, Contradiction]
-    """Pairs that agree with the model and whose two photos contradict each other there, except
-    those that were refuted before."""
+    """Pairs that agree with the model and whose two photos contradict each other there."""
     suspected: dict[Pair, Contradiction]
     """Pairs that agree with the model and join groups that contradict each other. Some of them may
     be right: then the groups were joined wrongly elsewhere."""
@@ -98,7 +95,7 @@ def check_model(
     fits = pair_fits(model, normal, given.matches, given.pairs)
     refuted, suspected = {}, {}
     for least in (CHECK.fit, *CHECK.lower_fits) if contradictions else ():
-        fitting = [p for p, fit in fits.items() if fit >= least and p not in given.refuted]
+        fitting = [p for p, fit in fits.items() if fit >= least]
         refuted = _refuted(found, names, fitting)
         suspected = {
             pair: each
