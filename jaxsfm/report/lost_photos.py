@@ -154,7 +154,10 @@ def _refused(report: RunReport) -> dict[str, _Refused]:
                 )
             elif at.held is not None:
                 why = (
-                    f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
+                    f"the mapper gave it a pose, but too few of its {at.held} points are shown by "
+                    "a third photo of the model"
+                    if not at.candidates
+                    else f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
                     f"{at.candidates} points that it should show, and only {at.held} points hold "
                     "it in the model"
                 )

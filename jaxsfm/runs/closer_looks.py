@@ -20,9 +20,8 @@ from jaxsfm.io.store import Store
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.runs.job import Job
 from jaxsfm.sfm.limits import REGISTER
-from jaxsfm.sfm.two_photos.matched import match_photos
-from jaxsfm.sfm.two_photos.pair_looks import HOPELESS
-from jaxsfm.sfm.two_photos.plane_looks import one_match_each
+from jaxsfm.sfm.two_photos.pair_looks import HOPELESS, looks_at_pair
+from jaxsfm.sfm.two_photos.plane_looks import as_one, one_match_each
 
 KEPT_FEATURES = REGISTER.partners + 1
 """Photos whose features are in memory: those of one photo and of its partners."""
@@ -36,7 +35,8 @@ def look_closer(
     Pairs that show no sign of a common part at any scale get no closer look.
 
     Args:
-      job: its config says how many planes are looked at; its stores may have features.
+      job: its config says how many planes are looked at, or that one look has to do
+        (`Config.closer_looks`); its stores may have features.
       images: the photos of the pairs, by name.
       store: where the results are kept, so that an interrupted run need not look again.
 
@@ -68,13 +68,14 @@ def look_closer(
 
 def _matched(job: Job, features: tuple[ImageFeatures, ImageFeatures]) -> PairResult:
     """The matches of a pair, one for each fine cell; none if they are hardly ever right."""
-    found = match_photos(
-        job.weights, *features, config=job.config, seed=job.seed, worth_closer=HOPELESS
+    looks = looks_at_pair(
+        job.weights, features, config=job.config, seed=job.seed, worth_closer=HOPELESS
     )
-    if found.evidence < REGISTER.evidence:
-        return without_matches(found.result)
+    found = as_one([each.result for each in looks.chosen])
+    if looks.evidence < REGISTER.evidence:
+        return without_matches(found)
     first, second = (job.config.fine_stride * float(np.mean(each.scale)) for each in features)
-    return one_match_each(found.result, (first, second))
+    return one_match_each(found, (first, second))
 
 
 def without_matches(result: PairResult) -> PairResult:

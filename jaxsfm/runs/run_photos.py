@@ -80,32 +80,37 @@ class RunPhotos:
 
 @dataclasses.dataclass(frozen=True)
 class LostMatcher:
-    """Matches photos without a place with their best partners at full size.
-
-    Where that is not enough, they are matched as seen from one place (`jaxsfm.runs.closer_looks`).
-    """
+    """Matches photos without a place with their best partners at full size: as they are, or as seen
+    from one place (`jaxsfm.runs.closer_looks`)."""
 
     photos: RunPhotos
     counts: Mapping[Pair, PairCounts]
     """Of all pairs that were tried."""
-    tried: set[Pair] = dataclasses.field(default_factory=set)
-    """The pairs that were looked at. No pair is looked at twice."""
+    tried: set[tuple[Pair, bool]] = dataclasses.field(default_factory=set)
+    """The pairs that were looked at, and whether closer. No pair is looked at twice alike."""
 
     def __call__(
-        self, lost: Collection[str], placed: Collection[str], false: Collection[Pair]
+        self,
+        lost: Collection[str],
+        placed: Collection[str],
+        false: Collection[Pair],
+        *,
+        closer: bool,
     ) -> dict[Pair, PairResult]:
         """Matches of lost photos, original pixels (`jaxsfm.sfm.register.lost.MatchLost`)."""
         job, identity = self.photos.job, self.photos.identity
+        config = job.config if closer else dataclasses.replace(job.config, closer_looks=0)
         counts = {pair: count for pair, count in self.counts.items() if pair not in false}
         pairs = pairs_to_look_at(lost, placed, counts, least=job.config.min_inliers)
-        pairs = [pair for pair in pairs if pair not in self.tried]
-        if not pairs:
+        pairs = [pair for pair in pairs if (pair, closer) not in self.tried]
+        if not pairs or (closer and not config.closer_looks):
             return {}
-        self.tried.update(pairs)
-        settings = {**job.config.matching(), "closer_looks": job.config.closer_looks}
+        self.tried.update((pair, closer) for pair in pairs)
+        settings = {**config.matching(), "closer_looks": config.closer_looks}
         store = Store(job.store.path, to_json(dataclasses.replace(identity, config=settings)))
         sought = sorted({name for pair in pairs for name in pair} & set(lost))
-        logger.info("looking closer at %s", named(sought))
-        bar = tqdm(pairs, desc="closer looks", unit="pair", disable=not job.progress)
-        full = job_of_look(job, identity, job.config)
+        what = "closer looks" if closer else "full size"
+        logger.info("no place yet, %s: %s", what, named(sought))
+        bar = tqdm(pairs, desc=what, unit="pair", disable=not job.progress)
+        full = job_of_look(job, identity, config)
         return look_closer(full, self.photos.images, bar, store=store)

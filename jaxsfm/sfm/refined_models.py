@@ -7,10 +7,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
+from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.cameras import pixels_were_turned
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import colour_points
-from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.model_images import part_of, registered
 from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
@@ -20,8 +23,11 @@ from jaxsfm.io.images import ImageError
 from jaxsfm.io.kept_folders import Steps
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
+from jaxsfm.sfm.check.model_check import MIN_VIEWS
+from jaxsfm.sfm.checker import opened
 from jaxsfm.sfm.kept_refinement import KeptRefinement, RefinedModel
 from jaxsfm.sfm.refine.evidence import Evidence
+from jaxsfm.sfm.refine.held_parts import held_parts
 from jaxsfm.sfm.refine.one_pass import PassSettings, run_pass
 from jaxsfm.sfm.refine.passes import (
     PassRun,
@@ -29,6 +35,7 @@ from jaxsfm.sfm.refine.passes import (
     refine_model,
     with_progress,
 )
+from jaxsfm.sfm.refine.weak_views import taken_out
 
 if TYPE_CHECKING:
     import pycolmap
@@ -53,7 +60,7 @@ class RefinedModels(NamedTuple):
     figures: list[RefinementFigures | None]
     """For each model, what was done to it; None where it was not refined."""
     order: list[int]
-    """For each model, its index among the given models."""
+    """For each model, the index of the given model that it was, or was a part of."""
 
 
 def refine_models(
@@ -86,12 +93,18 @@ def refine_models(
         kept = KeptRefinement(steps, f"model-{number}", believed.database)
         return kept.finished(model, lambda: refining.refined(model, kept.run_pass))
 
-    made = [refine(number, model) for number, model in enumerate(models)]
+    made = [
+        (number, *part)
+        for number, model in enumerate(models)
+        for part in refining.held(*refine(number, model))
+    ]
     # Images may have been taken out: the first model is again the one with most.
-    order = sorted(range(len(made)), key=lambda k: -made[k][0].num_reg_images())
-    for model, _ in made:
+    made.sort(key=lambda each: -each[1].num_reg_images())
+    for _, model, _ in made:
         colour_points(model, photos.rgb)
-    return RefinedModels([made[k][0] for k in order], [made[k][1] for k in order], order)
+    return RefinedModels(
+        [model for _, model, _ in made], [done for _, _, done in made], [k for k, _, _ in made]
+    )
 
 
 class _Refining(NamedTuple):
@@ -128,6 +141,44 @@ class _Refining(NamedTuple):
             )
             done = dataclasses.replace(done, camera=camera)
         return new, done
+
+    def held(
+        self, model: "pycolmap.Reconstruction", done: RefinementFigures | None
+    ) -> list[RefinedModel]:
+        """The parts of a refined model that hold together, each adjusted by itself.
+
+        Photos of parts of less than `MIN_VIEWS` have no place any more. A model of which nothing
+        would be left stays as it is, and does not count as confirmed.
+        """
+        if done is None or model.num_reg_images() < MIN_VIEWS:
+            return [(model, done)]
+        arrays = opened(model, self.photos)[0]
+        names = [view.name for view in arrays.views]
+        parts = [[names[k] for k in part] for part in held_parts(arrays.tracks, len(names))]
+        left = [part for part in parts if len(part) >= MIN_VIEWS]
+        if len(parts) == 1 or not left:
+            return [(model, dataclasses.replace(done, holds=bool(left)))]
+        shown = np.bincount(arrays.tracks.view, minlength=len(names)).tolist()
+        out = [
+            taken_out(name, held)
+            for name, held in zip(names, shown, strict=True)
+            if not any(name in part for part in left)
+        ]
+        made: list[RefinedModel] = []
+        for part in left:
+            alone = part_of(model, part)
+            bundle_adjust(
+                alone,
+                loss_px=self.photos.median_scale(),
+                refine_intrinsics=self.options.refine_intrinsics,
+                threads=self.options.threads,
+            )
+            own = [row for row in done.placed if row.name in part]
+            # Photos that no model has stand in the first part.
+            gone = [row for row in done.placed if row.name not in names]
+            rows = own if made else [*own, *gone, *out]
+            made.append((alone, dataclasses.replace(done, placed=rows)))
+        return made
 
     def _settings(self) -> PassSettings:
         assert self.config.refinement is not None

@@ -13,7 +13,7 @@ from jaxsfm.sfm.refine.passes import RefinementFigures, figures_from_json
 from jaxsfm.sfm.view_graph import Verdict
 
 FIGURES = "figures.json"
-FORMAT = 21
+FORMAT = 22
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 

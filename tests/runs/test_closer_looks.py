@@ -47,14 +47,15 @@ def looked(monkeypatch):
                 raise ImageError(f"{image.name}: damaged")
             return SimpleNamespace(image=image, scale=(scale, scale))
 
-        def match(_: object, a: Any, b: Any, *, config: object, seed: int, worth_closer: float):
+        def looks(_: object, both: Any, *, config: object, seed: int, worth_closer: float):
             assert worth_closer == HOPELESS and seed == 7
-            pair = (a.image.name, b.image.name)
+            pair = (both[0].image.name, both[1].image.name)
             done.append(pair)
-            return SimpleNamespace(result=result(pair), evidence=evidence[pair])
+            chosen = [SimpleNamespace(result=result(pair))]
+            return SimpleNamespace(chosen=chosen, evidence=evidence[pair])
 
         monkeypatch.setattr(closer_looks, "image_features", features)
-        monkeypatch.setattr(closer_looks, "match_photos", match)
+        monkeypatch.setattr(closer_looks, "looks_at_pair", looks)
         return done
 
     return of

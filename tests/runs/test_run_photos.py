@@ -1,5 +1,7 @@
 """Laws of the matching of a run's photos: at which size, which pairs, and what becomes of them."""
 
+import dataclasses
+import functools
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -61,23 +63,36 @@ def looks(monkeypatch) -> list:
 
 
 def test_lost_photos_are_matched_at_full_size_with_photos_that_have_a_place(looks, tmp_path):
-    found = LostMatcher(photos_in(tmp_path), TRIED)({"d"}, {"a", "b"}, set())
-    ((job, pairs, store),) = looks
-    assert [*found] == pairs == [("a", "d"), ("b", "d")]
-    assert job.config == preset("default")
-    assert job.store.identity["config"] == preset("default").matching()
-    assert store.identity["config"]["closer_looks"] == 4
+    match = LostMatcher(photos_in(tmp_path), TRIED)
+    for closer, planes in ((False, 0), (True, preset("default").closer_looks)):
+        found = match({"d"}, {"a", "b"}, set(), closer=closer)
+        job, pairs, store = looks.pop()
+        assert [*found] == pairs == [("a", "d"), ("b", "d")]
+        assert job.config == dataclasses.replace(preset("default"), closer_looks=planes)
+        assert job.store.identity["config"] == preset("default").matching()
+        assert store.identity["config"]["closer_looks"] == planes
+    assert planes == 4 and not looks
+
+
+def test_a_preset_without_closer_looks_matches_lost_photos_as_they_are_only(looks, tmp_path):
+    photos = photos_in(tmp_path)
+    job = dataclasses.replace(photos.job, config=preset("paper"))
+    match = LostMatcher(dataclasses.replace(photos, job=job), TRIED)
+    assert match({"d"}, {"a", "b"}, set(), closer=True) == {} and not looks
+    assert match({"d"}, {"a", "b"}, set(), closer=False) and len(looks) == 1
 
 
 def test_nothing_is_matched_where_nothing_is_lost_or_nothing_has_a_place(looks, tmp_path):
     for lost, placed in (({}, {*"abcd"}), ({*"abcd"}, {})):
-        assert LostMatcher(photos_in(tmp_path), TRIED)(lost, placed, set()) == {}
+        match = LostMatcher(photos_in(tmp_path), TRIED)
+        assert match(lost, placed, set(), closer=True) == {}
     assert not looks
 
 
-def test_no_pair_is_looked_at_twice(looks, tmp_path):
+@pytest.mark.parametrize("closer", [False, True])
+def test_no_pair_is_looked_at_twice(looks, tmp_path, closer):
     """A photo that has found a place is a new partner of the others."""
-    match = LostMatcher(photos_in(tmp_path), TRIED)
+    match = functools.partial(LostMatcher(photos_in(tmp_path), TRIED), closer=closer)
     assert [*match({"c", "d"}, {"a", "b"}, set())] == [
         ("a", "c"), ("b", "c"), ("a", "d"), ("b", "d")
     ]  # fmt: skip
@@ -86,7 +101,7 @@ def test_no_pair_is_looked_at_twice(looks, tmp_path):
 
 
 def test_pairs_that_were_found_to_be_false_are_not_looked_at(looks, tmp_path):
-    match = LostMatcher(photos_in(tmp_path), TRIED)
+    match = functools.partial(LostMatcher(photos_in(tmp_path), TRIED), closer=True)
     assert [*match({"d"}, {"a", "b", "c"}, {("a", "d")})] == [("b", "d"), ("c", "d")]
     assert match({"d"}, {"a"}, {("a", "d")}) == {}
 

@@ -187,12 +187,21 @@ class FakeGrow:
     [
         # The matches of the run are enough.
         ([["3.png", "4.png"]], []),
-        # One photo is left, and is registered.
-        ([["3.png"], ["4.png"]], [["4.png"]]),
-        # It is not, and nothing new can be its partner.
-        ([["3.png"], []], [["4.png"]]),
+        # One photo is left, and is registered by its matches at full size.
+        ([["3.png"], ["4.png"]], ["full 4.png"]),
+        # It needs closer looks.
+        ([["3.png"], [], ["4.png"]], ["full 4.png", "closer 4.png"]),
+        # They do not help, and nothing new can be its partner.
+        ([["3.png"], [], []], ["full 4.png", "closer 4.png"]),
         # Without any new photo at first, further matches are made all the same.
-        ([[], ["3.png"], []], [["3.png", "4.png"], ["4.png"]]),
+        (
+            [[], ["3.png"], [], []],
+            ["full 3.png 4.png", "full 4.png", "closer 4.png"],
+        ),
+        (
+            [[], [], ["3.png"], []],
+            ["full 3.png 4.png", "closer 3.png 4.png", "closer 4.png"],
+        ),
     ],
 )
 def test_more_is_matched_only_while_photos_are_lost_and_a_new_one_was_registered(
@@ -200,10 +209,10 @@ def test_more_is_matched_only_while_photos_are_lost_and_a_new_one_was_registered
 ):
     told, grow = [], FakeGrow(rendered, *plan)
 
-    def match_lost(lost, placed, false) -> Mapping[Pair, PairResult]:
+    def match_lost(lost, placed, false, *, closer) -> Mapping[Pair, PairResult]:
         assert not {*lost} & {*placed} and {*lost} | {*placed} == {*NAMES}
         assert {*false} == {("0.png", "1.png")}
-        told.append(sorted(lost))
+        told.append(" ".join(["closer" if closer else "full", *sorted(lost)]))
         return all_matches(rendered)
 
     monkeypatch.setattr(module, "grow", grow)
@@ -219,13 +228,13 @@ def test_where_no_more_matches_are_found_the_search_ends(rendered, run, monkeypa
     told: list[Any] = []
     monkeypatch.setattr(module, "grow", FakeGrow(rendered, []))
     given = run(model_with(rendered, [0, 1, 2]))
-    given.registered(lambda *about: told.append(about) or {})
-    assert len(told) == 1
+    given.registered(lambda *_, closer: told.append(closer) or {})
+    assert told == [False, True]
 
 
 def test_without_a_lost_photo_nothing_is_matched_and_nothing_kept(rendered, run):
     given = run(model_with(rendered, range(5)))
-    assert given.registered(lambda *_: pytest.fail("no photo is lost")) is given.made
+    assert given.registered(lambda *_, **__: pytest.fail("no photo is lost")) is given.made
     assert not (Path(given.kept.folder.path) / "stages" / "registered").exists()
 
 

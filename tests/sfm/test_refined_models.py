@@ -32,6 +32,9 @@ class FakePhotos:
     def median_scale(self) -> float:
         return 1.0
 
+    def working_size(self, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
+        return SIZE, (1.0, 1.0)
+
 
 @pytest.fixture
 def refined(rendered, monkeypatch):

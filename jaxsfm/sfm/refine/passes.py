@@ -47,11 +47,15 @@ class RefinementFigures:
     be registered."""
     camera: OtherCamera | None = None
     """The camera that the photos speak for, if it is not the one that was held."""
+    holds: bool = True
+    """Whether confirmed points hold three views together or more
+    (`jaxsfm.sfm.refine.held_parts`)."""
 
     @property
     def confirmed(self) -> bool:
-        """Whether enough points were found in the photos: a pass was made, and was accepted."""
-        return any(done.accepted for done in self.passes)
+        """Whether enough points were found in the photos: a pass was made, and was accepted, and
+        what is left holds."""
+        return self.holds and any(done.accepted for done in self.passes)
 
 
 def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
@@ -60,6 +64,7 @@ def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
         passes=[PassFigures(**each) for each in row["passes"]],
         placed=[Placement(**each) for each in row["placed"]],
         camera=OtherCamera(**row["camera"]) if row.get("camera") else None,
+        holds=row.get("holds", True),
     )
 
 

@@ -53,6 +53,17 @@ class Placement:
     if it was."""
 
 
+def taken_out(name: str, held: int) -> Placement:
+    """What became of a view that was taken out because few of its points hold it in the model.
+
+    Args:
+      held: the number of its observations.
+    """
+    return Placement(
+        name=name, registered=True, octave_px=None, candidates=0, agreed=0, error_px=None, held=held
+    )
+
+
 def _structure(model: Model, weak: Sequence[int]) -> tuple[Model, np.ndarray]:
     """The points that at least two of the other views see, and which points they are."""
     strong = model.tracks.select(~np.isin(model.tracks.view, weak))

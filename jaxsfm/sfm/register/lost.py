@@ -3,7 +3,7 @@
 These are photos that the mapper has lost, and photos that the refinement has taken out. They are
 located as photos that are added later (`jaxsfm.sfm.register.grow`), in the best of all models, and
 their places have to stand the same tests. The matches that the run has are tried first, then those
-with the best partners at full size.
+with the best partners at full size, and last those with the same partners as seen from one place.
 """
 
 import dataclasses
@@ -51,9 +51,19 @@ class MatchLost(Protocol):
     """Matches photos without a place with their best partners, at full size."""
 
     def __call__(
-        self, lost: Collection[str], placed: Collection[str], false: Collection[Pair]
+        self,
+        lost: Collection[str],
+        placed: Collection[str],
+        false: Collection[Pair],
+        *,
+        closer: bool,
     ) -> Mapping[Pair, PairResult]:
-        """The matches, original pixels. Pairs that were found to be false are left out."""
+        """The matches, original pixels. Pairs that were found to be false are left out.
+
+        Args:
+          closer: whether photos are also matched at other scales, turned, and as seen from one
+            place, which takes up to a minute for a pair. Otherwise they are matched as they are.
+        """
         ...
 
 
@@ -79,10 +89,13 @@ def register_lost(
         found = _Registration(given, settled, made)
         found.register(believed_matches(given, settled))
         if match_lost is not None:
-            # A photo that was registered may be the partner of another one.
-            false, more = settled.figures.misleading(), True
-            while more and (lost := found.lost()):
-                more = found.register(match_lost(lost, found.placed(), false))
+            false = settled.figures.misleading()
+            for closer in (False, True):
+                more = True
+                while more and (lost := found.lost()):
+                    # A photo that was registered may be the partner of another one.
+                    matches = match_lost(lost, found.placed(), false, closer=closer)
+                    more = found.register(matches)
         write_refined(folder, found.outcome())
 
     models = [fingerprint(model) for model in made.models]

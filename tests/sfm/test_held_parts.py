@@ -1,0 +1,141 @@
+"""Laws of the parts of a refined model that points of three views hold together."""
+
+import dataclasses
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from room_scene import SIZE, arrays, noisy_model
+from scipy.cluster.hierarchy import DisjointSet
+
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.config import Config, Refinement
+from jaxsfm.sfm import refined_models
+from jaxsfm.sfm.refine.held_parts import held_parts
+from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
+from jaxsfm.sfm.refine.passes import RefinementFigures
+from jaxsfm.sfm.refine.weak_views import taken_out
+from jaxsfm.sfm.refined_models import Believed, refine_models
+
+NAMES = [f"{k}.png" for k in range(5)]
+VIEWS = 6
+
+
+def tracks_of(points: list[set[int]]) -> Tracks:
+    """Tracks of points that these views see."""
+    point = [k for k, views in enumerate(points) for _ in views]
+    view = [each for views in points for each in sorted(views)]
+    many = len(point)
+    return Tracks(
+        np.zeros((len(points), 3)),
+        np.asarray(point, np.int64),
+        np.asarray(view, np.int64),
+        np.zeros((many, 2)),
+    )
+
+
+def slow_parts(points: list[set[int]]) -> list[list[int]]:
+    joined = DisjointSet(range(VIEWS))
+    for a, b in itertools.combinations(range(VIEWS), 2):
+        if sum({a, b} <= views and len(views) > 2 for views in points) >= MIN_COUNT:
+            joined.merge(a, b)
+    parts = [sorted(int(k) for k in part) for part in joined.subsets()]
+    return sorted(parts, key=lambda part: (-len(part), part))
+
+
+SEEN = st.sets(st.integers(0, VIEWS - 1), min_size=2, max_size=4)
+TIMES = st.integers(MIN_COUNT // 2, MIN_COUNT)
+
+
+@given(st.lists(st.tuples(SEEN, TIMES), max_size=8))
+def test_views_are_one_part_if_a_chain_of_shared_points_of_three_views_joins_them(groups):
+    points = [views for views, times in groups for _ in range(times)]
+    assert held_parts(tracks_of(points), VIEWS) == slow_parts(points)
+
+
+@pytest.mark.parametrize(
+    ("views", "times", "parts"),
+    [
+        ({0, 1, 2}, MIN_COUNT, [[0, 1, 2], [3]]),
+        ({0, 1, 2}, MIN_COUNT - 1, [[0], [1], [2], [3]]),
+        ({0, 1}, 10 * MIN_COUNT, [[0], [1], [2], [3]]),  # no third view shows them
+    ],
+)
+def test_a_third_view_must_show_enough_points(views, times, parts):
+    assert held_parts(tracks_of([views] * times), 4) == parts
+
+
+class Photos:
+    """Photos that are not read."""
+
+    gray = rgb = None
+    files: Any = {}
+
+    def median_scale(self) -> float:
+        return 1.0
+
+    def working_size(self, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
+        return SIZE, (1.0, 1.0)
+
+
+@pytest.fixture
+def held(rendered, monkeypatch):
+    """What is left of the room's model, if only some of its points are seen by some views."""
+
+    def run(*seen: set[int]) -> Any:
+        model = arrays(noisy_model(rendered, 0.0), rendered)
+        tracks, group = model.tracks, np.arange(len(model.tracks.points)) % len(seen)
+        keep = [view in seen[group[k]] for k, view in zip(tracks.point, tracks.view, strict=True)]
+        few = model.with_tracks(tracks.select(np.asarray(keep))).to_colmap()
+        done = RefinementFigures(passes=[], placed=[taken_out("gone", 3)])
+        monkeypatch.setattr(refined_models, "refine_model", lambda *_, **__: (few, done))
+        monkeypatch.setattr(refined_models, "colour_points", lambda *_: None)
+        monkeypatch.setattr(refined_models, "other_camera", lambda *_, **__: None)
+        return refine_models(
+            [few],
+            Photos(),  # pyright: ignore[reportArgumentType]
+            Believed(Any, {}),  # pyright: ignore[reportArgumentType]
+            config=Config(refinement=Refinement()),
+            options=MapOptions(refine_intrinsics=False, threads=1),
+        )
+
+    return run
+
+
+def test_a_model_that_holds_together_stays_as_it_is(held):
+    made = held({*range(5)})
+    assert [registered(model) for model in made.models] == [{*NAMES}] and made.order == [0]
+    (done,) = made.figures
+    assert done.holds and [row.name for row in done.placed] == ["gone"]
+
+
+def test_views_that_only_pairs_hold_lose_their_places(held):
+    made = held({0, 1, 2}, {3, 4})
+    assert [registered(model) for model in made.models] == [{*NAMES[:3]}] and made.order == [0]
+    (done,) = made.figures
+    assert done.holds and [row.name for row in done.placed] == ["gone", *NAMES[3:]]
+    assert all(row.held is not None and row.held > 0 for row in done.placed)
+
+
+def test_a_model_of_which_nothing_holds_stays_and_is_not_confirmed(held):
+    made = held({0, 1}, {1, 2}, {2, 3}, {3, 4})
+    assert [registered(model) for model in made.models] == [{*NAMES}]
+    (done,) = made.figures
+    accepted: Any = [type("Pass", (), {"accepted": True})]
+    assert not done.holds and not dataclasses.replace(done, passes=accepted).confirmed
+    assert dataclasses.replace(done, passes=accepted, holds=True).confirmed
+
+
+def test_each_part_that_is_large_enough_is_a_model_of_its_own(held, monkeypatch):
+    monkeypatch.setattr(refined_models, "MIN_VIEWS", 2)
+    monkeypatch.setattr(refined_models, "held_parts", lambda *_: [[0, 1], [3, 4], [2]])
+    made = held({0, 1}, {3, 4}, {2, 3})
+    sizes = [registered(model) for model in made.models]
+    assert sizes == [{*NAMES[:2]}, {*NAMES[3:]}] and made.order == [0, 0]
+    first, second = made.figures
+    assert [row.name for row in first.placed] == ["gone", NAMES[2]] and second.placed == []
