@@ -44,13 +44,25 @@ from places import Edit, code, mistakes
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "mutants"
 EQUIVALENT = Path(__file__).parent / "equivalent.json"
-FILES = ("jaxsfm/core", "jaxsfm/sfm/refine", "jaxsfm/sfm/register", "jaxsfm/sfm/view_graph.py")
+FILES = (
+    "jaxsfm/core",
+    "jaxsfm/runs/turned_photos.py",
+    "jaxsfm/sfm/check",
+    "jaxsfm/sfm/mapping.py",
+    "jaxsfm/sfm/refine",
+    "jaxsfm/sfm/refined_models.py",
+    "jaxsfm/sfm/register",
+    "jaxsfm/sfm/road.py",
+    "jaxsfm/sfm/settled_stage.py",
+    "jaxsfm/sfm/told_apart.py",
+    "jaxsfm/sfm/view_graph.py",
+)
 ALIGN = ("tests/core/test_align.py", "tests/core/test_alignment_noise.py")
 NUMERICS, BACKBONES = "tests/core/test_numerics_and_grid.py", "tests/core/test_backbones.py"
 PAIR, BATCHES = "tests/core/test_pair.py", "tests/matching/test_batches.py"
-PRODUCTS = "tests/core/test_products.py"
+PRODUCTS, ROAD = "tests/core/test_products.py", "tests/sfm/test_road.py"
 REFINE, WEAK = "tests/sfm/test_refine.py", "tests/sfm/test_weak_views.py"
-DEVICE = "tests/sfm/test_device_images.py"
+CHECK, DEVICE = "tests/sfm/test_check_model.py", "tests/sfm/test_device_images.py"
 TESTS: dict[str, tuple[str, ...]] = {
     "core/alexnet": (BACKBONES,),
     "core/align": ALIGN,
@@ -67,6 +79,17 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/sharded": (BATCHES,),
     "core/types": ("tests/core/test_presets.py", PAIR),
     "core/winograd": ("tests/core/test_winograd.py", "tests/core/test_vgg.py"),
+    "check/agreement": ("tests/sfm/test_check_agreement.py", CHECK),
+    "check/common_places": ("tests/sfm/test_check_places.py", "tests/bench/test_outcomes.py"),
+    "check/doubt": ("tests/sfm/test_doubt.py",),
+    "check/grouping": ("tests/sfm/test_check_grouping.py",),
+    "check/other_places": ("tests/sfm/test_check_places.py", CHECK),
+    "check/pair_fit": ("tests/sfm/test_check_places.py", CHECK),
+    "check/thinning": ("tests/sfm/test_check_thinning.py",),
+    "check/check_files": ("tests/sfm/test_stage_files.py",),
+    "check/check_model": (CHECK, "tests/sfm/test_check_scale.py"),
+    "check/model_check": ("tests/sfm/test_settled_stage.py", "tests/report/test_verdict.py"),
+    "check/scale": ("tests/sfm/test_check_scale.py",),
     "refine/candidates": (REFINE, WEAK),
     "refine/device_images": (DEVICE, "tests/sfm/test_placing.py"),
     "refine/device_templates": (DEVICE,),
@@ -91,6 +114,10 @@ TESTS: dict[str, tuple[str, ...]] = {
     "register/locate_view": ("tests/sfm/test_single_view.py", "tests/sfm/test_new_points.py"),
     "register/place": ("tests/sfm/test_new_points.py", "tests/runs/test_localize.py"),
     "register/triangulate": ("tests/sfm/test_new_points.py",),
+    "runs/turned_photos": ("tests/runs/test_turned_photos.py", "tests/runs/test_run_photos.py"),
+    "sfm/mapping": (ROAD, "tests/sfm/test_two_mappings.py"),
+    "sfm/refined_models": ("tests/sfm/test_held_parts.py", "tests/sfm/test_refined_models.py"),
+    "sfm/settled_stage": ("tests/sfm/test_settled_stage.py", ROAD),
     "sfm/view_graph": ("tests/sfm/test_viewgraph.py", "tests/sfm/test_placing.py"),
 }
 """Module (last two parts of its path) -> the tests that should notice a mistake in it, quickest
