@@ -224,6 +224,39 @@ def test_more_is_matched_only_while_photos_are_lost_and_a_new_one_was_registered
     assert told == asked  # the second time, the stage is there
 
 
+def test_a_photo_is_located_among_the_photos_that_it_was_matched_with(rendered, run, monkeypatch):
+    every = all_matches(rendered)
+    few = {pair: every[pair] for pair in [("0.png", "3.png"), ("1.png", "2.png")]}
+    grow = FakeGrow(rendered, [])
+    monkeypatch.setattr(module, "grow", grow)
+    monkeypatch.setattr(module, "believed_matches", lambda *_: few)
+    run(model_with(rendered, [0, 1, 2])).registered()
+    assert grow.wanted == [{"3.png": ["0.png"]}]
+
+
+@pytest.mark.parametrize("refines", [False, True])
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_camera_that_no_model_has_may_be_adjusted(rendered, run, monkeypatch, refines, shared):
+    own: list[bool] = []
+
+    def grow(models, wanted, *_, **__) -> ExtendedModels:
+        own.extend(each.own_camera for each in wanted.values())
+        return ExtendedModels(list(models), {}, {}, 1)
+
+    given = run(model_with(rendered, [0, 1, 2, 4]))
+    cameras = dict(module.read_images(given.settled.database))
+    if not shared:
+        image_id, camera = cameras[LOST]
+        alone = pycolmap.Camera(camera.todict())
+        alone.camera_id = 99
+        cameras[LOST] = (image_id, alone)
+    monkeypatch.setattr(module, "read_images", lambda _: cameras)
+    monkeypatch.setattr(module, "grow", grow)
+    options = dataclasses.replace(given.given.options, refine_intrinsics=refines)
+    given._replace(given=dataclasses.replace(given.given, options=options)).registered()
+    assert own == [refines and not shared]
+
+
 def test_where_no_more_matches_are_found_the_search_ends(rendered, run, monkeypatch):
     told: list[Any] = []
     monkeypatch.setattr(module, "grow", FakeGrow(rendered, []))

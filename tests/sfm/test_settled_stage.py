@@ -40,6 +40,12 @@ def test_another_mapping_counts_if_it_is_another_one_and_its_photos_agree(
     assert (found and found.elsewhere) == elsewhere
 
 
+def test_photos_that_the_other_mapping_lacks_say_nothing(rendered):
+    other = mapping(rendered)
+    other.models[0].deregister_frame(2)
+    assert _alternative(other, whole=False, check=CHECK, best=mapping(rendered)) is None
+
+
 def test_the_model_that_was_told_apart_counts_although_its_photos_contradict_each_other(rendered):
     whole = mapping(rendered, contradicted=7)
     check = outcome(NAMES[:3]).check

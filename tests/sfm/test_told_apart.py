@@ -59,6 +59,15 @@ def test_a_part_is_no_longer_bent_by_the_photos_that_were_joined_to_it_wrongly(r
     assert done is not None and done.check.groups == [NAMES[:3]]
 
 
+def test_large_errors_count_for_less_in_pixels_of_the_described_photos(rendered, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "bundle_adjust", lambda _, **given: asked.append(given["loss_px"]))
+    parts = outcome(NAMES[:3], NAMES[3:])
+    options = MapOptions(refine_intrinsics=False, threads=1, scale=4.0)
+    told_apart([noisy_model(rendered, 0.0)], [parts], FakeChecker(), options)
+    assert asked == [4.0 * module.LOSS_PX]
+
+
 def test_models_without_contradictions_stay_as_they_are_and_are_not_checked_again(rendered):
     model, checker = noisy_model(rendered, 0.0), FakeChecker()
     found = taken_apart([model, model], [outcome(NAMES), None], checker)

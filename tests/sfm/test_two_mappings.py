@@ -18,7 +18,7 @@ from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.model_check import Contradiction
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.limits import TRUST
-from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
+from jaxsfm.sfm.mapping import MappedModels, Mapper, MappingFigures, Trust
 from jaxsfm.sfm.view_graph import Verdict, strengths
 
 LETTERS = [*"abcdefghij"]
@@ -152,8 +152,26 @@ def test_rejected_pairs_are_refuted_in_the_second_mapping_and_say_why():
     assert trust is not None and trust.basis == "pairs" and trust.dropped() == {false}
     verdict = trust.verdicts[false]
     assert verdict.refuted and not verdict.trusted and "of 100 points" in verdict.reason
+    assert verdict.strength == 0
     assert "42 are missing" in verdict.reason
     assert not any(each.refuted for pair, each in trust.verdicts.items() if pair != false)
+
+
+@pytest.mark.parametrize(
+    ("trusted", "refuted", "basis", "misleads"),
+    [
+        (False, True, "pairs", True),
+        (False, False, "pairs", False),  # it may only be weak
+        (False, False, "order", True),
+        (True, False, "order", False),
+        (True, True, "pairs", False),
+    ],
+)
+def test_pairs_that_were_found_to_be_false_mislead(trusted, refuted, basis, misleads):
+    verdict = Verdict(trusted=trusted, refuted=refuted, strength=1.0, rotation_error_deg=None)
+    pair = ("a", "b")
+    figures = MappingFigures(verdicts={pair: verdict}, attempts=[], checks=[], basis=basis)
+    assert figures.misleading() == ({pair} if misleads else set())
 
 
 def test_a_rejected_pair_has_no_vote_on_the_others():
