@@ -143,25 +143,26 @@ def _refused(report: RunReport) -> dict[str, _Refused]:
         for group in check.told_apart
         for name in group
     }
-    for each in report.refinement:
-        for at in each.placed if each else ():
-            if at.doubt:
-                before = found.get(at.name)
-                why = f"registration found no place that can be trusted: {at.doubt}"
-                found[at.name] = _Refused(
-                    had_pose=before is not None or at.candidates > 0,
-                    why=f"{before.why}; {why}" if before else why,
-                )
-            elif at.held is not None:
-                why = (
-                    f"the mapper gave it a pose, but too few of its {at.held} points are shown by "
-                    "a third photo of the model"
-                    if not at.candidates
-                    else f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
-                    f"{at.candidates} points that it should show, and only {at.held} points hold "
-                    "it in the model"
-                )
-                found[at.name] = _Refused(True, why)
+    rows = [at for each in report.refinement for at in (each.placed if each else ())]
+    # What registration says comes after the reason for which a photo was taken out.
+    for at in sorted(rows, key=lambda at: bool(at.doubt)):
+        if at.doubt:
+            before = found.get(at.name)
+            why = f"registration found no place that can be trusted: {at.doubt}"
+            found[at.name] = _Refused(
+                had_pose=before is not None or at.candidates > 0,
+                why=f"{before.why}; {why}" if before else why,
+            )
+        elif at.held is not None:
+            why = (
+                f"the mapper gave it a pose, but too few of its {at.held} points are shown by "
+                "a third photo of the model"
+                if not at.candidates
+                else f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
+                f"{at.candidates} points that it should show, and only {at.held} points hold "
+                "it in the model"
+            )
+            found[at.name] = _Refused(True, why)
     return found
 
 

@@ -21,7 +21,7 @@ from jaxsfm.report.summary import component_lines, help_lines
 from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refine.weak_views import Placement, taken_out
 from jaxsfm.sfm.view_graph import Verdict
 
 REPORT = RunReport.from_json(
@@ -296,6 +296,25 @@ def test_an_image_that_was_told_apart_and_then_refused_says_both():
     assert row["stage"] == "not confirmed"
     assert "speaks against the model that it was in; registration" in row["detail"]
     assert row["detail"].endswith(": X")
+
+
+def test_an_image_that_was_taken_out_and_then_refused_says_both():
+    """It was taken out of the second model, and what registration says stands in the first one."""
+    tried = {("a", "b"): counts(Status.VERIFIED, 500, 400)}
+    refused = Placement(
+        name="c", registered=False, octave_px=None, candidates=0, agreed=0, error_px=None, doubt="X"
+    )
+    rows = [[refused], [taken_out("c", 17)]]
+    (row,) = explained(
+        "abc",
+        tried,
+        dict.fromkeys(tried, 42),
+        [["a", "b"]],
+        refinement=[RefinementFigures(passes=[], placed=placed) for placed in rows],
+    )["lost"]
+    assert row["stage"] == "not confirmed"
+    assert "too few of its 17 points are shown by a third photo" in row["detail"]
+    assert row["detail"].endswith("; registration found no place that can be trusted: X")
 
 
 def test_an_image_that_contradicts_the_model_it_was_in_says_so():

@@ -36,6 +36,7 @@ def test_a_report_of_the_first_format_is_read_and_loses_nothing(old):
             done["doubtful_views"] = []
             done["shift_px"] = None  # it was not measured then
         model["camera"] = None  # nor was it asked for another one
+        model["holds"] = True  # nor whether points hold it together
     assert report.to_json() == plain | {"format": 1, "checks": []}
     assert report.verdict is None
     assert report.models[0].registered == 7 and report.pairs.each[0].status == Status.VERIFIED

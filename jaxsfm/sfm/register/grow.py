@@ -47,7 +47,8 @@ def grow(
     seed: int = 0,
     on_view: Callable[[], None] = lambda: None,
 ) -> ExtendedModels:
-    """Register views until a round registers none. The views of one round do not see each other.
+    """Register views until no other view has a place that can be trusted. The views of one round
+    are located without each other.
 
     Args:
       models: one at least.

@@ -1,9 +1,9 @@
 """Registration of the photos of a run that have no place after the refinement.
 
-These are photos that the mapper has lost, and photos that the refinement has taken out. They are
-located as photos that are added later (`jaxsfm.sfm.register.grow`), in the best of all models, and
-their places have to stand the same tests. The matches that the run has are tried first, then those
-with the best partners at full size, and last those with the same partners as seen from one place.
+These are photos that the mapper has lost, that were split off, or that the refinement has taken
+out. They are located as photos that are added later (`jaxsfm.sfm.register.grow`), in the best of
+all refined models, and their places have to stand the same tests. The matches that the run has are
+tried first, then those with the best partners at full size, and last those as seen from one place.
 """
 
 import dataclasses
