@@ -154,15 +154,13 @@ def _refused(report: RunReport) -> dict[str, _Refused]:
                 why=f"{before.why}; {why}" if before else why,
             )
         elif at.held is not None:
-            why = (
-                f"the mapper gave it a pose, but too few of its {at.held} points are shown by "
-                "a third photo of the model"
-                if not at.candidates
-                else f"the mapper gave it a pose, but alignment finds only {at.agreed} of the "
-                f"{at.candidates} points that it should show, and only {at.held} points hold "
-                "it in the model"
+            lack = (
+                f"alignment finds only {at.agreed} of the {at.candidates} points that it should "
+                f"show, and only {at.held} points hold it in the model"
+                if at.candidates
+                else f"too few of its {at.held} points are shown by a third photo of the model"
             )
-            found[at.name] = _Refused(True, why)
+            found[at.name] = _Refused(True, f"the mapper gave it a pose, but {lack}")
     return found
 
 

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.cameras import pixels_were_turned
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_folders import colour_points
-from jaxsfm.colmap.model_images import part_of, registered
+from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.triangulation import with_all_points
 from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
@@ -36,6 +35,7 @@ from jaxsfm.sfm.refine.passes import (
     with_progress,
 )
 from jaxsfm.sfm.refine.weak_views import taken_out
+from jaxsfm.sfm.told_apart import adjusted_part
 
 if TYPE_CHECKING:
     import pycolmap
@@ -158,25 +158,21 @@ class _Refining(NamedTuple):
         left = [part for part in parts if len(part) >= MIN_VIEWS]
         if len(parts) == 1 or not left:
             return [(model, dataclasses.replace(done, holds=bool(left)))]
+        stay = {name for part in left for name in part}
         shown = np.bincount(arrays.tracks.view, minlength=len(names)).tolist()
-        out = [
-            taken_out(name, held)
-            for name, held in zip(names, shown, strict=True)
-            if not any(name in part for part in left)
+        # What became of photos that no model has stands in the first part.
+        others = [row for row in done.placed if row.name not in names]
+        others += [
+            taken_out(name, count)
+            for name, count in zip(names, shown, strict=True)
+            if name not in stay
         ]
         made: list[RefinedModel] = []
         for part in left:
-            alone = part_of(model, part)
-            bundle_adjust(
-                alone,
-                loss_px=self.photos.median_scale(),
-                refine_intrinsics=self.options.refine_intrinsics,
-                threads=self.options.threads,
-            )
-            own = [row for row in done.placed if row.name in part]
-            # Photos that no model has stand in the first part.
-            gone = [row for row in done.placed if row.name not in names]
-            rows = own if made else [*own, *gone, *out]
+            scale = self.photos.median_scale()
+            alone = adjusted_part(model, part, loss_px=scale, options=self.options)
+            rows = [row for row in done.placed if row.name in part]
+            rows += [] if made else others
             made.append((alone, dataclasses.replace(done, placed=rows)))
         return made
 

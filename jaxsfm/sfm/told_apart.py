@@ -74,13 +74,7 @@ def _parts(
     for part in done.parts if done is not None and len(done.parts) > 1 else ():
         names: list[list[str]] = []
         if len(part) >= MIN_VIEWS:
-            alone = part_of(model, part)
-            bundle_adjust(
-                alone,
-                loss_px=LOSS_PX * options.scale,
-                refine_intrinsics=options.refine_intrinsics,
-                threads=options.threads,
-            )
+            alone = adjusted_part(model, part, loss_px=LOSS_PX * options.scale, options=options)
             (again,) = checker.check([alone])
             if again is not None:
                 parts, names = _parts((alone, again), checker, options)
@@ -90,3 +84,25 @@ def _parts(
         return [whole], []
     contradicted = done is not None and bool(done.check.contradictions)
     return made, groups if contradicted else []
+
+
+def adjusted_part(
+    model: "pycolmap.Reconstruction",
+    names: Sequence[str],
+    *,
+    loss_px: float,
+    options: MapOptions,
+) -> "pycolmap.Reconstruction":
+    """A model with these photos alone, adjusted without the others.
+
+    Args:
+      loss_px: as in `jaxsfm.colmap.bundle_adjustment.bundle_adjust`.
+    """
+    part = part_of(model, names)
+    bundle_adjust(
+        part,
+        loss_px=loss_px,
+        refine_intrinsics=options.refine_intrinsics,
+        threads=options.threads,
+    )
+    return part

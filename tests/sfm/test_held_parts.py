@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from room_scene import SIZE, arrays, noisy_model
+from room_scene import arrays, noisy_model
 from scipy.cluster.hierarchy import DisjointSet
+from test_refined_models import NAMES, FakePhotos
 
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_images import registered
@@ -22,7 +23,6 @@ from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import taken_out
 from jaxsfm.sfm.refined_models import Believed, refine_models
 
-NAMES = [f"{k}.png" for k in range(5)]
 VIEWS = 6
 
 
@@ -70,19 +70,6 @@ def test_a_third_view_must_show_enough_points(views, times, parts):
     assert held_parts(tracks_of([views] * times), 4) == parts
 
 
-class Photos:
-    """Photos that are not read."""
-
-    gray = rgb = None
-    files: Any = {}
-
-    def median_scale(self) -> float:
-        return 1.0
-
-    def working_size(self, name: str) -> tuple[tuple[int, int], tuple[float, float]]:
-        return SIZE, (1.0, 1.0)
-
-
 @pytest.fixture
 def held(rendered, monkeypatch):
     """What is left of the room's model, if only some of its points are seen by some views."""
@@ -98,7 +85,7 @@ def held(rendered, monkeypatch):
         monkeypatch.setattr(refined_models, "other_camera", lambda *_, **__: None)
         return refine_models(
             [few],
-            Photos(),  # pyright: ignore[reportArgumentType]
+            FakePhotos(rendered),  # pyright: ignore[reportArgumentType]
             Believed(Any, {}),  # pyright: ignore[reportArgumentType]
             config=Config(refinement=Refinement()),
             options=MapOptions(refine_intrinsics=False, threads=1),
