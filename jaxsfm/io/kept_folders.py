@@ -3,9 +3,8 @@
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
-from jaxsfm.io.atomic import Json, atomic_folder
+from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.io.hashes import rows_sha256, sha256_of
 from jaxsfm.io.store import digest
 
@@ -35,32 +34,6 @@ def keep(folder: Path, key: str, compute: Callable[[Path], None]) -> None:
 def forget(folder: Path) -> None:
     """Make the next `is_kept` say no."""
     (folder / _KEY).unlink(missing_ok=True)
-
-
-class Steps(NamedTuple):
-    """Kept parts of work that is not finished: if it is interrupted, it goes on after the last one.
-
-    The parts are read from their files even if they have just been computed, so that work that was
-    interrupted ends as it would have.
-    """
-
-    folder: Path
-    key: str
-    """Identifies everything that the whole work depends on."""
-
-    def kept(self, kind: str, about: Json, compute: Callable[[Path], None]) -> Path:
-        """The folder with the files of a part, which is computed only if they are not there yet.
-
-        Args:
-          kind: of the part; it begins the name of its folder.
-          about: what the part depends on besides the key of the whole work.
-          compute: writes the files into the given folder.
-        """
-        key = digest(self.key, about)
-        target = self.folder / f"{kind}-{key[:16]}"
-        if not is_kept(target, key):
-            keep(target, key, compute)
-        return target
 
 
 def _content(folder: Path) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import PARTIAL, Json, read_json, write_atomic
-from jaxsfm.io.kept_folders import Steps, forget, is_kept, keep
+from jaxsfm.io.kept_folders import forget, is_kept, keep
 from jaxsfm.io.locks import only_process
 from jaxsfm.io.store import FAILED, Identity, Store
 
@@ -47,16 +47,7 @@ class WorkFolder(Store):
             logger.info("%s: as before, nothing it depends on has changed", name)
         else:
             keep(folder, key, compute)
-        _remove(self.steps(name, key).folder)
         return folder
-
-    def steps(self, name: str, key: str) -> Steps:
-        """The kept parts of a stage that is not finished; when it is, they are removed.
-
-        Args:
-          key: as in `stage`.
-        """
-        return Steps(self.path / "stages" / f"{name}-steps", key)
 
     def forget_stage(self, name: str) -> None:
         """Make the next run compute a stage again."""

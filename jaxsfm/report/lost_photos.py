@@ -155,8 +155,8 @@ def _refused(report: RunReport) -> dict[str, _Refused]:
             )
         elif at.held is not None:
             lack = (
-                f"alignment finds only {at.agreed} of the {at.candidates} points that it should "
-                f"show, and only {at.held} points hold it in the model"
+                f"alignment finds only {at.agreed} of the {at.candidates} points that it would "
+                "show there"
                 if at.candidates
                 else f"too few of its {at.held} points are shown by a third photo of the model"
             )

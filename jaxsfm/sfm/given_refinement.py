@@ -17,7 +17,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.sfm.model_photos import ModelPhotos
 from jaxsfm.sfm.old_frame import move_back
 from jaxsfm.sfm.refine.one_pass import PassSettings
-from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model, with_progress
+from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -58,7 +58,7 @@ def refine_given(
         photos.gray,
         PassSettings(refinement, refine_intrinsics, threads),
         described_px=_described_px(given, photos),
-        run=with_progress(on_pass),
+        on_pass=on_pass,
     )
     if not figures.confirmed:
         return None

@@ -19,20 +19,16 @@ from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
 from jaxsfm.config import WORTH, Config
 from jaxsfm.errors import UserError, remark
 from jaxsfm.io.images import ImageError
-from jaxsfm.io.kept_folders import Steps
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.checker import opened
-from jaxsfm.sfm.kept_refinement import KeptRefinement, RefinedModel
 from jaxsfm.sfm.refine.evidence import Evidence
 from jaxsfm.sfm.refine.held_parts import held_parts
-from jaxsfm.sfm.refine.one_pass import PassSettings, run_pass
+from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import (
-    PassRun,
     RefinementFigures,
     refine_model,
-    with_progress,
 )
 from jaxsfm.sfm.refine.weak_views import taken_out
 from jaxsfm.sfm.told_apart import adjusted_part
@@ -41,6 +37,9 @@ if TYPE_CHECKING:
     import pycolmap
 
 logger = logging.getLogger("jaxsfm")
+
+RefinedModel = tuple["pycolmap.Reconstruction", RefinementFigures | None]
+"""A model after the refinement, and what was done to it; None where it was not refined."""
 
 
 class Believed(NamedTuple):
@@ -71,7 +70,6 @@ def refine_models(
     config: Config,
     options: MapOptions,
     on_pass: Callable[[], None] = lambda: None,
-    steps: Steps | None = None,
 ) -> RefinedModels:
     """Refine the models, if asked for, and colour their points.
 
@@ -81,22 +79,12 @@ def refine_models(
       photos: at the size that the refinement works at.
       config: its `refinement` and `checked` switch these parts on.
       options: of the mapper; its `scale` is that of the photos in which keypoints were found.
-      steps: where passes and models are kept until all are refined; None: nowhere.
     """
     refining = _Refining(photos, believed, config, options, on_pass)
-
-    def refine(number: int, model: "pycolmap.Reconstruction") -> RefinedModel:
-        if config.refinement is None:
-            return model, None
-        if steps is None:
-            return refining.refined(model)
-        kept = KeptRefinement(steps, f"model-{number}", believed.database)
-        return kept.finished(model, lambda: refining.refined(model, kept.run_pass))
-
     made = [
         (number, *part)
         for number, model in enumerate(models)
-        for part in refining.held(*refine(number, model))
+        for part in refining.held(*refining.refined(model))
     ]
     # Images may have been taken out: the first model is again the one with most.
     made.sort(key=lambda each: -each[1].num_reg_images())
@@ -116,9 +104,12 @@ class _Refining(NamedTuple):
     options: MapOptions
     on_pass: Callable[[], None] = lambda: None
 
-    def refined(self, model: "pycolmap.Reconstruction", run: PassRun = run_pass) -> RefinedModel:
-        """A model after the refinement; if a photo cannot be read, it is not refined."""
+    def refined(self, model: "pycolmap.Reconstruction") -> RefinedModel:
+        """A model after the refinement. It stays as it is if no refinement is asked for, and if a
+        photo cannot be read."""
         options = self.options
+        if self.config.refinement is None:
+            return model, None
         try:
             new, done = refine_model(
                 model,
@@ -127,7 +118,7 @@ class _Refining(NamedTuple):
                 evidence=Evidence(self.believed.matches, options.seed),
                 with_all_points=self._whole,
                 described_px=described_px(options.scale / self.photos.median_scale()),
-                run=with_progress(self.on_pass, run),
+                on_pass=self.on_pass,
             )
         except ImageError as error:  # a photo was deleted since; the mapper's model remains
             logger.warning("no refinement: %s", error)
@@ -147,23 +138,30 @@ class _Refining(NamedTuple):
     ) -> list[RefinedModel]:
         """The parts of a refined model that hold together, each adjusted by itself.
 
-        Photos of parts of less than `MIN_VIEWS` have no place any more. A model of which nothing
-        would be left stays as it is, and does not count as confirmed.
+        Photos of parts of less than `MIN_VIEWS` have no place any more; registration looks for
+        another one. A model of which nothing would be left stays as it is, and does not count as
+        confirmed.
         """
         if done is None or model.num_reg_images() < MIN_VIEWS:
             return [(model, done)]
         arrays = opened(model, self.photos)[0]
         names = [view.name for view in arrays.views]
-        parts = [[names[k] for k in part] for part in held_parts(arrays.tracks, len(names))]
+        asked = self._settings().refinement.weak_octaves > 0
+        unconfirmed = done.unconfirmed_views() if asked else set()
+        use = np.asarray([name not in unconfirmed for name in names])[arrays.tracks.view]
+        parts = [
+            [names[k] for k in part] for part in held_parts(arrays.tracks.select(use), len(names))
+        ]
         left = [part for part in parts if len(part) >= MIN_VIEWS]
         if len(parts) == 1 or not left:
             return [(model, dataclasses.replace(done, holds=bool(left)))]
         stay = {name for part in left for name in part}
         shown = np.bincount(arrays.tracks.view, minlength=len(names)).tolist()
-        # What became of photos that no model has stands in the first part.
-        others = [row for row in done.placed if row.name not in names]
-        others += [
-            taken_out(name, count)
+        rows = {row.name: row for row in done.placed}
+        out = [
+            dataclasses.replace(rows[name], held=count)
+            if name in unconfirmed
+            else taken_out(name, count)
             for name, count in zip(names, shown, strict=True)
             if name not in stay
         ]
@@ -171,9 +169,10 @@ class _Refining(NamedTuple):
         for part in left:
             scale = self.photos.median_scale()
             alone = adjusted_part(model, part, loss_px=scale, options=self.options)
-            rows = [row for row in done.placed if row.name in part]
-            rows += [] if made else others
-            made.append((alone, dataclasses.replace(done, placed=rows)))
+            own = [row for row in done.placed if row.name in part]
+            # What became of photos that no model has stands in the first part.
+            own += [] if made else [row for row in done.placed if row.name not in names] + out
+            made.append((alone, dataclasses.replace(done, placed=own)))
         return made
 
     def _settings(self) -> PassSettings:

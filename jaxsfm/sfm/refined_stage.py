@@ -75,7 +75,6 @@ def refine_settled(
             config=config,
             options=given.options,
             on_pass=on_pass,
-            steps=kept.folder.steps("refined", key),
         )
         write_refined(folder, after)
 

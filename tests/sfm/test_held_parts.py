@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from room_scene import arrays, noisy_model
+from room_scene import arrays, noisy_model, other_scene
 from scipy.cluster.hierarchy import DisjointSet
 from test_refined_models import NAMES, FakePhotos
 
@@ -20,7 +20,7 @@ from jaxsfm.sfm import refined_models
 from jaxsfm.sfm.refine.held_parts import held_parts
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import taken_out
+from jaxsfm.sfm.refine.weak_views import Placement, taken_out
 from jaxsfm.sfm.refined_models import Believed, refine_models
 
 VIEWS = 6
@@ -70,16 +70,18 @@ def test_a_third_view_must_show_enough_points(views, times, parts):
     assert held_parts(tracks_of([views] * times), 4) == parts
 
 
+DONE = RefinementFigures(passes=[], placed=[taken_out("gone", 3)])
+
+
 @pytest.fixture
 def held(rendered, monkeypatch):
     """What is left of the room's model, if only some of its points are seen by some views."""
 
-    def run(*seen: set[int]) -> Any:
+    def run(*seen: set[int], done: RefinementFigures = DONE, weak_octaves: int = 4) -> Any:
         model = arrays(noisy_model(rendered, 0.0), rendered)
         tracks, group = model.tracks, np.arange(len(model.tracks.points)) % len(seen)
         keep = [view in seen[group[k]] for k, view in zip(tracks.point, tracks.view, strict=True)]
         few = model.with_tracks(tracks.select(np.asarray(keep))).to_colmap()
-        done = RefinementFigures(passes=[], placed=[taken_out("gone", 3)])
         monkeypatch.setattr(refined_models, "refine_model", lambda *_, **__: (few, done))
         monkeypatch.setattr(refined_models, "colour_points", lambda *_: None)
         monkeypatch.setattr(refined_models, "other_camera", lambda *_, **__: None)
@@ -87,7 +89,7 @@ def held(rendered, monkeypatch):
             [few],
             FakePhotos(rendered),  # pyright: ignore[reportArgumentType]
             Believed(Any, {}),  # pyright: ignore[reportArgumentType]
-            config=Config(refinement=Refinement()),
+            config=Config(refinement=Refinement(weak_octaves=weak_octaves)),
             options=MapOptions(refine_intrinsics=False, threads=1),
         )
 
@@ -116,6 +118,61 @@ def test_a_model_of_which_nothing_holds_stays_and_is_not_confirmed(held):
     accepted: Any = [type("Pass", (), {"accepted": True})]
     assert not done.holds and not dataclasses.replace(done, passes=accepted).confirmed
     assert dataclasses.replace(done, passes=accepted, holds=True).confirmed
+
+
+def weak_in(*passes: bool, octave_px: int | None) -> RefinementFigures:
+    """The figures of passes, in some of which the third view is weak, and of its placing."""
+    view = Placement(
+        name=NAMES[2],
+        registered=True,
+        octave_px=octave_px,
+        candidates=230,
+        agreed=11,
+        error_px=None if octave_px is None else 1.0,
+    )
+    each: Any = [
+        type("Pass", (), {"accepted": True, "weak_views": [NAMES[2]] if weak else []})
+        for weak in passes
+    ]
+    return RefinementFigures(passes=each, placed=[view])
+
+
+@pytest.mark.parametrize(
+    ("done", "weak_octaves", "stays"),
+    [
+        (weak_in(False, True, octave_px=None), 4, False),
+        (weak_in(False, True, octave_px=2), 4, True),  # an octave has confirmed its pose
+        (weak_in(True, False, octave_px=None), 4, True),  # the last pass has aligned it
+        (weak_in(False, True, octave_px=None), 0, True),  # no octave was asked
+    ],
+)
+def test_the_observations_of_a_view_that_nothing_confirms_hold_nothing(
+    held, done, weak_octaves, stays
+):
+    made = held({*range(5)}, done=done, weak_octaves=weak_octaves)
+    gone = set() if stays else {NAMES[2]}
+    assert [registered(model) for model in made.models] == [{*NAMES} - gone]
+    (row,) = made.figures[0].placed
+    assert (row.name, row.candidates, row.agreed) == (NAMES[2], 230, 11)
+    assert (row.held is None) == stays
+
+
+def test_the_refinement_takes_out_a_photo_of_another_place(rendered, monkeypatch):
+    """It has observations, which agree with its pose, and shows something else."""
+    elsewhere = rendered._replace(images=rendered.images | {NAMES[2]: other_scene(0)})
+    for name in ("with_all_points", "colour_points"):
+        monkeypatch.setattr(refined_models, name, lambda model, *_, **__: model)
+    monkeypatch.setattr(refined_models, "other_camera", lambda *_, **__: None)
+    made = refine_models(
+        [noisy_model(rendered, 0.7)],
+        FakePhotos(elsewhere),  # pyright: ignore[reportArgumentType]
+        Believed(Any, {}),  # pyright: ignore[reportArgumentType]
+        config=Config(refinement=Refinement()),
+        options=MapOptions(refine_intrinsics=False, threads=1),
+    )
+    assert [registered(model) for model in made.models] == [{*NAMES} - {NAMES[2]}]
+    (row,) = made.figures[0].placed
+    assert row.name == NAMES[2] and row.held is not None and row.held >= MIN_COUNT
 
 
 def test_each_part_that_is_large_enough_is_a_model_of_its_own(held, monkeypatch):

@@ -76,17 +76,13 @@ class Refined(NamedTuple):
     model: Model
 
 
-PassOutcome = tuple[Refined, PassFigures]
-"""The model after a pass, and what was done."""
-
-
 def run_pass(
     before: Refined,
     images: DeviceImages,
     px: int,
     limits: AlignmentLimits,
     settings: PassSettings,
-) -> PassOutcome:
+) -> tuple[Refined, PassFigures]:
     """Align the observations of a model and adjust it.
 
     Args:

@@ -15,7 +15,7 @@ the points of the matches that the mapper was given. Then all others return.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.colmap.other_camera import OtherCamera
@@ -25,13 +25,12 @@ from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
 from jaxsfm.sfm.refine.one_pass import (
     PassFigures,
-    PassOutcome,
     PassSettings,
     Refined,
     run_pass,
 )
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
-from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views, remove_unconfirmed
+from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views
 
 if TYPE_CHECKING:
     import pycolmap
@@ -57,6 +56,12 @@ class RefinementFigures:
         what is left holds."""
         return self.holds and any(done.accepted for done in self.passes)
 
+    def unconfirmed_views(self) -> set[str]:
+        """The views that nothing confirms: the last pass has not aligned their observations, and
+        no octave has given them a pose. What looks alike has given the mapper's poses to them."""
+        weak = {name for done in _accepted(self.passes)[-1:] for name in done.weak_views}
+        return {each.name for each in self.placed if each.octave_px is None and each.name in weak}
+
 
 def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
     """The figures that are given as plain data (`dataclasses.asdict`)."""
@@ -66,21 +71,6 @@ def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
         camera=OtherCamera(**row["camera"]) if row.get("camera") else None,
         holds=row.get("holds", True),
     )
-
-
-PassRun = Callable[[Refined, DeviceImages, int, AlignmentLimits, PassSettings], PassOutcome]
-"""What `run_pass` does."""
-
-
-def with_progress(on_pass: Callable[[], None], run: PassRun = run_pass) -> PassRun:
-    """`run`, and a call after each pass."""
-
-    def told(*given: Any) -> PassOutcome:
-        done = run(*given)
-        on_pass()
-        return done
-
-    return told
 
 
 def _as_arrays(reconstruction: "pycolmap.Reconstruction", sizes: Sizes) -> Refined:
@@ -111,15 +101,15 @@ def refine_model(
     evidence: Evidence = NO_EVIDENCE,
     with_all_points: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction] | None" = None,
     described_px: int = 1,
-    run: PassRun = run_pass,
+    on_pass: Callable[[], None] = lambda: None,
 ) -> "tuple[pycolmap.Reconstruction, RefinementFigures]":
     """Refine a model.
 
     Thresholds are in pixels of the working images. An image where too little agrees keeps its old
-    observations, with four times the error limit, until it is placed on the refined structure. One
-    that cannot be placed and has hardly any observations is taken out. Images that show far less of
-    what they should show than others do may have a wrong pose of the mapper. They are placed in the
-    same way. A pass that would lose most of the points is taken back.
+    observations, with four times the error limit, until it is placed on the refined structure.
+    Images that show far less of what they should show than others do may have a wrong pose of the
+    mapper. They are placed in the same way. A pass that would lose most of the points is taken
+    back.
 
     Args:
       reconstruction: from the mapper; not changed.
@@ -132,7 +122,7 @@ def refine_model(
         pixels. The `passes` are done with images of this size, and one more follows at each size
         above it, up to the working size: keypoints of a small image are too far off for a larger
         one.
-      run: does a pass, or gives what an earlier run of it gave.
+      on_pass: called after every pass.
 
     Raises:
       ImageError: an image of the model cannot be read any more.
@@ -150,17 +140,30 @@ def refine_model(
             limits = AlignmentLimits.of(refinement)  # the keypoints of new points are not aligned
         if len(now.model.tracks.points) < MIN_POINTS or len(now.model.views) < 2:
             break
-        now, done = run(now, images, px, limits, settings)
+        now, done = run_pass(now, images, px, limits, settings)
+        on_pass()
         figures.append(done)
         if not done.accepted:
             break
     if with_all_points is not None:  # the passes ended early
         now = _as_arrays(with_all_points(now.reconstruction), sizes)
-    placing = _Placing(images, sizes, evidence, settings)
-    placed: list[Placement] = []
-    if weak := _to_place(figures):
-        now, placed = placing.confirmed(now, weak)
-    return now.reconstruction, RefinementFigures(passes=figures, placed=placed)
+    reconstruction, placed = now.reconstruction, list[Placement]()
+    if wanted := _to_place(figures):
+        model, placed = place_weak_views(
+            now.model,
+            wanted,
+            images,
+            refinement=refinement,
+            refine_intrinsics=settings.refine_intrinsics,
+            evidence=evidence,
+        )
+        if model is not now.model:
+            reconstruction = model.to_colmap()
+    return reconstruction, RefinementFigures(passes=figures, placed=placed)
+
+
+def _accepted(figures: Sequence[PassFigures]) -> list[PassFigures]:
+    return [done for done in figures if done.accepted]
 
 
 def _to_place(figures: Sequence[PassFigures]) -> list[str]:
@@ -169,40 +172,6 @@ def _to_place(figures: Sequence[PassFigures]) -> list[str]:
     What little agreed in the first pass looks like much in the next (58 of 153 observations after
     22 of 393, and the camera 0.4 m off).
     """
-    accepted = [done for done in figures if done.accepted]
+    accepted = _accepted(figures)
     weak = {name for done in accepted for name in done.weak_views}
     return sorted(weak.union(*(done.doubtful_views for done in accepted[-1:])))
-
-
-class _Placing(NamedTuple):
-    """What views are placed with."""
-
-    images: DeviceImages
-    sizes: Sizes
-    evidence: Evidence
-    settings: PassSettings
-
-    def placed(self, model: Model, names: Sequence[str]) -> tuple[Model, list[Placement]]:
-        """`place_weak_views`."""
-        return place_weak_views(
-            model,
-            names,
-            self.images,
-            refinement=self.settings.refinement,
-            refine_intrinsics=self.settings.refine_intrinsics,
-            evidence=self.evidence,
-        )
-
-    def confirmed(self, now: Refined, weak: Sequence[str]) -> tuple[Refined, list[Placement]]:
-        """A model whose weak views are placed, without the views that nothing confirms."""
-        reconstruction, before = now
-        model, placed = self.placed(before, weak)
-        if model is not before:
-            reconstruction = model.to_colmap()
-        if self.settings.refinement.weak_octaves:  # otherwise nothing has tried to confirm them
-            if model is not before:  # COLMAP left out points whose rays are too close
-                model = Model.from_colmap(reconstruction, self.sizes)
-            left, placed = remove_unconfirmed(model, placed)
-            if left is not model:
-                reconstruction, model = left.to_colmap(), left
-        return Refined(reconstruction, model), placed

@@ -20,7 +20,6 @@ from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, Evidence, matched_points
 from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.refine.octave_pose import (
-    MIN_COUNT,
     OctavePose,
     PoseHypothesis,
     follow,
@@ -46,15 +45,15 @@ class Placement:
     error_px: float | None
     """Median distance of where they agree from where the pose puts them, working pixels."""
     held: int | None = None
-    """A number: it was in the model before, and was taken out because it had no more observations
-    than these. None: it was not."""
+    """A number: it was in the model before, had so many observations, and was taken out because
+    they do not hold it there (`jaxsfm.sfm.refine.held_parts`). None: it was not."""
     doubt: str = ""
     """Why an image without a place was not registered (`jaxsfm.sfm.register.lost`), in words. Empty
     if it was."""
 
 
 def taken_out(name: str, held: int) -> Placement:
-    """What became of a view that was taken out because few of its points hold it in the model.
+    """What became of a view that was taken out because its points do not hold it in the model.
 
     Args:
       held: the number of its observations.
@@ -169,33 +168,3 @@ def _with_placed(model: Model, best: Mapping[int, OctavePose], rows: np.ndarray)
         parts.append(pose.points.observations(k, rows))
     joined = Tracks.from_parts(tracks.points, parts, ordered=True)
     return model.with_views(views).with_tracks(joined)
-
-
-def remove_unconfirmed(
-    model: Model, placements: Sequence[Placement]
-) -> tuple[Model, list[Placement]]:
-    """Take out the views that neither alignment nor observations confirm.
-
-    Such a view has fewer observations than COLMAP asks for to register an image (`MIN_COUNT`), and
-    alignment did not confirm its pose. It is a photo of another place: what looks alike gave it a
-    pose, and bundle adjustment dropped one observation after the other. Of 186 models of runs two
-    had such a view, with 0 and with 4 observations, where others had thousands. No other photo had
-    fewer than 60.
-
-    Args:
-      placements: what became of the weak views.
-
-    Returns:
-      the same model if no view is taken out; the placements, with `held` where one is.
-    """
-    counts = np.bincount(model.tracks.view, minlength=len(model.views)).tolist()
-    held = {view.name: count for view, count in zip(model.views, counts, strict=True)}
-    few = {name for name, count in held.items() if count < MIN_COUNT}
-    refuted = {each.name for each in placements if each.name in few and each.octave_px is None}
-    stay = held.keys() - refuted
-    if not refuted or len(stay) < 2:
-        return model, list(placements)
-    return model.part(stay)[0], [
-        dataclasses.replace(each, held=held[each.name]) if each.name in refuted else each
-        for each in placements
-    ]

@@ -107,7 +107,7 @@ def _held(located: Localization) -> Localization:
 
     Such a view would carry the points that it adds, and the views that later rounds place on them.
     The refinement asks as much of a view that the mapper has left out
-    (docs/decisions/weak-views.md#photos-of-another-place).
+    (docs/decisions/weak-views.md#photos-that-nothing-confirms).
     """
     count = 0 if located.points is None else len(located.points.rows)
     if not located.trusted or count >= MIN_COUNT:
