@@ -7,7 +7,6 @@ import tyro
 
 from jaxsfm.bench.model_options import (
     AmbiguousOptions,
-    CollectionOptions,
     DayNightOptions,
     LedgerOptions,
     SequenceOptions,
@@ -146,18 +145,6 @@ def warps(bench: Unnamed[WarpsOptions]) -> int:
     from jaxsfm.bench.warps import bench_warps, table_lines
 
     return _run(bench_warps, table_lines, bench)
-
-
-def collection(bench: Unnamed[CollectionOptions]) -> int:
-    """Reconstruct photos of a photo site, and judge each model beside reference poses.
-
-    For example
-        $ jaxsfm bench collection --root PHOTOS --out OUT
-        $ jaxsfm bench collection --root PHOTOS --reference MODEL --methods default --out OUT
-    """
-    from jaxsfm.bench.collection import bench_collection, table_lines
-
-    return _run(bench_collection, table_lines, bench)
 
 
 def sequence(bench: Unnamed[SequenceOptions]) -> int:

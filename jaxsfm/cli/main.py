@@ -10,7 +10,6 @@ import tyro
 
 from jaxsfm.cli.bench_commands import (
     ambiguous,
-    collection,
     confidence,
     daynight,
     homography,
@@ -45,7 +44,6 @@ BENCHMARKS = {
     "strecha": strecha,
     "daynight": daynight,
     "ambiguous": ambiguous,
-    "collection": collection,
     "sequence": sequence,
     "recall": recall,
     "wxbs": wxbs,

@@ -51,7 +51,6 @@ LONG = (
             "strecha",
             "daynight",
             "ambiguous",
-            "collection",
             "sequence",
             "recall",
         )
