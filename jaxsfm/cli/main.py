@@ -10,17 +10,10 @@ import tyro
 
 from jaxsfm.cli.bench_commands import (
     ambiguous,
-    confidence,
     daynight,
-    homography,
     ledger,
-    planes,
-    poses,
-    recall,
     sequence,
     strecha,
-    turns,
-    warps,
     wxbs,
 )
 from jaxsfm.cli.data_commands import data
@@ -45,14 +38,7 @@ BENCHMARKS = {
     "daynight": daynight,
     "ambiguous": ambiguous,
     "sequence": sequence,
-    "recall": recall,
     "wxbs": wxbs,
-    "homography": homography,
-    "planes": planes,
-    "poses": poses,
-    "warps": warps,
-    "turns": turns,
-    "confidence": confidence,
 }
 _Benchmark = one_of(BENCHMARKS)
 

@@ -46,18 +46,7 @@ LONG = (
     "weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
-        for name in (
-            "ledger",
-            "strecha",
-            "daynight",
-            "ambiguous",
-            "sequence",
-            "recall",
-        )
-    ),
-    *(
-        f"jaxsfm.bench.{name}.bench_{name}"
-        for name in ("wxbs", "homography", "planes", "warps", "turns", "confidence", "poses")
+        for name in ("ledger", "strecha", "daynight", "ambiguous", "sequence", "wxbs")
     ),
 )
 FENCED = re.compile(r"^```(?:bash|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)
