@@ -104,25 +104,6 @@ DATA_SETS: dict[str, DataSet] = {
         ("images_upright", "3D-models", "image_pairs_to_match.txt"),
         "daynight",
     ),
-    "hpatches": DataSet(
-        "HPatches sequences: 116 planar scenes under changes of light and viewpoint (Balntas et "
-        "al., CVPR 2017)",
-        "https://github.com/hpatches/hpatches-dataset",
-        "MIT; cite Balntas et al. 2017",
-        "1.3 GB",
-        (
-            RemoteFile(
-                "https://huggingface.co/datasets/vbalnt/hpatches/resolve/main/"
-                "hpatches-sequences-release.tar.gz",
-                "hpatches-sequences-release.tar.gz",
-                "md5:c9d94e72b85182ba744534db0aca9c94",
-                archive=True,
-            ),
-        ),
-        "hpatches-sequences-release",
-        ("hpatches-sequences-release",),
-        "homography",
-    ),
     "wxbs": DataSet(
         "WxBS 1.1: pairs under changes of viewpoint, light, season and sensor (Mishkin et al., "
         "BMVC 2015)",

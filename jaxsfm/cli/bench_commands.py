@@ -7,20 +7,12 @@ import tyro
 
 from jaxsfm.bench.model_options import (
     AmbiguousOptions,
-    CollectionOptions,
     DayNightOptions,
     LedgerOptions,
     SequenceOptions,
     StrechaOptions,
 )
-from jaxsfm.bench.options import BenchOptions, PlanesOptions, RecallOptions, WarpsOptions
-from jaxsfm.bench.pair_options import (
-    ConfidenceOptions,
-    HomographyOptions,
-    PosesOptions,
-    TurnsOptions,
-    WxbsOptions,
-)
+from jaxsfm.bench.options import BenchOptions, WxbsOptions
 from jaxsfm.cli.run_commands import check_writable
 from jaxsfm.io.threads import limit_threads
 
@@ -97,28 +89,6 @@ def wxbs(bench: Unnamed[WxbsOptions]) -> int:
     return _run(bench_wxbs, table_lines, bench)
 
 
-def homography(bench: Unnamed[HomographyOptions]) -> int:
-    """Match sequences with known homographies (Oxford affine, HPatches).
-
-    For example
-        $ jaxsfm bench homography --root SEQUENCES --methods rootsift,default
-    """
-    from jaxsfm.bench.homography import bench_homography, table_lines
-
-    return _run(bench_homography, table_lines, bench)
-
-
-def planes(bench: Unnamed[PlanesOptions]) -> int:
-    """Fit several homographies to given points (AdelaideRMF).
-
-    For example
-        $ jaxsfm bench planes --root POINTS
-    """
-    from jaxsfm.bench.planes import bench_planes, table_lines
-
-    return _run(bench_planes, table_lines, bench)
-
-
 def daynight(bench: Unnamed[DayNightOptions]) -> int:
     """Reconstruct day photos with one night photo: the paper's night protocol.
 
@@ -137,29 +107,6 @@ def daynight(bench: Unnamed[DayNightOptions]) -> int:
     return _run(bench_daynight, table_lines, bench)
 
 
-def warps(bench: Unnamed[WarpsOptions]) -> int:
-    """Compare relocalization rules on views of photos under known homographies (synthetic).
-
-    For example
-        $ jaxsfm bench warps --root PHOTOS --seeds 3
-    """
-    from jaxsfm.bench.warps import bench_warps, table_lines
-
-    return _run(bench_warps, table_lines, bench)
-
-
-def collection(bench: Unnamed[CollectionOptions]) -> int:
-    """Reconstruct photos of a photo site, and judge each model beside reference poses.
-
-    For example
-        $ jaxsfm bench collection --root PHOTOS --out OUT
-        $ jaxsfm bench collection --root PHOTOS --reference MODEL --methods default --out OUT
-    """
-    from jaxsfm.bench.collection import bench_collection, table_lines
-
-    return _run(bench_collection, table_lines, bench)
-
-
 def sequence(bench: Unnamed[SequenceOptions]) -> int:
     """Reconstruct frames of a video with known poses (7-Scenes), next to COLMAP's RootSIFT.
 
@@ -172,49 +119,3 @@ def sequence(bench: Unnamed[SequenceOptions]) -> int:
     from jaxsfm.bench.sequence import bench_sequence, table_lines
 
     return _run(bench_sequence, table_lines, bench)
-
-
-def recall(bench: Unnamed[RecallOptions]) -> int:
-    """Count the pairs of photos of one place among the pairs that retrieval chooses.
-
-    For example
-        $ jaxsfm bench recall --root PHOTOS --truth MODEL
-        $ jaxsfm bench recall --root FRAMES --truth FRAMES --every 10 --strangers OTHERS
-    """
-    from jaxsfm.bench.recall import bench_recall, table_lines
-
-    return _run(bench_recall, table_lines, bench)
-
-
-def turns(bench: Unnamed[TurnsOptions]) -> int:
-    """Match photos with copies of themselves that are turned and resized (synthetic).
-
-    For example
-        $ jaxsfm bench turns --root PHOTOS --every 10 --max-size 800
-    """
-    from jaxsfm.bench.turns import bench_turns, table_lines
-
-    return _run(bench_turns, table_lines, bench)
-
-
-def confidence(bench: Unnamed[ConfidenceOptions]) -> int:
-    """Count how many pairs of each confidence are right: photos with known poses, altered.
-
-    For example
-        $ jaxsfm bench confidence --root SETS --max-size 800 --diagram diagram.png
-    """
-    from jaxsfm.bench.confidence import bench_confidence, table_lines
-
-    check_writable(bench.diagram, "--diagram", (".png",))
-    return _run(bench_confidence, table_lines, bench)
-
-
-def poses(bench: Unnamed[PosesOptions]) -> int:
-    """Compare relative poses from matches with known ones (ScanNet-1500, MegaDepth-1500).
-
-    For example
-        $ jaxsfm bench poses --root PHOTOS --pairs pairs_calibrated.txt --methods default
-    """
-    from jaxsfm.bench.poses import bench_poses, table_lines
-
-    return _run(bench_poses, table_lines, bench)

@@ -10,18 +10,10 @@ import tyro
 
 from jaxsfm.cli.bench_commands import (
     ambiguous,
-    collection,
-    confidence,
     daynight,
-    homography,
     ledger,
-    planes,
-    poses,
-    recall,
     sequence,
     strecha,
-    turns,
-    warps,
     wxbs,
 )
 from jaxsfm.cli.data_commands import data
@@ -45,16 +37,8 @@ BENCHMARKS = {
     "strecha": strecha,
     "daynight": daynight,
     "ambiguous": ambiguous,
-    "collection": collection,
     "sequence": sequence,
-    "recall": recall,
     "wxbs": wxbs,
-    "homography": homography,
-    "planes": planes,
-    "poses": poses,
-    "warps": warps,
-    "turns": turns,
-    "confidence": confidence,
 }
 _Benchmark = one_of(BENCHMARKS)
 

@@ -8,7 +8,6 @@ import contextlib
 import lzma
 import os
 import sys
-import tarfile
 import tempfile
 import zipfile
 import zlib
@@ -30,7 +29,6 @@ OnBytes = Callable[[int, int | None], None]
 """Is called with the bytes received so far and in total; None if the server does not say."""
 
 _DAMAGED = (
-    tarfile.TarError,
     zipfile.BadZipFile,
     zlib.error,
     lzma.LZMAError,
@@ -159,10 +157,10 @@ def _reason(error: requests.RequestException) -> str:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Unpack a zip or tar archive into a folder, beside the files that are there.
+    """Unpack a zip archive into a folder, beside the files that are there.
 
-    If the archive is damaged or would write outside the folder, UserError is raised and nothing is
-    written.
+    Nothing is written outside the folder. If the archive is damaged, UserError is raised and
+    nothing is written.
     """
     scratch = tempfile.TemporaryDirectory(
         prefix=".unpacking-", dir=folder, ignore_cleanup_errors=True
@@ -170,12 +168,8 @@ def unpack(archive: Path, folder: Path) -> None:
     with writing(folder), scratch as name:
         fresh = Path(name)
         try:
-            if zipfile.is_zipfile(archive):
-                with zipfile.ZipFile(archive) as opened:
-                    opened.extractall(fresh)  # zipfile removes ".." and roots from the names
-            else:
-                with tarfile.open(archive) as opened:
-                    opened.extractall(fresh, filter="data")
+            with zipfile.ZipFile(archive) as opened:
+                opened.extractall(fresh)  # zipfile removes ".." and roots from the names
         except _DAMAGED as error:
             raise UserError(f"{archive}: cannot be unpacked ({error})") from error
         for path in sorted(fresh.rglob("*")):

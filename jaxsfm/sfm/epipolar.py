@@ -1,12 +1,10 @@
-"""Robust fundamental matrices and homographies for the benchmarks: OpenCV's MAGSAC++ with a seed.
+"""Robust fundamental matrices for `bench wxbs`: OpenCV's MAGSAC++ with a seed.
 
 All methods that are compared have the same estimator with the same settings, so that only their
 matches differ. A fundamental matrix is the best of several, after robust least squares over all
 matches, because single ones differ more with the seed than methods do
 (docs/decisions/benchmarks.md).
 """
-
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -37,16 +35,10 @@ def _params(seed: int) -> cv2.UsacParams:
     return params
 
 
-def _estimate(
-    solve: Callable[..., tuple[np.ndarray | None, np.ndarray | None]],
-    xy0: np.ndarray,
-    xy1: np.ndarray,
-    least: int,
-    seed: int,
-) -> np.ndarray | None:
-    if len(xy0) < least:
+def _estimate(xy0: np.ndarray, xy1: np.ndarray, seed: int) -> np.ndarray | None:
+    if len(xy0) < 8:
         return None
-    found, _ = solve(np.float64(xy0), np.float64(xy1), _params(seed))
+    found, _ = cv2.findFundamentalMat(xy0, xy1, _params(seed))
     if found is None or found.shape != (3, 3) or not np.isfinite(found).all():
         return None
     return found
@@ -128,7 +120,7 @@ def fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.nda
     """The F (float64 (3, 3)) with x1' F x0 = 0 of matches (n, 2), pixels; None if there is none."""
     xy0, xy1 = np.asarray(xy0, np.float64), np.asarray(xy1, np.float64)
     seeds = np.random.SeedSequence(seed).generate_state(STARTS)
-    starts = [_estimate(cv2.findFundamentalMat, xy0, xy1, 8, int(s >> 1)) for s in seeds]
+    starts = [_estimate(xy0, xy1, int(s >> 1)) for s in seeds]
     refined = [refine_fundamental_matrix(f, xy0, xy1) for f in starts if f is not None]
     return min(refined, key=lambda found: found[1])[0] if refined else None
 
@@ -141,8 +133,3 @@ def single_fundamental_matrix(xy0: np.ndarray, xy1: np.ndarray) -> np.ndarray | 
     xy0, xy1 = np.asarray(xy0, np.float64), np.asarray(xy1, np.float64)
     found, _ = cv2.findFundamentalMat(xy0, xy1, cv2.USAC_MAGSAC, 0.25, 0.999999, 100_000)
     return None if found is None or found.shape != (3, 3) else found
-
-
-def homography(xy0: np.ndarray, xy1: np.ndarray, *, seed: int) -> np.ndarray | None:
-    """The H (float64 (3, 3)) with x1 ~ H x0 of matches (n, 2), pixels; None if there is none."""
-    return _estimate(cv2.findHomography, xy0, xy1, 4, seed)

@@ -1,4 +1,4 @@
-"""`bench ledger`: its sets, its judges, the runs that it makes or finds, and its tables."""
+"""`bench ledger`: its sets, the runs that it makes or finds, and its tables."""
 
 import json
 import os
@@ -7,23 +7,19 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from test_outcomes import disturbed, folded, moved, part, ring, similarity
+from test_outcomes import moved, part, ring, similarity
 from verdicts import check_of
 
 from jaxsfm.bench import ledger, ledger_runs
 from jaxsfm.bench.ledger import bench_ledger
-from jaxsfm.bench.ledger_judges import Judged, judged, ring_groups
 from jaxsfm.bench.ledger_photos import as_frames, as_phototourism, as_turned
 from jaxsfm.bench.ledger_runs import SECONDS, LedgerRun, SetPhotos, apart, run_set
 from jaxsfm.bench.ledger_sets import DRAWN, choose_ledger_sets, ledger_sets
 from jaxsfm.bench.ledger_table import counts, markdown, set_cells, table_lines
 from jaxsfm.bench.model_options import LedgerOptions
-from jaxsfm.bench.outcomes import judge
 from jaxsfm.bench.synthetic import camera_text, write_photo
-from jaxsfm.bench.walls import turn
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.errors import UserError
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.run_options import RunOptions
@@ -200,71 +196,6 @@ def test_a_calibration_is_the_motion_of_points_into_the_camera(tmp_path):
     path.write_bytes(b"")
     with pytest.raises(UserError, match="calibration_01"):
         as_phototourism(tmp_path, tmp_path)
-
-
-# -- the judges ------------------------------------------------------------------------------------
-
-
-def test_the_judge_of_places_has_the_outcome_of_bench_ambiguous():
-    truth = ring()
-    whole = moved(truth, similarity(1))
-    wrong = folded(whole, sorted(truth)[10:], np.pi)
-    halves = [part(truth, 0, 12), part(truth, 12, 20)]
-    for models in ([], [whole], [wrong], halves, [halves[0], wrong], [part(truth, 0, 2)]):
-        for noticed in (False, True):
-            found = judged(models, truth, truth, "places", noticed)
-            assert found.outcome == judge(models, truth, noticed=noticed).outcome
-
-
-def test_only_the_photos_of_right_models_are_right_and_each_once():
-    truth = ring()
-    names = sorted(truth)
-    first, second = part(truth, 0, 12), part(truth, 8, 20)
-    assert judged([first, second], truth, truth, "places", False) == Judged("split", 20)
-    bad = folded(second, names[14:], np.pi)
-    assert judged([first, bad], truth, truth, "places", True) == Judged("wrong, noticed", 12)
-    one = folded(truth, names[:1], np.pi)
-    assert judged([one], truth, truth, "places", False) == Judged("right", 19)
-
-
-def test_rough_positions_are_right_if_the_rotations_are():
-    truth = ring()
-    rough = disturbed(truth, position=2.0, rotation_deg=2.0)
-    assert judged([rough], truth, truth, "places", False).outcome.startswith("wrong")
-    assert judged([rough], truth, truth, "rotations", False) == Judged("right", 20)
-    wrong = folded(rough, sorted(truth)[12:], np.pi / 2)
-    assert judged([wrong], truth, truth, "rotations", True) == Judged("wrong, noticed", 0)
-
-
-def test_without_a_reference_only_a_ring_is_judged():
-    truth = ring()
-    assert judged([truth], None, truth, "places", False) == Judged("not judged", None)
-    assert judged([truth], None, truth, "ring", False) == Judged("right", 20)
-
-
-@pytest.mark.parametrize("backwards", [False, True])
-def test_a_ring_in_the_order_of_the_names_is_right_whole_or_in_parts(backwards):
-    cameras = disturbed(ring(64), position=0.1, rotation_deg=1.0)
-    poses = reversed(cameras.values()) if backwards else cameras.values()
-    turned = moved(dict(zip(sorted(cameras), poses, strict=True)), similarity(2))
-    assert judged([turned], None, turned, "ring", False) == Judged("right", 64)
-    parts = [part(turned, 0, 30), part(turned, 30, 55), part(turned, 55, 64)]
-    assert judged(parts, None, turned, "ring", False) == Judged("split", 64)
-
-
-def test_a_ring_that_is_cut_goes_back_or_is_bent_to_half_its_angle_is_wrong():
-    truth = ring(64)
-    names, first = sorted(truth), truth["00.png"]
-    cut = folded(truth, names[32:], 2.7)
-    back = {n: turn(2 * np.pi * min(k, 64 - k) / 64).moved(first) for k, n in enumerate(names)}
-    half = {n: turn(np.pi * k / 64).moved(first) for k, n in enumerate(names)}
-    line = {
-        n: CameraPose(p.rotation, np.asarray([0.1 * k, 0, 0]))
-        for k, (n, p) in enumerate(truth.items())
-    }
-    assert len(ring_groups(cut, names)[0]) == 32
-    for wrong in (cut, back, half, line):
-        assert judged([wrong], None, names, "ring", False).outcome == "wrong, not noticed"
 
 
 # -- runs that are there ---------------------------------------------------------------------------

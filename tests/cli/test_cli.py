@@ -291,9 +291,7 @@ def test_a_report_says_which_weights_and_with_other_ones_all_is_done_again(
     assert "this run made no model, so the earlier model stays" in said
 
 
-@pytest.mark.parametrize(
-    "name", ["strecha", "daynight", "ambiguous", "wxbs", "homography", "warps"]
-)
+@pytest.mark.parametrize("name", ["strecha", "daynight", "ambiguous", "wxbs"])
 def test_every_benchmark_takes_other_weights(name, tmp_path, monkeypatch):
     import importlib
 

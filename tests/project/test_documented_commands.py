@@ -46,29 +46,14 @@ LONG = (
     "weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
-        for name in (
-            "ledger",
-            "strecha",
-            "daynight",
-            "ambiguous",
-            "collection",
-            "sequence",
-            "recall",
-        )
-    ),
-    *(
-        f"jaxsfm.bench.{name}.bench_{name}"
-        for name in ("wxbs", "homography", "planes", "warps", "turns", "confidence", "poses")
+        for name in ("ledger", "strecha", "daynight", "ambiguous", "sequence", "wxbs")
     ),
 )
 FENCED = re.compile(r"^```(?:bash|text)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 IN_FENCE = re.compile(r"^(?: {4}\$ |\$ |)(jaxsfm [a-z-].*)$", re.MULTILINE)
 INDENTED = re.compile(r"^ {4}(?:\.venv/bin/)?(jaxsfm [a-z-].*)$", re.MULTILINE)
 INLINE = re.compile(r"`(jaxsfm [a-z]+ [^`]*--[^`]*)`")
-FOLDERS = (
-    *("PHOTOS", "OTHER_PHOTOS", "images", "FOLDER", "DIR", "SETS", "SCENES"),
-    *("FRAMES", "OXFORD", "PAIRS", "SEQUENCES", "POINTS", "DATA"),
-)
+FOLDERS = (*("PHOTOS", "images", "FOLDER", "DIR", "SETS", "SCENES", "FRAMES", "PAIRS", "DATA"),)
 """Names of folders in the documentation."""
 SHELL = {
     '"$(jaxsfm data path wxbs)"': "DIR",

@@ -11,7 +11,6 @@ from strategies import rng_of
 from jaxsfm.bench.wxbs import symmetric_epipolar_error
 from jaxsfm.sfm.epipolar import (
     fundamental_matrix,
-    homography,
     refine_fundamental_matrix,
     sampson_error,
 )
@@ -37,7 +36,6 @@ def test_estimators_find_the_geometry_among_outliers_and_repeat():
     assert np.median(symmetric_epipolar_error(found, xy0, xy1)) < 0.5
     assert np.array_equal(found, fundamental_matrix(xy0, noisy, seed=3))
     assert fundamental_matrix(xy0[:7], xy1[:7], seed=0) is None
-    assert homography(xy0[:3], xy1[:3], seed=0) is None
 
 
 def test_sampson_error_is_the_distance_to_the_nearest_exact_match():

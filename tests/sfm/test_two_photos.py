@@ -31,7 +31,7 @@ from jaxsfm.sfm.two_photos.common_view import (
     view_change,
 )
 from jaxsfm.sfm.two_photos.look import Look, moved
-from jaxsfm.sfm.two_photos.matched import confidence, match_photos
+from jaxsfm.sfm.two_photos.matched import HALF_SURE, POWER, confidence, match_photos
 
 
 def photo(size: tuple[int, int], orientation: int = 1) -> ImageFile:
@@ -83,6 +83,12 @@ def test_cells_of_an_enlarged_photo_are_counted_in_larger_cells():
 def test_confidence_grows_from_none_to_certainty():
     values = [confidence(e) for e in (0.0, 30.0, 60.0, 200.0, 4000.0)]
     assert values == sorted(values) and values[0] < 0.05 and values[-1] > 0.99
+
+
+def test_the_odds_of_a_pair_grow_with_a_power_of_its_evidence():
+    odds = [c / (1 - c) for c in map(confidence, (HALF_SURE, 2 * HALF_SURE, 8 * HALF_SURE))]
+    assert odds == pytest.approx([1, 2**POWER, 8**POWER])
+    assert confidence(633.0) == pytest.approx(0.9, abs=0.001)  # docs/decisions/hard-pairs.md
 
 
 @settings(max_examples=30, deadline=None)
