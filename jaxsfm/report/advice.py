@@ -1,4 +1,7 @@
-"""What may help a lost photo: options or further photos that the numbers of the run speak for."""
+"""What may help a lost photo: the options that the numbers of the run speak for.
+
+There is at most one sentence for each cause. Where no option would help, photos would.
+"""
 
 import re
 from collections.abc import Collection, Iterable
@@ -12,7 +15,6 @@ LEAST_ANGLE_DEG = 4.0
 """The least angle at which the rays of a pair's points must meet to give the mapper depth to start
 from: the last and lowest of the mapper's demands."""
 _SHORTLIST = re.compile(r"\b(retrieval|sequential):(\d+)")
-_NO_OPTION = "no option would help; "
 
 
 def towards_others(
@@ -33,10 +35,14 @@ def towards_others(
     ]
     if best is not None and not best.verified:
         if best.inliers >= COLMAP_MIN_INLIERS and best.handed_on and not pairs.known_camera:
-            matches = f"{best.inliers} matches of {describe(best.pair)}"
-            found.append(_camera(f"COLMAP verified none of the {matches}"))
+            found.append(_camera())
         found += _resolution(best, pairs)
-    return [*found, _photos(best, pairs, alone=not found)]
+    if found:
+        return found
+    if best is None:
+        return [_photos("photos that show it together with the others")]
+    lack = pairs.missed(best) or f"{best.colmap_inliers} inliers, which did not join them"
+    return [_photos(f"photos between {describe(best.pair)}, the pair that came closest ({lack})")]
 
 
 def without_pose(
@@ -51,20 +57,24 @@ def without_pose(
     widest = None if model else pairs.widest_deg(own)
     if widest is not None and widest < LEAST_ANGLE_DEG:
         why = f"the rays of its points meet at {widest:.1f} deg at most"
-        return [Advice(option=None, reason=f"{_NO_OPTION}take photos a step to the side: {why}")]
-    best = furthest(row for row in own if row.trusted)
-    assert best is not None, name
+        return [_photos(f"photos a step to the side: {why}")]
     found = [*_more_pairs([name], own, pairs), *_more_handed_on(own)]
     if not pairs.known_camera:
-        inliers = f"{best.colmap_inliers} inliers in its best pair"
-        found.append(_camera(f"{inliers}, but COLMAP found no pose"))
+        found.append(_camera())
+    if found:
+        return found
+    best = furthest(row for row in own if row.trusted)
+    assert best is not None, name
     (other,) = set(best.pair) - {name}
-    near = f"take photos near it, a step to the side of {shown_name(other)}"
-    return [*found, Advice(option=None, reason=near if found else _NO_OPTION + near)]
+    return [_photos(f"photos near it, a step to the side of {shown_name(other)}")]
 
 
-def _camera(why: str) -> Advice:
-    return Advice(option="--intrinsics", reason=f"the focal length was guessed; {why}")
+def _photos(which: str) -> Advice:
+    return Advice(option=None, reason=f"no option would help; take {which}")
+
+
+def _camera() -> Advice:
+    return Advice(option="--intrinsics", reason="the focal length was guessed")
 
 
 def _more_pairs(
@@ -91,8 +101,8 @@ def _more_handed_on(tried: Collection[PairRow]) -> Iterable[Advice]:
     best = furthest(left)
     if best is not None:
         why = (
-            f"choose a larger number, or leave the option out: {len(left)} of its pairs with "
-            f"matches were left out, the best, {describe(best.pair)}, with {best.inliers} matches"
+            f"a larger number would take in {len(left)} more of its pairs, the best, "
+            f"{describe(best.pair)}, with {best.inliers} matches"
         )
         yield Advice(option="--best-pairs", reason=why)
 
@@ -102,38 +112,23 @@ def _more_trusted(crossing: Collection[PairRow]) -> Iterable[Advice]:
     best = furthest(dropped)
     if best is not None:
         why = (
-            f"the view graph dropped {len(dropped)} of its pairs, the best, "
-            f"{describe(best.pair)}, with {best.colmap_inliers} inliers; check that both show the "
-            "same place"
+            f"the view graph dropped {len(dropped)} of its pairs; check that both photos of the "
+            f"best, {describe(best.pair)}, show the same place"
         )
         yield Advice(option="--view-graph no", reason=why)
 
 
 def _resolution(best: PairRow, pairs: PairOutcomes) -> Iterable[Advice]:
-    """Larger working images, if the photos are larger or can be enlarged."""
+    """One way to more detail, if there is one."""
     config = pairs.config
-    if config.octaves == 1:
-        why = (
-            "the preset paper describes photos at one size only; four sizes find more matches at "
-            "night and between photos from different distances"
-        )
-        yield Advice(option="--preset default", reason=why)
     sides = {name: max(pairs.sizes[name]) for name in best.pair}
     large, small = max(best.pair, key=sides.__getitem__), min(best.pair, key=sides.__getitem__)
-    if sides[large] > config.max_size:
+    if config.octaves == 1:
+        yield Advice(option="--preset default", reason="paper describes photos at one size only")
+    elif sides[large] > config.max_size:
         size = min(2 * config.max_size, sides[large])
         why = f"{shown_name(large)} was reduced from {sides[large]} to {config.max_size} px"
         yield Advice(option=f"--max-size {size}", reason=why)
-    if sides[small] < config.max_size and config.enlarge == 1:
-        why = f"{shown_name(small)} has only {sides[small]} px; it would be enlarged, up to twice"
+    elif sides[small] < config.max_size and config.enlarge == 1:
+        why = f"{shown_name(small)} has only {sides[small]} px"
         yield Advice(option="--preset robust", reason=why)
-
-
-def _photos(best: PairRow | None, pairs: PairOutcomes, *, alone: bool) -> Advice:
-    """Which photos would help; `alone`: no option would."""
-    if best is None:
-        where = "that show it together with the others"
-    else:
-        lack = pairs.missed(best) or f"{best.colmap_inliers} inliers, which did not join them"
-        where = f"between {describe(best.pair)}, the pair that came closest ({lack})"
-    return Advice(option=None, reason=f"{_NO_OPTION * alone}take photos {where}")

@@ -202,14 +202,6 @@ def masks_folder(report: RunReport) -> Path | None:
     return Path(folder) if isinstance(folder, str) else None
 
 
-def _described(report: RunReport) -> RecordedConfig:
-    """The limits of the working images whose cells the matches are of."""
-    config, looks = report.options.config, report.looks
-    if looks is None or looks.whole:
-        return config
-    return dataclasses.replace(config, max_size=looks.first_px)
-
-
 def _looks(store: Store, report: RunReport) -> Store:
     """Where the matches of a run are; `store` has those at the size of its config."""
     identity, looks = report.identity, report.looks
@@ -250,7 +242,7 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(where, report.identity, _described(report), masks_folder(report)),
+        photos=RecordedPhotos(where, report.identity, report.options.config, masks_folder(report)),
         model=model,
         colours=colours,
         reference=known,

@@ -32,17 +32,29 @@ _UNCONFIRMED = (
     "too few of its points were found in the photos that should show them, so the model is as the "
     "mapper made it"
 )
-_DECISIVE = "neighbours overlap by more than half and something that occurs only once is in view"
+_OVERLAP = (
+    "so that neighbours overlap by more than half and something that occurs only once is in view"
+)
+_AGAIN = "and run the same command again"
 
 
 class Finding(NamedTuple):
     """Something that speaks against a model."""
 
     text: str
-    images: list[str]
-    others: list[str]
+    images: Sequence[str] = ()
+    others: Sequence[str] = ()
     """The photos that contradict `images`, or the other photos of the pairs that give `images` a
     second place."""
+
+
+class Reason(NamedTuple):
+    """All findings of one kind."""
+
+    label: str
+    """A word or two for the kind."""
+    findings: list[Finding]
+    """The weightiest first."""
 
 
 class ModelVerdict(NamedTuple):
@@ -50,22 +62,8 @@ class ModelVerdict(NamedTuple):
 
     colour: VerdictColour
     headline: str
-    contradictions: list[Finding]
-    """The one with most contradicted points first."""
-    places: list[Finding]
-    """Second places of photos, the one with most points that agree first."""
-    alternatives: list[Finding]
-    """The other model of the same photos, if one was made."""
-    neighbours: list[Finding]
-    """Photos that follow each other and do not agree with the model."""
-    parts: list[Finding]
-    """Photos that were in one model, which something spoke against, and are in several now."""
-    scale: list[Finding]
-    """Photos whose part of the model may have shrunk."""
-    unconfirmed: str
-    """That the photos do not show the points of the model; empty if they do."""
-    decisive: str
-    """Photos that would decide between two places or two models; empty if there is no choice."""
+    reasons: list[Reason]
+    """What speaks against the model."""
     advice: str
     """What to do next; empty for a model that nothing speaks against."""
 
@@ -93,7 +91,6 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
       model: the folder of the model, if the words should name it.
     """
     colour = check.verdict
-    contradictions = sorted(check.contradictions, key=lambda each: -each.contradicted)
     places = sorted(check.other_places, key=lambda each: -each.agreed)
     headline = in_words(colour)
     if colour == "amber" and check.unconfirmed:
@@ -107,18 +104,23 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
     return ModelVerdict(
         colour=colour,
         headline=headline + (f" ({model})" if model else ""),
-        contradictions=[
-            Finding(_against(each), each.images, each.others) for each in contradictions
-        ],
-        places=[Finding(_fits(each), [each.image], each.pairs) for each in places],
-        alternatives=[_other_model(check.alternative)] if check.alternative else [],
-        neighbours=[Finding(_apart(pair), pair[:1], pair[1:]) for pair in check.apart],
-        parts=[_told_apart(check.told_apart)] if check.told_apart else [],
-        scale=[_shrunk(check.shrunk)] if check.shrunk else [],
-        unconfirmed=_UNCONFIRMED if check.unconfirmed else "",
-        decisive=_decides(check, places),
+        reasons=_reasons(check, places),
         advice=_advice(check, places),
     )
+
+
+def _reasons(check: ModelCheck, places: Sequence[OtherPlace]) -> list[Reason]:
+    contradictions = sorted(check.contradictions, key=lambda each: -each.contradicted)
+    reasons = [
+        Reason("contradiction", [_against(each) for each in contradictions]),
+        Reason("second place", [_fits(place) for place in places]),
+        Reason("other model", [_other_model(check.alternative)] if check.alternative else []),
+        Reason("neighbours", [_apart(pair) for pair in check.apart]),
+        Reason("told apart", [_told_apart(check.told_apart)] if check.told_apart else []),
+        Reason("scale", [_shrunk(check.shrunk)] if check.shrunk else []),
+        Reason("not refined", [Finding(_UNCONFIRMED)] if check.unconfirmed else []),
+    ]
+    return [reason for reason in reasons if reason.findings]
 
 
 def verdict_lines(verdicts: Sequence[ModelVerdict]) -> list[str]:
@@ -131,41 +133,32 @@ def verdict_lines(verdicts: Sequence[ModelVerdict]) -> list[str]:
 
 def _model_lines(verdict: ModelVerdict) -> list[str]:
     lines = [f"verdict          {verdict.headline}"]
-    for label, found in (
-        ("contradiction    ", verdict.contradictions),
-        ("second place     ", verdict.places),
-        ("other model      ", verdict.alternatives),
-        ("neighbours       ", verdict.neighbours),
-        ("told apart       ", verdict.parts),
-        ("scale            ", verdict.scale),
-    ):
-        lines += [label + each.text for each in found[:MAX_FINDINGS]]
-        if more := len(found[MAX_FINDINGS:]):
-            lines.append(f"{label}{more} more {'is' if more == 1 else 'are'} in report.json")
-    if verdict.unconfirmed:
-        lines.append(f"not refined      {verdict.unconfirmed}")
-    if verdict.decisive:
-        lines.append(f"would decide     {verdict.decisive}")
+    for label, findings in verdict.reasons:
+        lines += [f"{label:<17}{each.text}" for each in findings[:MAX_FINDINGS]]
+        if more := len(findings[MAX_FINDINGS:]):
+            lines.append(f"{label:<17}{more} more {'is' if more == 1 else 'are'} in report.json")
     if verdict.advice:
         lines.append(f"what next        {verdict.advice}")
     return lines
 
 
-def _against(found: Contradiction) -> str:
-    return (
+def _against(found: Contradiction) -> Finding:
+    text = (
         f"{named(found.images)} against {named(found.others)}: {found.contradicted} of "
         f"{found.tested} points that one group shows are missing in the other, which should show "
         "them"
     )
+    return Finding(text, found.images, found.others)
 
 
-def _fits(place: OtherPlace) -> str:
+def _fits(place: OtherPlace) -> Finding:
     put = "the pair with {} puts" if len(place.pairs) == 1 else "the pairs with {} put"
-    return (
+    text = (
         f"{shown_name(place.image)}, turned by {place.rotation_deg:.0f} degrees: "
         f"{put.format(named(place.pairs))} it there; seen from there, it agrees with "
         f"{place.agreed} points of the model and contradicts {place.contradicted}"
     )
+    return Finding(text, [place.image], place.pairs)
 
 
 def _other_model(other: Alternative) -> Finding:
@@ -174,20 +167,19 @@ def _other_model(other: Alternative) -> Finding:
             f"alternative/0 has {other.images} photos in one model, as they were before they were "
             f"told apart; photos contradict each other at {other.contradicted} of its points"
         )
-        return Finding(text, other.elsewhere, [])
-    moved = "1 photo has" if len(other.elsewhere) == 1 else f"{len(other.elsewhere)} photos have"
-    text = (
-        f"alternative/0 is another mapping, which follows {FOLLOWS[other.basis]}: "
-        f"{moved} another place there ({named(other.elsewhere)})"
-    )
-    if not other.elsewhere:
-        text = f"alternative/0 is another mapping, which follows {FOLLOWS[other.basis]}"
-    return Finding(text, other.elsewhere, [])
+        return Finding(text, other.elsewhere)
+    text = f"alternative/0 is another mapping, which follows {FOLLOWS[other.basis]}"
+    if other.elsewhere:
+        count = len(other.elsewhere)
+        moved = "1 photo has" if count == 1 else f"{count} photos have"
+        text += f": {moved} another place there ({named(other.elsewhere)})"
+    return Finding(text, other.elsewhere)
 
 
-def _apart(pair: Sequence[str]) -> str:
+def _apart(pair: Sequence[str]) -> Finding:
     first, second = map(shown_name, pair)
-    return f"{first} and {second} follow each other, but their matches do not agree with the model"
+    text = f"{first} and {second} follow each other, but their matches do not agree with the model"
+    return Finding(text, pair[:1], pair[1:])
 
 
 def _told_apart(groups: Sequence[list[str]]) -> Finding:
@@ -195,8 +187,7 @@ def _told_apart(groups: Sequence[list[str]]) -> Finding:
     more = f"; and {len(groups) - MAX_FINDINGS} more" if len(groups) > MAX_FINDINGS else ""
     return Finding(
         "these photos were in one model, which something spoke against; each group is by "
-        "itself now: "
-        f"{shown}{more}",
+        f"itself now: {shown}{more}",
         groups[0],
         [name for group in groups[1:] for name in group],
     )
@@ -207,58 +198,54 @@ def _shrunk(names: list[str]) -> Finding:
     return Finding(
         f"{named(names)} {see} points a hundred times nearer than other photos do, or nearer still",
         names,
-        [],
     )
 
 
-def _decides(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
-    """Which photos would decide between two places or two models; empty if there is nothing to."""
-    if places:
-        way = f"from {shown_name(places[0].image)} to {named(places[0].pairs)}"
-    elif check.alternative and not check.alternative.whole:
-        way = f"from {named(check.alternative.elsewhere)} to the other photos"
-    elif check.apart and check.verdict == "amber":
-        way = f"from {shown_name(check.apart[0][0])} to {shown_name(check.apart[0][1])}"
-    elif repeats(check.told_apart) and check.verdict == "amber":
-        way = f"from {named(check.told_apart[0])} to {named(check.told_apart[1])}"
-    else:
-        return ""
-    return f"photos taken on the way {way}, if {_DECISIVE}"
-
-
 def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
+    """What to do next, in one sentence; empty for a model that nothing speaks against."""
     colour, other = check.verdict, check.alternative
     if colour == "red":
         instead = "look whether alternative/0 is the right one, or " if other else ""
-        return (
-            f"do not use this model as it is: {instead}add photos taken on the way from one group "
-            f"to the other, so that {_DECISIVE}, and run the same command again"
-        )
-    if colour == "amber" and check.unconfirmed:
+        way = _photos_on_the_way("one group", "the other")
+        return f"do not use this model as it is: {instead}{way}"
+    if colour == "green":
+        return ""
+    if check.unconfirmed:
         return (
             "do not use this model before you have looked at it; add photos that overlap more, and "
-            "--intrinsics if the camera is known, and run the same command again"
+            f"--intrinsics if the camera is known, {_AGAIN}"
         )
-    if colour == "amber" and check.shrunk:
+    if check.shrunk:
         return (
             "do not trust distances in this model; look where these photos and the others meet, "
-            "add photos that show what both show, and run the same command again"
+            f"add photos that show what both show, {_AGAIN}"
         )
-    if colour == "amber" and repeats(check.told_apart):
-        way = (
+    if repeats(check.told_apart):
+        one_way = (
             " (alternative/0 is one way, which photos contradict)" if other and other.whole else ""
         )
+        way = _photos_on_the_way(*map(named, check.told_apart[:2]))
         return (
             "look at each model by itself; each may be right, and what is missing is how they "
-            f"belong together{way}; add such photos and run the same command again"
+            f"belong together{one_way}; {way}"
         )
-    if colour == "amber":
-        unsure = places[0].image if places else other.elsewhere[0] if other else check.apart[0][1]
-        where = (
-            "the model has it, and not where alternative/0 has it" if other else "the model has it"
-        )
-        return (
-            f"look whether {shown_name(unsure)} stands where {where}; if you cannot tell, add such "
-            "photos and run the same command again"
-        )
-    return ""
+    if places:
+        unsure = start = shown_name(places[0].image)
+        end = named(places[0].pairs)
+    elif other and other.elsewhere:
+        unsure = shown_name(other.elsewhere[0])
+        start, end = named(other.elsewhere), "the other photos"
+    elif check.apart:
+        start, end = map(shown_name, check.apart[0])
+        unsure = end
+    else:
+        return "look at alternative/0, too, and use the model that is right"
+    where = "the model has it, and not where alternative/0 has it" if other else "the model has it"
+    return (
+        f"look whether {unsure} stands where {where}; if you cannot tell, "
+        f"{_photos_on_the_way(start, end)}"
+    )
+
+
+def _photos_on_the_way(start: str, end: str) -> str:
+    return f"add photos taken on the way from {start} to {end}, {_OVERLAP}, {_AGAIN}"

@@ -23,7 +23,7 @@ from jaxsfm.matching.engines import Engine, chosen_engine
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import check_threads
 from jaxsfm.report.finished_run import FinishedRun, read_run
-from jaxsfm.report.page.after_run import page_after_run
+from jaxsfm.report.page import page_after_run
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import NewPhotos

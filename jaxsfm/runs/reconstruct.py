@@ -27,7 +27,7 @@ from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs
 from jaxsfm.options import Retrieval
-from jaxsfm.report.page.after_run import page_after_run
+from jaxsfm.report.page import page_after_run
 from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json

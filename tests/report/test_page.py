@@ -15,16 +15,11 @@ from verdicts import NAMES, check_of, with_verdicts
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.colmap.poses import read_poses
-from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.core.types import Status
 from jaxsfm.report.finished_run import read_run
-from jaxsfm.report.page import write
-from jaxsfm.report.page.close_ups import close_ups
-from jaxsfm.report.page.figures import figures3
-from jaxsfm.report.page.matrices import _reduced, pair_matrices
-from jaxsfm.report.page.pair_states import NOT_TRUSTED, STATES, USED, state
-from jaxsfm.report.page.view_graph import BEST_OF_EACH, chosen_edges
-from jaxsfm.report.page.write import page
+from jaxsfm.report.page import figures, write
+from jaxsfm.report.page.pairs import pair_table, state
+from jaxsfm.report.page.write import figures3, page
 from jaxsfm.report.run_results import LostPhoto, PairRow
 from jaxsfm.report.scene import shown_scene
 from jaxsfm.report.verdict import model_verdicts
@@ -32,8 +27,8 @@ from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.view_graph import Verdict
 
-SECTIONS = ("the-model", "photos", "pairs", "matches", "keypoints", "run", "next")
-FIGURES = ("model", "reprojection", "tracks", "view-graph", "inliers", "states")
+SECTIONS = ("the-model", "photos", "pairs", "matches", "run", "next")
+FIGURES = ("model", "reprojection")
 LOADS = re.compile(
     r"<[^>]*\s(?:src|href|srcset|poster|data)\s*=\s*(?![\"']?(?:data:|#))[^\s>]", re.I
 )
@@ -84,7 +79,7 @@ def test_every_run_leaves_a_page_with_all_parts(text, plain):
 
 def test_every_figure_and_picture_is_described(text):
     body = without_scripts(text)
-    assert body.count("<figure") == body.count("<figcaption") >= 6
+    assert body.count("<figure") == body.count("<figcaption") >= 5
     for tag in re.findall(r"<img[^>]*>", body):
         assert re.search(r'alt="[^"]+', tag)
     for tag in re.findall(r"<(?:svg|div)[^>]*role=\"img\"[^>]*>", body):
@@ -129,18 +124,6 @@ def test_shown_cameras_differ_from_the_reference_by_the_evaluated_errors(plain, 
     heights = {c.name: c.pose.centre[2] - low for c in shown.reference}
     order = sorted(heights, key=heights.__getitem__)
     assert order == sorted(reference, key=lambda name: -reference[name].centre[1])
-
-
-def test_keypoints_walk_inside_their_cells_and_patches_hold_them(plain):
-    tracks = close_ups(read_run(plain[0]))
-    assert len(tracks) == 5
-    for track in tracks:
-        assert 2 <= len(track.patches) <= track.length and track.error < 2
-        walked = [(p.cell, p.walked) for p in track.patches if p.cell and p.walked]
-        assert len(walked) >= 2
-        for cell, at in walked:
-            inside = np.asarray(at) - cell
-            assert (inside > 0).all() and (inside < FINE_STRIDE).all()
 
 
 # -- names, limits, gaps ------------------------------------------------------------------------
@@ -188,20 +171,16 @@ def test_a_large_run_has_a_small_page_that_says_what_is_left_out(plain):
     body = without_scripts(text)
     assert all(f"gone {k}" in body.lower() for k in range(n - lost, n))  # every lost image and why
     assert "10 more lost photos" in body and "The 330 photos with the smallest errors" in body
-    assert "Each square stands for 2 x 2 photos" in body
-    used, odd = (sum(state(r) == s for r in rows) for s in (USED, NOT_TRUSTED))
-    assert f"{used + odd - 1500} weaker pairs are left out" in body
+    odd = sum(state(r) == "not trusted" for r in rows)
     assert f"{odd - 15} more are in report.json" in body
 
 
 def test_points_beyond_the_limit_are_drawn_in_part_and_the_page_says_so(plain, monkeypatch):
-    from jaxsfm.report.page import model_figure
-
     scene = shown_scene(read_run(plain[0]))
     n = len(scene.points)
-    whole = model_figure.model_figure(scene)
-    monkeypatch.setattr(model_figure, "MAX_POINTS", n // 2)
-    part = model_figure.model_figure(scene)
+    whole = figures.model_figure(scene)
+    monkeypatch.setattr(figures, "MAX_POINTS", n // 2)
+    part = figures.model_figure(scene)
     assert f"{n // 2} of {n} points are drawn" in part.note
     assert "points are drawn" not in whole.note
     assert len(json.loads(part.spec)["data"][0]["marker"]["color"]) == n // 2
@@ -221,9 +200,9 @@ def test_a_page_without_photos_or_matches_has_all_the_rest(plain, scene, tmp_pat
             path.write_bytes(path.read_bytes() + b"\0")
     assert main(["report", str(out), "--images", str(images)]) == 0
     body = without_scripts((out / "report.html").read_text())
-    assert 'id="matches"' not in body and 'id="keypoints"' not in body
+    assert 'id="matches"' not in body
     assert ("<img" in body) == (what == "matches")
-    assert "All 3 photos are in one model." in body and 'id="view-graph"' in body
+    assert "All 3 photos are in one model." in body and 'id="model"' in body
 
 
 def test_a_run_without_a_model_says_why_each_photo_was_lost(plain, tmp_path):
@@ -268,8 +247,8 @@ def test_a_run_in_parts_says_what_parts_them_and_what_may_help(plain, tmp_path):
     change_report(out, part)
     assert main(["report", str(out)]) == 0
     body = without_scripts((out / "report.html").read_text())
-    assert "Groups of photos that are joined by trusted pairs" in body
-    assert "7 matches, 26 are needed" in body and HOSTILE not in body
+    assert "<li>View graph: 2 groups of 2, 2 images; no trusted pair joins two groups.</li>" in body
+    assert "7 matches, 26 are needed.</li>" in body and HOSTILE not in body
     assert "<li><code>--some &lt;option&gt;</code>: small</li><li>far</li>" in body
     change_report(out, lambda report: report.update(models=[], no_model="nothing <fits>"))
     assert main(["report", str(out)]) == 0
@@ -289,8 +268,11 @@ def test_the_page_says_the_verdict_with_all_its_photos(plain, colour):
     assert (f"<b>What next:</b> {verdict.advice}." in head) == (colour != "green")
     for name in NAMES:
         assert (name in head) == (colour != "green"), name
-    for found in (*verdict.contradictions, *verdict.places):
-        assert f"<li>{found.text}." in head
+    assert len(verdict.reasons) == (colour != "green")
+    for label, findings in verdict.reasons:
+        assert f"<h3>{label.capitalize()}</h3>" in head
+        for found in findings:
+            assert f"<li>{found.text}." in head
 
 
 def test_a_page_of_a_doubtful_model_has_no_green_outcome(plain):
@@ -319,9 +301,9 @@ def test_the_page_says_what_speaks_against_a_model_as_a_whole(plain, doubt, labe
     check = dataclasses.replace(check_of("green"), **doubt)
     report = dataclasses.replace(run.report, checks=[check])
     (verdict,) = model_verdicts(report.checked)
-    said = verdict.unconfirmed or verdict.scale[0].text
+    (reason,) = verdict.reasons
     body = without_scripts(page(dataclasses.replace(run, report=report)))
-    assert f"<b>{label}:</b> {said}." in body
+    assert f"<h3>{label}</h3>" in body and f"<li>{reason.findings[0].text}." in body
 
 
 def test_names_in_a_verdict_are_only_ever_text(plain):
@@ -402,35 +384,15 @@ def test_states_follow_a_pair_through_the_pipeline():
         dataclasses.replace(row("a", "b"), handed_on=False),
         row("a", "b", inliers=0, verified=0),
     ]
-    names = [STATES[state(r)].name for r in rows]
-    assert names == ["used", "not trusted", "not verified", "not chosen", "no plane"]
-    assert STATES[state(dataclasses.replace(row("a", "b"), view_graph=None))].name == "used"
-
-
-def test_matrices_are_symmetrical_and_reduced_to_the_best():
-    rows = [row("a", "b", 9, 0), row("a", "c", 9, 5), row("b", "e", 7, 3, trusted=False)]
-    inliers, states = pair_matrices(list("abcde"), rows)
-    assert (inliers == inliers.T).all() and (states == states.T).all()
-    assert inliers[0, 1] == 9 and inliers[0, 2] == 5 and states[1, 4] == NOT_TRUSTED
-    small = _reduced(inliers, 2)
-    assert small.tolist() == [[9, 5, 3], [5, 0, 0], [3, 0, 0]]
-
-
-def test_a_cut_graph_keeps_the_best_of_every_photo():
-    rng = np.random.default_rng(0)
-    names = [f"{k:02d}" for k in range(30)]
-    rows = [
-        row(a, b, strength=float(rng.random()) * (0.01 if "29" in (a, b) else 1.0))
-        for i, a in enumerate(names)
-        for b in names[i + 1 :]
-    ]
-    edges = chosen_edges(rows, 100, 80)
-    assert len(edges) == 100
-    for name in names:
-        assert sum(name in r.pair for r in edges) >= BEST_OF_EACH
-    assert chosen_edges(rows[:50], 100, 80) == sorted(
-        rows[:50], key=lambda r: -(r.view_graph.strength if r.view_graph else 0)
+    names = ["used", "not trusted", "not verified", "not chosen", "no plane"]
+    assert [state(r) for r in rows] == names
+    assert state(dataclasses.replace(row("a", "b"), view_graph=None)) == "used"
+    table = pair_table([*rows, *rows[1:3]])
+    assert [(n, name) for n, name, _ in table.counts] == list(
+        zip([1, 2, 2, 1, 1], names, strict=True)
     )
+    assert [why for _, why in table.refused][:2] == ["not trusted: it is off"] * 2
+    assert table.refused[2][1].startswith("not verified: it has matches, but COLMAP")
 
 
 def test_far_points_are_left_out_and_counted(plain):

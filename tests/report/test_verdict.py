@@ -8,7 +8,14 @@ from verdicts import NAMES, OTHER, check_of, with_verdicts
 
 from jaxsfm.report.run_report import read_report
 from jaxsfm.report.summary import summary_lines
-from jaxsfm.report.verdict import MAX_FINDINGS, model_verdict, model_verdicts, verdict_lines
+from jaxsfm.report.verdict import (
+    MAX_FINDINGS,
+    Finding,
+    ModelVerdict,
+    model_verdict,
+    model_verdicts,
+    verdict_lines,
+)
 from jaxsfm.sfm.check.model_check import Alternative
 
 FORMAT_1 = Path(__file__).parent / "report_of_format_1.json"
@@ -26,6 +33,13 @@ def lines(report, *colours) -> list[str]:
     return [x for x in summary_lines(with_verdicts(report, *colours)) if x not in without]
 
 
+def only_finding(verdict: ModelVerdict) -> Finding:
+    """The one thing that speaks against a model."""
+    (reason,) = verdict.reasons
+    (finding,) = reason.findings
+    return finding
+
+
 def test_a_model_that_was_not_checked_has_no_line(report):
     assert lines(report, None) == [] and "verdict" not in "\n".join(summary_lines(report))
 
@@ -38,7 +52,7 @@ def test_green_is_one_line_for_any_number_of_models(report):
 
 
 def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(report):
-    head, place, decisive, advice = lines(report, "amber")
+    head, place, advice = lines(report, "amber")
     assert head == (
         "verdict          amber: two models may explain these photos; 1 photo fits into the model "
         "in a second place"
@@ -48,53 +62,60 @@ def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(repor
         f"second place     {NAMES[0]}, turned by 90 degrees: the pairs with {others} put it there; "
         "seen from there, it agrees with 120 points of the model and contradicts 3"
     )
-    assert decisive.startswith(
-        f"would decide     photos taken on the way from {NAMES[0]} to {others}"
-    )
-    assert "overlap by more than half" in decisive and "occurs only once" in decisive
     assert advice.startswith(f"what next        look whether {NAMES[0]} stands")
+    assert f"add photos taken on the way from {NAMES[0]} to {others}" in advice
+    assert "overlap by more than half" in advice and "occurs only once" in advice
 
 
 def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move():
     verdict = model_verdict(dataclasses.replace(check_of("green"), alternative=OTHER))
-    assert verdict.colour == "amber" and not verdict.places
-    head, other, decisive, advice = verdict_lines([verdict])
+    assert verdict.colour == "amber" and len(verdict.reasons) == 1
+    head, other, advice = verdict_lines([verdict])
     assert head == "verdict          amber: two models may explain these photos"
     assert other == (
         "other model      alternative/0 is another mapping, which follows the order of the photos' "
         f"names: 2 photos have another place there ({NAMES[2]}, {NAMES[3]})"
     )
-    assert f"on the way from {NAMES[2]}, {NAMES[3]} to the other photos" in decisive
+    assert f"on the way from {NAMES[2]}, {NAMES[3]} to the other photos" in advice
     assert f"look whether {NAMES[2]} stands where the model has it, and not where" in advice
+
+
+def test_another_model_without_a_photo_elsewhere_is_looked_at_too():
+    other = dataclasses.replace(OTHER, elsewhere=[])
+    verdict = model_verdict(dataclasses.replace(check_of("green"), alternative=other))
+    _, found, advice = verdict_lines([verdict])
+    assert found.endswith("which follows the order of the photos' names")
+    assert advice.endswith("look at alternative/0, too, and use the model that is right")
 
 
 def test_neighbours_that_disagree_are_amber_and_named():
     verdict = model_verdict(dataclasses.replace(check_of("green"), apart=[NAMES[3:5]]))
-    head, neighbours, decisive, advice = verdict_lines([verdict])
+    head, neighbours, advice = verdict_lines([verdict])
     assert head == "verdict          amber: two models may explain these photos"
     assert neighbours == (
         f"neighbours       {NAMES[3]} and {NAMES[4]} follow each other, but their matches do not "
         "agree with the model"
     )
-    assert f"on the way from {NAMES[3]} to {NAMES[4]}" in decisive
+    assert f"on the way from {NAMES[3]} to {NAMES[4]}" in advice
     assert f"look whether {NAMES[4]} stands where the model has it; if" in advice
 
 
 def test_photos_that_were_told_apart_are_amber_and_each_group_is_named():
     groups = [NAMES[:3], NAMES[3:5], *([name] for name in NAMES[5:])]
     verdict = model_verdict(dataclasses.replace(check_of("green"), told_apart=groups))
-    head, parts, decisive, advice = verdict_lines([verdict])
+    head, parts, advice = verdict_lines([verdict])
     assert head == "verdict          amber: two models may explain these photos"
     assert parts == (
         "told apart       these photos were in one model, which something spoke against; each "
         f"group is by itself now: {', '.join(NAMES[:3])}; {NAMES[3]}, {NAMES[4]}; {NAMES[5]}; "
         "and 3 more"
     )
-    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in decisive
+    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in advice
     assert "look at each model by itself" in advice
-    (found,) = verdict.parts
+    found = only_finding(verdict)
     assert found.images == NAMES[:3] and found.others == NAMES[3:]
-    (found,) = model_verdict(dataclasses.replace(check_of("green"), told_apart=groups[:3])).parts
+    check = dataclasses.replace(check_of("green"), told_apart=groups[:3])
+    found = only_finding(model_verdict(check))
     assert found.text.endswith(f"; {NAMES[5]}")
 
 
@@ -107,10 +128,10 @@ def test_a_part_that_may_have_shrunk_is_amber_and_its_photos_are_named():
         "other photos do, or nearer still"
     )
     assert "do not trust distances in this model" in advice
-    (found,) = verdict.scale
-    assert found.images == NAMES[:2] and found.others == []
+    found = only_finding(verdict)
+    assert found.images == NAMES[:2] and not found.others
     alone = model_verdict(dataclasses.replace(check_of("green"), shrunk=NAMES[:1]))
-    assert f"{NAMES[0]} sees its points" in alone.scale[0].text
+    assert f"{NAMES[0]} sees its points" in only_finding(alone).text
 
 
 def test_a_model_of_which_the_photos_show_few_points_is_amber():
@@ -133,7 +154,7 @@ def test_the_model_that_was_told_apart_is_shown_as_one_way_to_join_the_groups():
         "told apart; photos contradict each other at 9 of its points"
     )
     assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in lines[3]
-    assert "look at each model by itself" in lines[4] and "alternative/0" in lines[4]
+    assert "look at each model by itself" in lines[3] and "alternative/0" in lines[3]
 
 
 def test_a_photo_that_was_told_apart_alone_leaves_the_others_green():
@@ -176,8 +197,9 @@ def test_the_strongest_findings_come_first_and_the_others_are_counted():
     (place,) = check.other_places
     places = [dataclasses.replace(place, image=f"{n}.jpg", agreed=n) for n in (5, 80, 3, 70, 60)]
     verdict = model_verdict(dataclasses.replace(check, other_places=places))
-    assert [each.images for each in verdict.places[:3]] == [["80.jpg"], ["70.jpg"], ["60.jpg"]]
-    assert "from 80.jpg to" in verdict.decisive and "5 photos fit" in verdict.headline
+    (reason,) = verdict.reasons
+    assert [each.images for each in reason.findings[:3]] == [["80.jpg"], ["70.jpg"], ["60.jpg"]]
+    assert "from 80.jpg to" in verdict.advice and "5 photos fit" in verdict.headline
     found = [x for x in verdict_lines([verdict]) if x.startswith("second place")]
     assert len(found) == MAX_FINDINGS + 1
     assert found[-1] == "second place     2 more are in report.json"
@@ -187,4 +209,4 @@ def test_a_red_model_tells_of_second_places_too():
     places = check_of("amber").other_places
     check = dataclasses.replace(check_of("red"), other_places=places)
     labels = [line[:17].strip() for line in verdict_lines([model_verdict(check)])]
-    assert labels == ["verdict", "contradiction", "second place", "would decide", "what next"]
+    assert labels == ["verdict", "contradiction", "second place", "what next"]

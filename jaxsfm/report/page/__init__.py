@@ -1,1 +1,18 @@
 """The report of a run as one page of HTML that needs nothing else."""
+
+import logging
+from pathlib import Path
+
+from jaxsfm.io.work_folder import PAGE
+
+logger = logging.getLogger(__name__)
+
+
+def page_after_run(results: Path) -> None:
+    """Write the page of finished results. A failure is only a warning: the run is not affected."""
+    try:
+        from jaxsfm.report.page.write import write_page
+
+        logger.info("the report, for the browser: %s", write_page(results))
+    except Exception as error:
+        logger.warning("%s was not written (%s)", results / PAGE, error)

@@ -1,31 +1,25 @@
 """Puts the page together and writes it."""
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import jinja2
+import numpy as np
 import plotly.offline
 from markupsafe import Markup
 
-from jaxsfm.core.grid import FINE_STRIDE
 from jaxsfm.io.atomic import write_atomic
-from jaxsfm.io.images import MOST_NAMED, named, shown_name
+from jaxsfm.io.images import MOST_NAMED, shown_name
 from jaxsfm.io.pairs import describe
 from jaxsfm.io.work_folder import PAGE
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.georeference_lines import georeference_lines, words_of
-from jaxsfm.report.page.close_ups import SIDE, close_ups
-from jaxsfm.report.page.error_figures import cumulative_figure, reprojection_figure, track_figure
-from jaxsfm.report.page.figures import BLUE, GREEN, Figure, count, duration, figures3
-from jaxsfm.report.page.matrices import matrix_figures
-from jaxsfm.report.page.model_figure import model_figure
-from jaxsfm.report.page.pair_pictures import pair_pictures
-from jaxsfm.report.page.pair_states import component_table, pair_table
-from jaxsfm.report.page.photo_table import photo_table
-from jaxsfm.report.page.view_graph import view_graph
+from jaxsfm.report.page.figures import figures
+from jaxsfm.report.page.pairs import pair_pictures, pair_table
+from jaxsfm.report.page.photos import photo_table
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.report.scene import shown_scene
+from jaxsfm.report.summary import component_lines
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.report.verdict import model_verdicts
 from jaxsfm.sfm.georeference.placement import AnchorRow
@@ -35,6 +29,26 @@ MAX_FINDINGS = 5
 a rendered box filled the first screen."""
 MAX_ANCHORS = 60
 """The number of measured positions in the table, those that are the furthest off."""
+
+
+def count(n: int) -> str:
+    """A number with thin spaces between thousands."""
+    return f"{n:,}".replace(",", "\u202f")
+
+
+def figures3(value: float) -> str:
+    """A number with three significant figures, never as a power of ten."""
+    return np.format_float_positional(value, precision=3, fractional=False, trim="-")
+
+
+def duration(seconds: float) -> str:
+    """A time in its two largest units."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
 _ENVIRONMENT = jinja2.Environment(
     loader=jinja2.PackageLoader("jaxsfm.report.page", "."),
     autoescape=True,
@@ -44,7 +58,6 @@ _ENVIRONMENT = jinja2.Environment(
 )
 _ENVIRONMENT.filters |= {
     "name": shown_name,
-    "named": named,
     "described": describe,
     "count": count,
     "figures3": figures3,
@@ -52,32 +65,6 @@ _ENVIRONMENT.filters |= {
     "quote": shlex.quote,
     "repr": repr,
 }
-
-
-def photo_names(report: RunReport) -> list[str]:
-    """Every photo that is in a pair, in a model, or lost; sorted."""
-    names = {name for row in report.pairs.each for name in row.pair}
-    names |= {name for model in report.models for name in model.images}
-    return sorted(names | {photo.image for photo in report.lost})
-
-
-def _figures(run: FinishedRun, names: list[str]) -> Iterator[tuple[str, Figure]]:
-    """The figures of the page, each with the name by which page.html places it."""
-    report, rows = run.report, run.report.pairs.each
-    if run.model is not None:
-        yield "model", model_figure(shown_scene(run))
-        yield "reprojection", reprojection_figure(run.errors)
-        yield "tracks", track_figure(run.model.tracks)
-    if evaluation := report.evaluation:
-        total, errors = evaluation.reference_images, evaluation.images.values()
-        positions, rotations = [e.position for e in errors], [e.rotation_deg for e in errors]
-        unit = "units of the reference"
-        yield "positions", cumulative_figure("position", unit, BLUE, positions, total)
-        yield "rotations", cumulative_figure("rotation", "degrees", GREEN, rotations, total)
-    if names:
-        registered = set(report.models[0].images) if report.models else set()
-        yield "view-graph", view_graph(names, rows, registered)
-        yield from zip(("inliers", "states"), matrix_figures(names, rows), strict=True)
 
 
 def _options(options: object, prefix: str = "") -> list[tuple[str, str]]:
@@ -99,7 +86,6 @@ def _anchors(report: RunReport) -> list[AnchorRow]:
 def page(run: FinishedRun) -> str:
     """The report as HTML that needs nothing from outside."""
     report, images = run.report, run.photos.folder
-    names = photo_names(report)
     pictures, photos = pair_pictures(run)
     anchors = _anchors(report)
     refinement = report.refinement[0] if report.refinement else None
@@ -116,15 +102,12 @@ def page(run: FinishedRun) -> str:
         georeference=[words_of(line) for line in georeference_lines(report.georeference)],
         anchors=anchors[:MAX_ANCHORS],
         anchors_left_out=len(anchors[MAX_ANCHORS:]),
-        figures=dict(_figures(run, names)),
+        figures=dict(figures(run)),
         pictures=pictures,
         photos=photos,
-        tracks=close_ups(run),
-        patch=SIDE,
-        cell=FINE_STRIDE,
         pairs=pair_table(report.pairs.each),
-        groups=component_table(report.view_graph),
-        table=photo_table(run, names),
+        groups=[words_of(line) for line in component_lines(report.view_graph)],
+        table=photo_table(run),
         options=_options(to_json(report.options)),
         out=str(run.folder.absolute()),
         images=images and str(images.absolute()),

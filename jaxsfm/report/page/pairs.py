@@ -1,5 +1,6 @@
-"""Pictures of the matches of the best, the weakest and the refused pairs."""
+"""The pairs in the page: how far they came, and pictures of the matches of some of them."""
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -7,11 +8,12 @@ import numpy as np
 
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.report.finished_run import FinishedRun
-from jaxsfm.report.page.embedded import Embedded, embed
-from jaxsfm.report.page.pair_states import USED, refused_pairs, state
+from jaxsfm.report.page.photos import Embedded, embed
 from jaxsfm.report.plot import COLOURS, MAX_LINES
 from jaxsfm.report.run_results import PairRow
 
+MAX_PAIRS = 15
+"""The most rows of the table of refused pairs."""
 OF_A_KIND = 3
 """The number of pairs of each kind: best, weakest, refused."""
 SIDE = 640
@@ -20,13 +22,65 @@ GAP = 6
 """The space between the two photos, pixels of the page."""
 MAX_DOTS = 400
 """The most dots of a plane in a photo."""
+NO_PLANE, NOT_CHOSEN, NOT_VERIFIED = "no plane", "not chosen", "not verified"
+NOT_TRUSTED, USED = "not trusted", "used"
+STATES = {
+    USED: "COLMAP verified it, and it was given to the mapper",
+    NOT_TRUSTED: "COLMAP verified it, but stronger pairs or the check of the model contradict it",
+    NOT_VERIFIED: "it has matches, but COLMAP found no common geometry",
+    NOT_CHOSEN: "it has matches, but --best-pairs left it out",
+    NO_PLANE: "too few matches, or too few on a common plane",
+}
+"""The stages at which a pair can end, and what each means."""
+
+
+def state(row: PairRow) -> str:
+    """The stage at which a pair ended: a key of STATES."""
+    if not row.inliers:
+        return NO_PLANE
+    if not row.handed_on:
+        return NOT_CHOSEN
+    if not row.colmap_inliers:
+        return NOT_VERIFIED
+    return USED if row.trusted else NOT_TRUSTED
+
+
+def _refused_pairs(rows: Iterable[PairRow]) -> list[PairRow]:
+    """The pairs with matches that the model does not rest on, those with most matches first."""
+    refused = [row for row in rows if state(row) in (NOT_TRUSTED, NOT_VERIFIED)]
+    return sorted(refused, key=lambda row: (-row.colmap_inliers, -row.inliers, row.pair))
+
+
+class PairTable(NamedTuple):
+    """How far all pairs came."""
+
+    counts: list[tuple[int, str, str]]
+    """The number of pairs that ended at a stage, for every stage that occurs; its name and what it
+    means."""
+    refused: list[tuple[PairRow, str]]
+    """The refused pairs with the most matches, and why each was refused."""
+    left_out: int
+    """The number of refused pairs that have no row."""
+
+
+def pair_table(rows: list[PairRow]) -> PairTable:
+    """How far all pairs came, and the reasons why pairs with many matches were refused."""
+    refused, numbers = _refused_pairs(rows), Counter(map(state, rows))
+    shown = []
+    for row in refused[:MAX_PAIRS]:
+        reason = row.view_graph.reason if row.view_graph else ""
+        shown.append((row, f"{state(row)}: {reason or STATES[state(row)]}"))
+    return PairTable(
+        counts=[(numbers[name], name, STATES[name]) for name in STATES if numbers[name]],
+        refused=shown,
+        left_out=len(refused[MAX_PAIRS:]),
+    )
 
 
 class Plane(NamedTuple):
     """The matches of one homography, as paths of SVG."""
 
     colour: str
-    matches: int
     lines: str
     dots: str
 
@@ -51,7 +105,7 @@ def _chosen(rows: list[PairRow]) -> list[tuple[str, PairRow]]:
     return [
         *(("Among the best pairs", row) for row in best),
         *(("Among the weakest pairs that were used", row) for row in weakest),
-        *(("Refused", row) for row in refused_pairs(rows)[:OF_A_KIND]),
+        *(("Refused", row) for row in _refused_pairs(rows)[:OF_A_KIND]),
     ]
 
 
@@ -69,7 +123,7 @@ def _planes(result: PairResult, xy0: np.ndarray, xy1: np.ndarray) -> list[Plane]
         ]
         some = _some(member, MAX_DOTS)
         dots = [f"M{x:.0f} {y:.0f}h0" for xy in (xy0, xy1) for x, y in xy[some]]
-        planes.append(Plane(COLOURS[k % len(COLOURS)], len(member), "".join(lines), "".join(dots)))
+        planes.append(Plane(COLOURS[k % len(COLOURS)], "".join(lines), "".join(dots)))
     return planes
 
 

@@ -1,21 +1,58 @@
-"""The table of photos. To add a column, add a field to `PhotoRow`, and in page.html a heading and a
-cell."""
+"""The photos in the page: how they are embedded, and their table.
 
-from collections.abc import Mapping, Sequence
+To add a column to the table, add a field to `PhotoRow`, and in page.html a heading and a cell.
+"""
+
+import base64
+from collections import Counter
+from collections.abc import Mapping
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
+from jaxsfm.io.images import WorkingImage, working_size
 from jaxsfm.report.finished_run import FinishedRun
-from jaxsfm.report.page.embedded import Embedded, embed
-from jaxsfm.report.page.pair_states import partners
+from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import LostPhoto
 from jaxsfm.sfm.evaluation import PoseError
 
+QUALITY = 72
+"""Quality of JPEG, 0 .. 100."""
 MAX_PHOTOS = 60
 """The most rows of the table. How many photos are left out is said below it."""
 THUMBNAIL = 96
 """Longer side of a thumbnail, pixels."""
+
+
+class Embedded(NamedTuple):
+    """A photo in the page."""
+
+    id: str
+    uri: str
+    """The photo as JPEG, for the address of an <img>."""
+    width: int
+    height: int
+    scale: np.ndarray
+    """Original pixels per pixel of the embedded photo, (x, y)."""
+
+    def place(self, xy: np.ndarray) -> np.ndarray:
+        """Original pixels (n, 2) as coordinates of SVG, whose (0, 0) is the top-left corner."""
+        return (xy + 0.5) / self.scale
+
+
+def embed(image: WorkingImage, *, id: str, side: int) -> Embedded:
+    """A photo whose longer side is at most `side` pixels."""
+    full = (image.rgb.shape[1], image.rgb.shape[0])
+    width, height = working_size(full, side)
+    small = cv2.resize(image.rgb, (width, height), interpolation=cv2.INTER_AREA)
+    # OpenCV encodes photos, see jaxsfm.colmap.
+    bgr = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
+    ok, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    assert ok
+    uri = "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+    scale = np.asarray(image.scale) * np.asarray(full) / (width, height)
+    return Embedded(id, uri, width, height, scale)
 
 
 class PhotoRow(NamedTuple):
@@ -25,7 +62,7 @@ class PhotoRow(NamedTuple):
     thumbnail: Embedded | None
     """None if the photo is gone or has changed since the run."""
     pairs: int
-    """The number of pairs with this photo that were used."""
+    """The number of pairs with this photo that were given to the mapper."""
     observations: int | None
     """The number of points that were seen in it; None if it is not in the model."""
     reprojection_px: float | None
@@ -62,12 +99,20 @@ def _seen_points(run: FinishedRun) -> dict[str, tuple[int, float]]:
     }
 
 
-def photo_table(run: FinishedRun, names: Sequence[str]) -> PhotoTable:
-    """A row for each of the photos: the lost ones first, then those with the largest errors."""
-    report = run.report
+def _photo_names(report: RunReport) -> list[str]:
+    """Every photo that is in a pair, in a model, or lost; sorted."""
+    names = {name for row in report.pairs.each for name in row.pair}
+    names |= {name for model in report.models for name in model.images}
+    return sorted(names | {photo.image for photo in report.lost})
+
+
+def photo_table(run: FinishedRun) -> PhotoTable:
+    """A row for each photo: the lost ones first, then those with the largest errors."""
+    report, names = run.report, _photo_names(run.report)
     lost = {photo.image: photo for photo in report.lost}
     errors = report.evaluation.images if report.evaluation else {}
-    seen, used = _seen_points(run), partners(names, report.pairs.each)
+    seen = _seen_points(run)
+    used = Counter(name for row in report.pairs.each if row.trusted for name in row.pair)
 
     def worst_first(name: str) -> tuple[bool, float, float]:
         error = errors[name].position if name in errors else 0.0
