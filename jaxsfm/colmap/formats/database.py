@@ -1,7 +1,8 @@
 """Reads COLMAP's database without COLMAP.
 
-COLMAP opens a database for writing, updates its tables, and ends the process if it is damaged. So
-it is read with sqlite3. Tables and blobs: https://colmap.github.io/database.html.
+COLMAP changes a database when it opens one: it writes tables that are missing into the file, or
+into an empty file. It does not notice keypoints or matches of images that are not there. So another
+tool's database is read with sqlite3. Tables and blobs: https://colmap.github.io/database.html.
 """
 
 import sqlite3
