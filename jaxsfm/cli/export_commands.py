@@ -17,21 +17,7 @@ from jaxsfm.errors import UserError
 if TYPE_CHECKING:
     import pycolmap
 
-    from jaxsfm.colmap.formats.tables import Tables
-
-Format = Literal[
-    "hloc",
-    "colmap",
-    "colmap-text",
-    "ply",
-    "bundler",
-    "nvm",
-    "openmvg",
-    "nerfstudio",
-    "undistorted",
-]
-FILES = {"ply": ".ply", "nvm": ".nvm"}
-"""The formats that are a single file, and how its name ends. The others are folders."""
+Format = Literal["hloc", "colmap", "colmap-text", "ply", "nerfstudio", "undistorted"]
 GEOREFERENCE = "georeference.json"
 """The file beside an exported model that says where it is: report.json's `georeference`."""
 
@@ -57,12 +43,11 @@ def export(
       run: The folder of a run. For formats that hold a model, it can also be the folder of a COLMAP
         model.
       to: The format. hloc: features.h5, matches.h5 and pairs.txt. colmap, colmap-text: the model.
-        ply: the points of the model. bundler, nvm: cameras, points and observations. openmvg:
-        sfm_data.json, features and matches. nerfstudio: transforms.json and points. undistorted:
-        photos without lens distortion and their model, for dense stereo and Gaussian splatting.
-      out: The file (for ply and nvm) or the new folder to write.
-      images: The folder of the photos, which are undistorted, or to which the files of nerfstudio
-        and openmvg refer. Without it, the folder in which the run found them, if it still exists.
+        ply: the points of the model. nerfstudio: transforms.json and points. undistorted: photos
+        without lens distortion and their model, for dense stereo and Gaussian splatting.
+      out: The file (for ply) or the new folder to write.
+      images: The folder of the photos, which are undistorted, or to which the file of nerfstudio
+        refers. Without it, the folder in which the run found them, if it still exists.
       copy_images: For nerfstudio: copy the photos into a folder named images, next to
         transforms.json.
       matches: Which matches are written for hloc. all: those that were handed to COLMAP. verified:
@@ -86,18 +71,16 @@ def export(
         raise UserError(
             f"{option}: {run} does not say where its photos are; name them with --images"
         )
-    with _fresh(out, FILES.get(to)) as fresh:
+    with _fresh(out, ".ply" if to == "ply" else None) as fresh:
         if to == "hloc":
             _write_hloc(fresh, run, matches)
-        elif to == "openmvg":
-            _write_openmvg(fresh, run, images)
         elif to == "nerfstudio":
             _write_nerfstudio(fresh, _model(run), images, copy_images)
         elif to == "undistorted":
             _write_undistorted(fresh, run, images, max_size)
         else:
             _write_model(fresh, _model(run), to)
-        if to not in FILES and to != "hloc":
+        if to not in ("ply", "hloc"):
             _write_georeference(fresh, run)
     print(f"{to}: {out}")
     return 0
@@ -154,29 +137,13 @@ def _model(run: Path) -> "pycolmap.Reconstruction":
     return read_model(find_model(run))
 
 
-def _tables(run: Path) -> "Tables | None":
-    """Keypoints and matches of the database of a run; None if there is no database."""
-    from jaxsfm.colmap.formats.database import read_database
-
-    path = run / "database.db"
-    return read_database(path, where=str(path)) if path.is_file() else None
-
-
 def _write_model(
-    fresh: Path,
-    model: "pycolmap.Reconstruction",
-    to: Literal["nvm", "ply", "bundler", "colmap", "colmap-text"],
+    fresh: Path, model: "pycolmap.Reconstruction", to: Literal["ply", "colmap", "colmap-text"]
 ) -> None:
-    from jaxsfm.colmap.formats.bundler import write_bundler
-    from jaxsfm.colmap.formats.lens import check_no_blanks
-    from jaxsfm.colmap.formats.nvm import nvm_text
+    from jaxsfm.colmap.formats.image_names import check_no_blanks
 
-    if to == "nvm":
-        fresh.write_bytes(nvm_text(model).encode())
-    elif to == "ply":
+    if to == "ply":
         model.export_PLY(fresh)
-    elif to == "bundler":
-        write_bundler(fresh, model)
     elif to == "colmap":
         model.write_binary(fresh)
     elif to == "colmap-text":
@@ -204,15 +171,17 @@ def _write_georeference(folder: Path, run: Path) -> None:
 
 
 def _write_hloc(folder: Path, run: Path, matches: Literal["all", "verified"]) -> None:
+    from jaxsfm.colmap.formats.database import read_database
     from jaxsfm.colmap.formats.hloc import write_hloc
     from jaxsfm.io.images import working_size
     from jaxsfm.report.finished_run import ORIGINAL
     from jaxsfm.report.run_inputs import RecordedConfig
     from jaxsfm.report.run_report import read_part
 
-    tables = _tables(run)
-    if tables is None:
+    path = run / "database.db"
+    if not path.is_file():
         raise UserError(f"{run}: no database.db here, so there are no matches to write for hloc")
+    tables = read_database(path, where=str(path))
     try:
         config = read_part(run, RecordedConfig, "options", "config")
         limits = config.max_size, config.enlarge
@@ -223,33 +192,10 @@ def _write_hloc(folder: Path, run: Path, matches: Literal["all", "verified"]) ->
     write_hloc(folder, tables, chosen, {name: scales[s] for name, s in tables.sizes.items()})
 
 
-def _write_openmvg(folder: Path, run: Path, images: Path | None) -> None:
-    from jaxsfm.colmap.formats.lens import camera_of
-    from jaxsfm.colmap.formats.openmvg import sfm_data, write_openmvg
-    from jaxsfm.colmap.poses import find_model, read_model
-
-    tables = _tables(run)
-    cameras, model = {}, None
-    if tables is not None:
-        where = str(run / "database.db")
-        for name, row in tables.cameras.items():
-            cameras[name] = camera_of(row, tables.sizes[name], where)
-    try:
-        found = find_model(run)
-    except UserError:  # OpenMVG can start from views and matches
-        if tables is None:
-            raise
-    else:
-        model = read_model(found)
-        cameras |= {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    root = None if images is None else images.absolute()
-    write_openmvg(folder, sfm_data(cameras, model, root), tables)
-
-
 def _write_nerfstudio(
     folder: Path, model: "pycolmap.Reconstruction", images: Path | None, copy_images: bool
 ) -> None:
-    from jaxsfm.colmap.formats.lens import registered_images
+    from jaxsfm.colmap.formats.image_names import registered_images
     from jaxsfm.colmap.formats.nerfstudio import IMAGES, write_nerfstudio
 
     write_nerfstudio(folder, model, None if copy_images or images is None else images.absolute())

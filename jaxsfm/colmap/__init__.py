@@ -6,8 +6,9 @@ heap (measured). `import jaxsfm` loads zlib. Pillow's PNG encoder can fail even 
 """
 
 import cv2  # noqa: F401  must precede pycolmap, see above
-import pycolmap  # noqa: F401  here, so that signals are noted again right after it
+import pycolmap  # here, so that signals are noted again right after it
 
 from jaxsfm.io import interrupt
 
 interrupt.note_again()
+pycolmap.logging.minloglevel = 3  # errors are raised too, and our messages are one sentence

@@ -75,8 +75,7 @@ def bundle_adjust(
     if lost:
         options.refine_principal_point = False
         _solve(reconstruction, options, fixed=())
-    # The solver moves points behind cameras. COLMAP gives them an error of 1e154, and a model file
-    # with it is refused.
+    # The solver moves points behind cameras. COLMAP gives them an error of 1e154.
     pycolmap.ObservationManager(reconstruction).filter_observations_with_negative_depth()
     _move_to(reconstruction, place)
     reconstruction.update_point_3d_errors()  # the solver does not update them

@@ -16,8 +16,6 @@ from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult, describe
 
-pycolmap.logging.minloglevel = 3
-
 PIXEL_OFFSET = np.float32(0.5)
 """COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.colmap.formats.database import read_database
-from jaxsfm.colmap.formats.tables import CameraRow, Tables, one_to_one
+from jaxsfm.colmap.formats.tables import Tables
 from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, camera_of
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
@@ -116,9 +116,9 @@ def _checked(
                 f"{where}: {shown_name(name)} is {_by(tables.sizes[name])} pixels there, "
                 f"but the photo {_by(size)}"
             )
-        if intrinsics is not None and name in tables.cameras:
+        if intrinsics is not None and name in tables.focal_px:
             camera = camera_of(intrinsics, known[name])
-            _check_focal(tables.cameras[name], camera, where, name)
+            _check_focal(tables.focal_px[name], camera, where, name)
         inside = np.clip(
             tables.keypoints[name], -0.5, np.asarray(size, np.float32) - np.float32(0.5)
         )
@@ -135,7 +135,7 @@ def _checked(
             shown_name(ignored[0]),
         )
     matches = {
-        pair: one_to_one(rows)
+        pair: _one_to_one(rows)
         for pair, rows in sorted((tables.inliers or tables.matches).items())
         if pair[0] in keypoints and pair[1] in keypoints
     }
@@ -155,10 +155,14 @@ def _by(size: tuple[int, int]) -> str:
     return f"{size[0]} x {size[1]}"
 
 
-def _check_focal(camera: CameraRow, intrinsics: Intrinsics, where: str, name: str) -> None:
-    if not (camera.known and camera.params):
-        return
-    focal, ours = camera.params[0], intrinsics.params[0]
+def _one_to_one(rows: np.ndarray) -> np.ndarray:
+    """Keep only matches (m, 2) that are the first of both their keypoints, as tracks need it."""
+    first0, first1 = (np.unique(column, return_index=True)[1] for column in rows.T)
+    return rows[np.intersect1d(first0, first1)]
+
+
+def _check_focal(focal: float, intrinsics: Intrinsics, where: str, name: str) -> None:
+    ours = intrinsics.params[0]
     if not ours / FOCAL_RATIO < focal < ours * FOCAL_RATIO:
         raise UserError(
             f"{where}: {shown_name(name)} has a focal length of {focal:g} pixels there, "

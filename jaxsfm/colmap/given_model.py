@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.poses import find_model, read_model
@@ -12,8 +11,6 @@ from jaxsfm.io.images import shown_name
 
 SPHERICAL = "EQUIRECTANGULAR"
 """COLMAP's camera model of 360-degree photos. It has no image plane."""
-WORDS = 10
-"""The words on an image's line in images.txt."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,8 +52,6 @@ def read_given_model(path: Path) -> pycolmap.Reconstruction:
         raise UserError(f"{path}: no such folder")
     folder = find_model(path)
     model = read_model(folder)
-    if not (folder / "images.bin").is_file():
-        _check_names(folder / "images.txt")
     if model.num_reg_images() < 2:
         raise UserError(
             f"{folder}: {model.num_reg_images()} images with a pose; a refinement needs two"
@@ -69,8 +64,6 @@ def read_given_model(path: Path) -> pycolmap.Reconstruction:
                 f"{folder}: {shown_name(image.name)} has a camera of the model {SPHERICAL}; "
                 "360-degree photos cannot be refined"
             )
-        if not camera.verify_params() or not np.isfinite(camera.params).all():
-            raise UserError(f"{folder}: camera {camera.camera_id} has parameters that cannot be")
     if not any(point.track.length() > 1 for point in model.points3D.values()):
         raise UserError(
             f"{folder}: no points that two images observe, so there is nothing to refine; "
@@ -102,19 +95,3 @@ def shares_cameras(model: pycolmap.Reconstruction) -> bool:
 def _used_cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
     used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
     return [model.camera(camera_id) for camera_id in sorted(used)]
-
-
-def _check_names(path: Path) -> None:
-    """Refuse names with blanks in a text model: COLMAP reads them up to the blank, silently."""
-    lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
-    rows = [line for line in lines if not line.startswith("#")]
-    while rows and not rows[0].strip():
-        del rows[0]
-    for line in rows[::2]:
-        words = line.split()
-        if len(words) > WORDS:
-            name = " ".join(words[WORDS - 1 :])
-            raise UserError(
-                f"{path}: the name {shown_name(name)!r} has a blank in it, where COLMAP's text "
-                "format ends a name; write the model as a binary one"
-            )

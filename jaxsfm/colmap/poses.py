@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.model_files import DamagedModelError, check_binary
+from jaxsfm.colmap.model_files import DamagedModelError, check_binary, check_text
 from jaxsfm.errors import UserError
 from jaxsfm.io.photo_folder import find_images
 
@@ -104,23 +104,32 @@ def _read_llff(path: Path) -> Poses:
 
 
 def read_model(path: Path) -> pycolmap.Reconstruction:
-    """Read the COLMAP model (binary or text) in a folder. Raises UserError if there is none."""
+    """Read the COLMAP model (binary or text) in a folder.
+
+    Raises:
+      UserError: there is none, or it is damaged.
+    """
     suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
     if path.is_dir():
         for name in _FILES:
             if not (path / (name + suffix)).is_file():
                 raise UserError(f"{path}: not a readable COLMAP model ({name}{suffix} is missing)")
     try:
-        if (path / "images.bin").is_file():
+        if suffix == ".bin":
             check_binary(path)
         model = pycolmap.Reconstruction(path)
-        if not all(
-            np.isfinite([*p.rotation.flat, *p.centre]).all() for p in model_poses(model).values()
-        ):
-            raise DamagedModelError("a pose that is not finite")
+        if suffix == ".txt":
+            check_text(path, model)
+        _ = [image.name for image in model.images.values()]  # Python decodes them when asked
+        if not model.is_valid():
+            raise DamagedModelError("its files do not fit together")
         return model
     except DamagedModelError as error:
         raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
+    except UnicodeDecodeError as error:
+        raise UserError(
+            f"{path}: not a readable COLMAP model (images{suffix}: a name that is not UTF-8)"
+        ) from error
     except Exception as error:  # native errors of several kinds, whose texts are long
         raise UserError(f"{path}: not a readable COLMAP model") from error
 

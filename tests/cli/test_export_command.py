@@ -18,8 +18,8 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.formats.hloc import FEATURES, MATCHES, read_hloc
 
-FOLDERS = ["hloc", "colmap", "colmap-text", "bundler", "openmvg", "nerfstudio"]
-ALL = [*FOLDERS, "ply", "nvm"]
+FOLDERS = ["hloc", "colmap", "colmap-text", "nerfstudio"]
+ALL = [*FOLDERS, "ply"]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def run(tmp_path_factory, model):
 
 
 def target(tmp_path, to):
-    return tmp_path / ("model." + to if to in ("ply", "nvm") else "made")
+    return tmp_path / ("model.ply" if to == "ply" else "made")
 
 
 def export(run, to, out, *more):
@@ -98,52 +98,17 @@ def test_the_uncertainty_is_a_working_pixel(tmp_path, run, model):
             assert file["sub/b.jpg/keypoints"].attrs["uncertainty"] == expected
 
 
-def read_openmvg_matches(path):
-    words = iter(path.read_text().split())
-    found = {}
-    for first in words:
-        pair = int(first), int(next(words))
-        found[pair] = [(int(next(words)), int(next(words))) for _ in range(int(next(words)))]
-    return found
-
-
-def test_openmvgs_features_and_matches_are_the_databases(tmp_path, run):
-    assert export(run, "openmvg", tmp_path / "o", "--images", run) == 0
-    record = json.loads((tmp_path / "o" / "sfm_data.json").read_text())
-    assert record["root_path"] == str(run.absolute())
-    folder = tmp_path / "o" / "matches"
-    names = sorted(NAMES)
-    for kind, attribute in (("putative", "matches"), ("f", "inliers")):
-        from jaxsfm.colmap.formats.database import read_database
-
-        tables = read_database(run / "database.db", where="run")
-        found = read_openmvg_matches(folder / f"matches.{kind}.txt")
-        truth = {
-            (names.index(a), names.index(b)): list(map(tuple, rows.tolist()))
-            for (a, b), rows in getattr(tables, attribute).items()
-        }
-        assert found == truth
-    for name in names:
-        stem = name.rpartition("/")[2].rpartition(".")[0]
-        rows = np.loadtxt(folder / f"{stem}.feat")
-        assert np.allclose(rows[:, :2], tables.keypoints[name], atol=1e-4)
-        assert (rows[:, 2:] == [1, 0]).all()
-
-
 def test_a_run_without_a_model_gives_its_matches_and_says_so_of_the_rest(tmp_path, model, capsys):
     bare = write_run(tmp_path / "bare", model, with_model=False)
     assert export(bare, "hloc", tmp_path / "h") == 0
-    assert export(bare, "openmvg", tmp_path / "o") == 0
-    record = json.loads((tmp_path / "o" / "sfm_data.json").read_text())
-    assert len(record["views"]) == len(NAMES) and record["extrinsics"] == []
     capsys.readouterr()
-    for to in ("colmap", "colmap-text", "ply", "bundler", "nvm", "nerfstudio"):
+    for to in ("colmap", "colmap-text", "ply", "nerfstudio"):
         assert "no COLMAP model here" in refusal(capsys, bare, to, target(tmp_path, to))
         assert not target(tmp_path, to).exists()
 
 
 def test_a_models_own_folder_is_enough_for_a_model(tmp_path, run, capsys):
-    for to in ("colmap", "ply", "bundler", "openmvg", "nerfstudio"):
+    for to in ("colmap", "ply", "nerfstudio"):
         assert export(run / "sparse" / "0", to, target(tmp_path / to, to)) == (
             2 if to == "ply" else 0
         )
@@ -159,7 +124,6 @@ def test_an_empty_model_is_exported_empty(tmp_path):
     for to in ALL:
         (tmp_path / to).mkdir()
         assert export(tmp_path / "empty", to, target(tmp_path / to, to)) == 0
-    assert (tmp_path / "bundler" / "made" / "bundle.out").read_text().split("\n")[1] == "0 0"
     meta = json.loads((tmp_path / "nerfstudio" / "made" / "transforms.json").read_text())
     assert meta["frames"] == []
 
@@ -192,9 +156,9 @@ def test_what_is_there_is_not_overwritten_and_what_cannot_be_written_is_said(
 
 
 def test_a_failed_export_leaves_nothing(tmp_path, capsys):
-    run = write_run(tmp_path / "run", exact_model([camera("OPENCV")]))
-    for to in ("bundler", "openmvg", "nvm"):
-        assert "OPENCV" in refusal(capsys, run, to, target(tmp_path, to))
+    mixed = exact_model([camera("PINHOLE"), camera("OPENCV_FISHEYE", 2)])
+    run = write_run(tmp_path / "run", mixed)
+    assert "OPENCV_FISHEYE" in refusal(capsys, run, "nerfstudio", tmp_path / "made")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run"]
 
 
@@ -231,19 +195,13 @@ def test_nerfstudios_images_are_referred_to_or_copied(tmp_path, run, photos, cap
 def test_names_that_a_format_would_cut_are_refused(tmp_path, capsys, name):
     names = [name, *NAMES[1:]]
     run = write_run(tmp_path / "run", exact_model([camera("SIMPLE_PINHOLE")], names))
-    for to in ("hloc", "bundler", "nvm", "colmap-text"):
+    for to in ("hloc", "colmap-text"):
         assert "has a blank in it" in refusal(capsys, run, to, target(tmp_path, to))
-    for to in ("colmap", "openmvg", "nerfstudio"):
+    for to in ("colmap", "nerfstudio"):
         (tmp_path / to).mkdir()
         assert export(run, to, target(tmp_path / to, to)) == 0
     frames = json.loads((tmp_path / "nerfstudio" / "made" / "transforms.json").read_text())
     assert f"images/{name}" in [frame["file_path"] for frame in frames["frames"]]
-
-
-def test_openmvg_refuses_two_images_of_one_stem(tmp_path, capsys):
-    names = ["a.jpg", "sub/a.jpg", "c.jpg"]
-    run = write_run(tmp_path / "run", exact_model([camera("SIMPLE_PINHOLE")], names))
-    assert "a.feat" in refusal(capsys, run, "openmvg", tmp_path / "o")
 
 
 def test_a_missing_or_damaged_run_is_one_sentence(tmp_path, model, capsys):
@@ -255,8 +213,6 @@ def test_a_missing_or_damaged_run_is_one_sentence(tmp_path, model, capsys):
     for name in ("images.bin", "points3D.bin"):
         (run / "sparse" / "0" / name).write_bytes(b"")
     assert "not a readable COLMAP model" in refusal(capsys, run, "colmap", tmp_path / "h")
-    (run / "database.db").unlink()
-    assert "not a readable COLMAP model" in refusal(capsys, run, "openmvg", tmp_path / "h")
 
 
 def test_the_photos_are_those_of_the_run_unless_others_are_given(run, photos, tmp_path, capsys):
@@ -286,17 +242,16 @@ def test_no_name_of_a_model_leads_out_of_the_photos(name, tmp_path, capsys):
     photos = tmp_path / "deep" / "photos"
     photos.mkdir()
     (tmp_path / "secret.txt").write_text("not for export")
-    for to in ("nerfstudio", "bundler", "openmvg"):
-        more = ("--images", photos, "--copy-images") if to == "nerfstudio" else ()
-        message = refusal(capsys, folder, to, tmp_path / "out" / to, *more)
-        assert "outside" in message and not (tmp_path / "out" / to).exists()
+    out = tmp_path / "out" / "nerfstudio"
+    message = refusal(capsys, folder, "nerfstudio", out, "--images", photos, "--copy-images")
+    assert "outside" in message and not out.exists()
 
 
 def test_a_name_that_the_output_cannot_show_is_printed_as_escapes(tmp_path, run):
     """Windows writes into files and pipes in an encoding with few letters."""
-    out = tmp_path / "模型.nvm"
-    command = [sys.executable, "-m", "jaxsfm", "export", str(run), "--to", "nvm", "--out", str(out)]
+    out = tmp_path / "模型.ply"
+    command = [sys.executable, "-m", "jaxsfm", "export", str(run), "--to", "ply", "--out", str(out)]
     known = {"PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0"}
     done = subprocess.run(command, capture_output=True, env=os.environ | known)
     assert done.returncode == 0 and out.is_file()
-    assert rb"\u6a21\u578b.nvm" in done.stdout
+    assert rb"\u6a21\u578b.ply" in done.stdout

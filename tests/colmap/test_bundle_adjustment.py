@@ -30,7 +30,7 @@ def diverging(room: Room, points: int):
 
 
 def test_points_that_end_behind_a_camera_are_left_out(rendered):
-    """COLMAP gives such a point an error of 1e154, and our reader refuses a model with it."""
+    """COLMAP gives such a point an error of 1e154."""
     model = diverging(rendered, 5)
     before = model.num_points3D()
     bundle_adjust(model, loss_px=1000.0, refine_intrinsics=False, threads=1)

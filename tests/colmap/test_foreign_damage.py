@@ -4,6 +4,7 @@ import sqlite3
 
 import h5py
 import numpy as np
+import pycolmap
 import pytest
 from foreign_model import NAMES, camera, exact_model, write_run
 from mutations import mutated
@@ -90,6 +91,20 @@ def test_a_blob_of_another_size_is_named_with_its_image(tmp_path, files):
         read_database(path, where="d.db")
 
 
+def test_colmap_does_not_notice_what_a_database_lacks(tmp_path, files):
+    """This, and the next test, is why we do not let COLMAP read other tools' databases."""
+    path = tmp_path / "d.db"
+    path.write_bytes((files / "database.db").read_bytes())
+    db = sqlite3.connect(path)
+    db.execute("PRAGMA foreign_keys = off")
+    for damage in ("keypoints of nobody", "matches of nobody", "no table"):
+        db.execute(BAD_ROWS[damage])
+    db.commit()
+    db.close()
+    with pycolmap.Database.open(path) as db:
+        assert len(db.read_all_images()) == len(NAMES) and db.num_verified_image_pairs() == 0
+
+
 def test_reading_a_database_does_not_change_it(tmp_path, files):
     path = tmp_path / "some folder" / "d#1?.db"
     path.parent.mkdir()
@@ -98,6 +113,9 @@ def test_reading_a_database_does_not_change_it(tmp_path, files):
     assert len(read_database(path, where="x").keypoints) == len(NAMES)
     assert path.read_bytes() == (files / "database.db").read_bytes()
     assert [each.name for each in path.parent.iterdir()] == [path.name]
+    path.chmod(0o644)
+    pycolmap.Database.open(path).close()
+    assert path.read_bytes() != (files / "database.db").read_bytes()
 
 
 @pytest.mark.parametrize("content", [b"", b"not a database", b"SQLite format 3\0" + bytes(90)])

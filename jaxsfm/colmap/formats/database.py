@@ -1,7 +1,8 @@
 """Reads COLMAP's database without COLMAP.
 
-COLMAP opens a database for writing, updates its tables, and ends the process if it is damaged. So
-it is read with sqlite3. Tables and blobs: https://colmap.github.io/database.html.
+COLMAP changes a database when it opens one: it writes tables that are missing into the file, or
+into an empty file. It does not notice keypoints or matches of images that are not there. So another
+tool's database is read with sqlite3. Tables and blobs: https://colmap.github.io/database.html.
 """
 
 import sqlite3
@@ -13,13 +14,7 @@ from urllib.parse import quote
 import numpy as np
 
 from jaxsfm.colmap.database import PIXEL_OFFSET
-from jaxsfm.colmap.formats.tables import (
-    MAX_KEYPOINTS,
-    CameraRow,
-    Tables,
-    checked_keypoints,
-    checked_matches,
-)
+from jaxsfm.colmap.formats.tables import MAX_KEYPOINTS, Tables, checked_keypoints, checked_matches
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair
@@ -85,21 +80,20 @@ def read_database(path: Path, *, where: str) -> Tables:
 
 
 def _read(db: sqlite3.Connection, where: str) -> Tables:
-    cameras = {
-        camera_id: (
-            (int(width), int(height)),
-            CameraRow(int(model), tuple(np.frombuffer(params).tolist()), bool(known)),
-        )
-        for camera_id, model, width, height, params, known in db.execute(
-            "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras"
-        )
-    }
-    names, sizes, own_cameras = {}, {}, {}
+    cameras = {}
+    for camera_id, width, height, params, known in db.execute(
+        "SELECT camera_id, width, height, params, prior_focal_length FROM cameras"
+    ):
+        values = np.frombuffer(params).tolist()
+        cameras[camera_id] = (int(width), int(height)), values[0] if known and values else None
+    names, sizes, focal_px = {}, {}, {}
     for image_id, name, camera_id in db.execute("SELECT image_id, name, camera_id FROM images"):
         if not isinstance(name, str) or name in sizes:
             raise UserError(f"{where}: damaged: two images {name!r}")
         names[image_id] = name
-        sizes[name], own_cameras[name] = cameras[camera_id]
+        sizes[name], focal = cameras[camera_id]
+        if focal is not None:
+            focal_px[name] = focal
     keypoints = {}
     for image_id, rows, columns, data in db.execute(
         "SELECT image_id, rows, cols, data FROM keypoints"
@@ -113,4 +107,4 @@ def _read(db: sqlite3.Connection, where: str) -> Tables:
         dict(_pairs(db, table, names, keypoints, where))
         for table in ("matches", "two_view_geometries")
     ]
-    return Tables(sizes, own_cameras, keypoints, tables[0], tables[1])
+    return Tables(sizes, focal_px, keypoints, tables[0], tables[1])

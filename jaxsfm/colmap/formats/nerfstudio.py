@@ -12,25 +12,40 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.formats.lens import Lens, lens_of, registered_images
+from jaxsfm.colmap.formats.image_names import registered_images
 from jaxsfm.errors import UserError
 
 TRANSFORMS, POINTS, IMAGES = "transforms.json", "sparse_pc.ply", "images"
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """From the world to nerfstudio's world."""
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+_FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+_DISTORTION = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
+"""The distortion of nerfstudio's camera models. COLMAP's simpler models have the first terms of it,
+in the same order."""
 
 
-def _intrinsics(lens: Lens) -> dict[str, float]:
-    names = ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2")
+def _model_of(camera: pycolmap.Camera) -> str:
+    """nerfstudio's model of a camera; UserError if it has none."""
+    if camera.model_name in _PERSPECTIVE:
+        return "OPENCV"
+    if camera.model_name in _FISHEYE:
+        return "OPENCV_FISHEYE"
+    raise UserError(f"--to nerfstudio: it has no camera like COLMAP's {camera.model_name}")
+
+
+def _intrinsics(camera: pycolmap.Camera) -> dict[str, float]:
+    terms = dict.fromkeys(_DISTORTION[_model_of(camera)], 0.0)
+    given = [float(camera.params[k]) for k in camera.extra_params_idxs()]
     return {
-        "w": lens.size[0],
-        "h": lens.size[1],
-        "fl_x": lens.fx,
-        "fl_y": lens.fy,
-        "cx": lens.cx,
-        "cy": lens.cy,
-        **dict(zip(names, lens.radial, strict=False)),
-        **({} if lens.fisheye else {"p1": lens.tangential[0], "p2": lens.tangential[1]}),
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": float(camera.focal_length_x),
+        "fl_y": float(camera.focal_length_y),
+        "cx": float(camera.principal_point_x),
+        "cy": float(camera.principal_point_y),
+        **terms,
+        **dict(zip(terms, given, strict=False)),
     }
 
 
@@ -44,11 +59,13 @@ def write_nerfstudio(folder: Path, model: pycolmap.Reconstruction, images: Path 
       UserError: nerfstudio does not have a camera, or perspective and fisheye cameras are mixed.
     """
     views = registered_images(model)
-    lenses = [lens_of(model.camera(view.camera_id), "nerfstudio") for view in views]
-    if len({lens.fisheye for lens in lenses}) > 1:
-        kinds = ", ".join(sorted({lens.model for lens in lenses}))
-        raise UserError(f"--to nerfstudio: one kind of camera for all images; got {kinds}")
-    shared = len(set(lenses)) == 1
+    cameras = [model.camera(view.camera_id) for view in views]
+    kinds = {_model_of(camera) for camera in cameras}
+    if len(kinds) > 1:
+        names = ", ".join(sorted({camera.model_name for camera in cameras}))
+        raise UserError(f"--to nerfstudio: one kind of camera for all images; got {names}")
+    lenses = [_intrinsics(camera) for camera in cameras]
+    shared = bool(lenses) and all(lens == lenses[0] for lens in lenses)
     frames = []
     for view, lens in zip(views, lenses, strict=True):
         world_from_cam = np.vstack([view.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
@@ -56,11 +73,10 @@ def write_nerfstudio(folder: Path, model: pycolmap.Reconstruction, images: Path 
         placed = np.vstack([APPLIED @ world_from_cam, [0, 0, 0, 1]])
         where = (images / view.name).as_posix() if images else f"{IMAGES}/{view.name}"
         frame = {"file_path": where, "transform_matrix": placed.tolist()}
-        frames.append(frame if shared else frame | _intrinsics(lens))
-    fisheye = bool(lenses) and lenses[0].fisheye
+        frames.append(frame if shared else frame | lens)
     record = {
-        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-        **(_intrinsics(lenses[0]) if shared else {}),
+        "camera_model": next(iter(kinds), "OPENCV"),
+        **(lenses[0] if shared else {}),
         "frames": frames,
         "applied_transform": APPLIED.tolist(),
         "ply_file_path": POINTS,

@@ -12,24 +12,13 @@ MAX_KEYPOINTS = 10_000_000
 """Keypoints of one image. A file that claims more is damaged."""
 
 
-class CameraRow(NamedTuple):
-    """A camera as it is in COLMAP's database."""
-
-    model: int
-    """COLMAP's number of the camera model."""
-    params: tuple[float, ...]
-    """In COLMAP's pixels. The focal length in x comes first."""
-    known: bool
-    """The focal length was known before mapping."""
-
-
 class Tables(NamedTuple):
     """Keypoints and matches of another tool's files."""
 
     sizes: dict[str, tuple[int, int]]
     """Image name -> (width, height), of the images whose size the file holds."""
-    cameras: dict[str, CameraRow]
-    """By image name; empty if the file has no cameras."""
+    focal_px: dict[str, float]
+    """By image name, the focal lengths in x that were known before mapping, original pixels."""
     keypoints: dict[str, np.ndarray]
     """float32 (n, 2): (x, y), original pixels, centre of the top-left pixel (0, 0)."""
     matches: dict[Pair, np.ndarray]
@@ -80,9 +69,3 @@ def checked_matches(
             )
     pair = make_pair(*names)
     return pair, (rows if pair == names else rows[:, ::-1]).astype(np.int32)
-
-
-def one_to_one(rows: np.ndarray) -> np.ndarray:
-    """Keep only matches (m, 2) that are the first of both their keypoints, as tracks need it."""
-    first0, first1 = (np.unique(column, return_index=True)[1] for column in rows.T)
-    return rows[np.intersect1d(first0, first1)]
