@@ -175,10 +175,10 @@ def shown_name(name: str) -> str:
     return name if name.isprintable() else name.encode("unicode_escape").decode()
 
 
-def named(names: Sequence[str], most: int = MOST_NAMED) -> str:
+def named(names: Sequence[str]) -> str:
     """The first names of a list for messages, and how many more there are."""
-    shown = ", ".join(shown_name(name) for name in names[:most])
-    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
+    shown = ", ".join(shown_name(name) for name in names[:MOST_NAMED])
+    return f"{shown} and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else shown
 
 
 def image_bytes(image: ImageFile) -> bytes:
