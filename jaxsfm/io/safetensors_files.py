@@ -14,8 +14,7 @@ import safetensors
 import safetensors.numpy
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json, write_atomic
-from jaxsfm.io.hashes import sha256_of
+from jaxsfm.io.atomic import Json, sha256_of, write_atomic
 
 Parameters = dict[str, dict[str, dict[str, np.ndarray]]]
 """The parameters of a network as flax has them: {'params': {layer: {part: float32 array}}}."""
