@@ -14,7 +14,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.orientation import UPRIGHT, quarters_between
 from jaxsfm.io.pairs import Pair, PairCounts
-from jaxsfm.io.saved_matches import SavedMatches
+from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.versions import versions
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
 from jaxsfm.report.lost_photos import explained
