@@ -101,7 +101,7 @@ def image_features(weights: Weights, image: ImageFile, *, config: Config) -> Ima
 def describe_pixels(
     weights: Weights, image: ImageFile, working: WorkingImage, *, config: Config
 ) -> ImageFeatures:
-    """The features of pixels that have been read (`jaxsfm.io.photo_views`).
+    """The features of pixels that have been read (`jaxsfm.io.photos`).
 
     Args:
       image: the photo that the pixels are from. Coordinates are mapped to the pixels of a photo of
