@@ -147,7 +147,7 @@ def match(
 
     from jaxsfm.io.atomic import atomic_file
     from jaxsfm.io.images import inspect_image, read_image
-    from jaxsfm.io.masked_images import with_mask
+    from jaxsfm.io.photo_folder import with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
     from jaxsfm.sfm.two_photos.matched import match_photos
