@@ -14,7 +14,7 @@ from jaxsfm.bench.model_options import (
 )
 from jaxsfm.bench.options import BenchOptions, WxbsOptions
 from jaxsfm.cli.run_commands import check_writable
-from jaxsfm.io.threads import limit_threads
+from jaxsfm.io.libraries import limit_threads
 
 Options = TypeVar("Options", bound=BenchOptions)
 Figures = TypeVar("Figures", bound=Mapping[str, object])

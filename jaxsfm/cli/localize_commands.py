@@ -5,7 +5,7 @@ from json import dumps
 from pathlib import Path
 
 from jaxsfm.cli.run_commands import Positional, check_writable
-from jaxsfm.io.threads import limit_threads
+from jaxsfm.io.libraries import limit_threads
 from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice
 
 

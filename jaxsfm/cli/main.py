@@ -29,8 +29,7 @@ from jaxsfm.cli.train_commands import train
 from jaxsfm.cli.weights_commands import weights, with_action
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.io.compiled_programs import keep_compiled
-from jaxsfm.io.versions import package_versions
+from jaxsfm.io.libraries import keep_compiled, package_versions
 
 BENCHMARKS = {
     "ledger": ledger,

@@ -6,7 +6,7 @@ from typing import Literal
 
 from jaxsfm.cli.run_commands import Positional
 from jaxsfm.cli.subcommands import named_options
-from jaxsfm.io.threads import limit_threads
+from jaxsfm.io.libraries import limit_threads
 from jaxsfm.options import check_threads
 
 

@@ -13,7 +13,7 @@ import tyro
 from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.subcommands import named_options
 from jaxsfm.errors import UserError
-from jaxsfm.io.threads import limit_threads
+from jaxsfm.io.libraries import limit_threads
 from jaxsfm.options import (
     EngineChoice,
     ExecutionChoice,

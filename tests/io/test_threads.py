@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from jaxsfm.cli.main import BENCHMARKS
-from jaxsfm.io.threads import READ_ONCE, limit_threads
+from jaxsfm.io.libraries import READ_ONCE, limit_threads
 
 CODE = """
 import os, sys, time
