@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.libraries import keep_compiled, package_versions
-from jaxsfm.matching.ray.cluster import connect, worker_resources, xla_threads
+from jaxsfm.matching.ray_cluster import connect, worker_resources, xla_threads
 
 if TYPE_CHECKING:
     from types import ModuleType
