@@ -25,8 +25,8 @@ from jaxsfm.io.masks import mask_path
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching import extraction, pair_matching
-from jaxsfm.matching.device_cache import ImageCache, tile_order
 from jaxsfm.matching.execution import Execution, select_devices
+from jaxsfm.matching.pair_matching import ImageCache, tile_order
 from jaxsfm.matching.ray_cluster import import_ray
 from jaxsfm.matching.ray_workers import Task, worker_pool
 from jaxsfm.options import EngineChoice
