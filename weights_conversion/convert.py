@@ -7,7 +7,7 @@ from typing import Literal
 
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
-from jaxsfm.io.hashes import sha256_of
+from jaxsfm.io.atomic import sha256_of
 from jaxsfm.io.weight_files import FORMAT, is_converted, save_weights
 from weights_conversion.keras_files import Kernels, read_keras
 from weights_conversion.matlab_files import read_matlab

@@ -8,9 +8,8 @@ from pathlib import Path, PurePosixPath
 import platformdirs
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.atomic import sha256_of, write_atomic
 from jaxsfm.io.download import download, progress_bar, unpack
-from jaxsfm.io.hashes import sha256_of
 
 _STRECHA = (
     "https://raw.githubusercontent.com/openMVG/SfM_quality_evaluation/"

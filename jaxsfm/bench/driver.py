@@ -26,9 +26,8 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
-from jaxsfm.io.saved_matches import SavedMatches
-from jaxsfm.io.store import Store
-from jaxsfm.matching.device_cache import tile_order
+from jaxsfm.io.store import SavedMatches, Store
+from jaxsfm.matching.pair_matching import tile_order
 from jaxsfm.matching.retrieval import partner_pairs
 from jaxsfm.sfm.view_graph import trusted_pairs
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsfm.bench.options import BenchOptions
 from jaxsfm.io.atomic import write_atomic
-from jaxsfm.io.versions import package_versions
+from jaxsfm.io.libraries import package_versions
 
 Row = TypeVar("Row")
 Summary = TypeVar("Summary")

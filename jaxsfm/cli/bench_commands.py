@@ -1,6 +1,7 @@
-"""The benchmarks' commands: `jaxsfm bench NAME`."""
+"""The commands `jaxsfm bench NAME` and `jaxsfm data`: benchmarks and their public data sets."""
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 import tyro
@@ -13,8 +14,9 @@ from jaxsfm.bench.model_options import (
     StrechaOptions,
 )
 from jaxsfm.bench.options import BenchOptions, WxbsOptions
-from jaxsfm.cli.run_commands import check_writable
-from jaxsfm.io.threads import limit_threads
+from jaxsfm.cli.run_commands import Positional, check_writable
+from jaxsfm.cli.subcommands import one_of
+from jaxsfm.io.libraries import limit_threads
 
 Options = TypeVar("Options", bound=BenchOptions)
 Figures = TypeVar("Figures", bound=Mapping[str, object])
@@ -119,3 +121,78 @@ def sequence(bench: Unnamed[SequenceOptions]) -> int:
     from jaxsfm.bench.sequence import bench_sequence, table_lines
 
     return _run(bench_sequence, table_lines, bench)
+
+
+BENCHMARKS = {
+    "ledger": ledger,
+    "strecha": strecha,
+    "daynight": daynight,
+    "ambiguous": ambiguous,
+    "sequence": sequence,
+    "wxbs": wxbs,
+}
+_Benchmark = one_of(BENCHMARKS)
+
+
+def bench(result: _Benchmark) -> int:  # pyright: ignore[reportInvalidTypeForm]
+    """Run a benchmark on a public data set."""
+    return result
+
+
+def list_all(*, to: Path | None = None) -> int:
+    """List the data sets with their sizes and terms, and say which of them have been fetched.
+
+    Args:
+      to: Folder of data sets. Without it, $JAXSFM_DATA; if that is not set, the user's data folder.
+    """
+    from jaxsfm.bench import datasets
+
+    for name, data_set in datasets.DATA_SETS.items():
+        here = "fetched" if datasets.is_complete(name, to) else "not fetched"
+        published = all(file.known_hash for file in data_set.files)
+        hashes = (
+            "hash published" if published else "no published hash; that of the download is kept"
+        )
+        print(f"{name:10s} {here}; {data_set.size}; for jaxsfm bench {data_set.bench}")
+        print(f"{'':10s} {data_set.title}")
+        print(f"{'':10s} {data_set.page}; terms: {data_set.terms}")
+        print(f"{'':10s} {hashes}")
+    print(f"folder     {to or datasets.data_folder()}")
+    return 0
+
+
+def fetch(name: Positional[str], *, to: Path | None = None) -> int:
+    """Download a data set. If a download is interrupted, the same command continues it.
+
+    For example
+        $ jaxsfm data fetch wxbs
+
+    Args:
+      name: Name of the data set (jaxsfm data list).
+      to: Folder of data sets. Without it, $JAXSFM_DATA; if that is not set, the user's data folder.
+    """
+    from jaxsfm.bench import datasets
+
+    print(datasets.fetch(name, to, progress=True))
+    return 0
+
+
+def path(name: Positional[str], *, to: Path | None = None) -> int:
+    """Print the folder of a data set. The benchmarks take it as --root.
+
+    Args:
+      name: Name of the data set (jaxsfm data list).
+      to: Folder of data sets. Without it, $JAXSFM_DATA; if that is not set, the user's data folder.
+    """
+    from jaxsfm.bench import datasets
+
+    print(datasets.path_of(name, to))
+    return 0
+
+
+_Data = one_of({"list": list_all, "fetch": fetch, "path": path})
+
+
+def data(result: _Data) -> int:  # pyright: ignore[reportInvalidTypeForm]
+    """List and download public data sets for the benchmarks."""
+    return result

@@ -8,45 +8,15 @@ import threading
 
 import tyro
 
-from jaxsfm.cli.bench_commands import (
-    ambiguous,
-    daynight,
-    ledger,
-    sequence,
-    strecha,
-    wxbs,
-)
-from jaxsfm.cli.data_commands import data
+from jaxsfm.cli.bench_commands import bench, data
 from jaxsfm.cli.export_commands import export
-from jaxsfm.cli.frames_command import frames
-from jaxsfm.cli.localize_commands import extend, localize
-from jaxsfm.cli.model_commands import merge, refine
-from jaxsfm.cli.pairs_command import pairs
-from jaxsfm.cli.result_commands import evaluate, report, view
-from jaxsfm.cli.run_commands import demo, match, reconstruct
-from jaxsfm.cli.subcommands import one_of, unwrapped
-from jaxsfm.cli.train_commands import train
-from jaxsfm.cli.weights_commands import weights, with_action
+from jaxsfm.cli.model_commands import evaluate, extend, localize, merge, refine, report, view
+from jaxsfm.cli.network_commands import train, weights, with_action
+from jaxsfm.cli.run_commands import demo, frames, match, pairs, reconstruct
+from jaxsfm.cli.subcommands import unwrapped
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.io.compiled_programs import keep_compiled
-from jaxsfm.io.versions import package_versions
-
-BENCHMARKS = {
-    "ledger": ledger,
-    "strecha": strecha,
-    "daynight": daynight,
-    "ambiguous": ambiguous,
-    "sequence": sequence,
-    "wxbs": wxbs,
-}
-_Benchmark = one_of(BENCHMARKS)
-
-
-def bench(result: _Benchmark) -> int:  # pyright: ignore[reportInvalidTypeForm]
-    """Run a benchmark on a public data set."""
-    return result
-
+from jaxsfm.io.libraries import keep_compiled, package_versions
 
 DESCRIPTION = """Structure-from-Motion from dense VGG-16 features with relocalization.
 

@@ -11,7 +11,8 @@ import os
 import sys
 from pathlib import Path
 
-from jaxsfm.cli.main import BENCHMARKS, COMMANDS, main
+from jaxsfm.cli.bench_commands import BENCHMARKS
+from jaxsfm.cli.main import COMMANDS, main
 
 COLUMNS = 100
 """Width of the help texts, in characters."""

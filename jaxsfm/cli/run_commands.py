@@ -1,4 +1,4 @@
-"""The commands `jaxsfm reconstruct`, `jaxsfm match` and `jaxsfm demo`.
+"""The commands that start from photos: reconstruct, frames, match, pairs and demo.
 
 Heavy modules are imported inside the commands, so that --help is quick.
 """
@@ -12,12 +12,14 @@ import tyro
 
 from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.subcommands import named_options
+from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
-from jaxsfm.io.threads import limit_threads
+from jaxsfm.io.libraries import limit_threads
 from jaxsfm.options import (
     EngineChoice,
     ExecutionChoice,
     ReconstructionChoice,
+    Retrieval,
     WeightsChoice,
     check_seed,
 )
@@ -147,7 +149,7 @@ def match(
 
     from jaxsfm.io.atomic import atomic_file
     from jaxsfm.io.images import inspect_image, read_image
-    from jaxsfm.io.masked_images import with_mask
+    from jaxsfm.io.photo_folder import with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
     from jaxsfm.sfm.two_photos.matched import match_photos
@@ -211,3 +213,94 @@ def demo(*, out: Path | None = None, seed: int = 0) -> int:
     lines, passed = run_demo(out, seed=seed)
     print("\n".join(lines))
     return 0 if passed else 1
+
+
+def frames(
+    video: Positional[Path],
+    *,
+    out: Path,
+    overlap: float = 0.8,
+    most: int | None = None,
+) -> int:
+    """Choose frames of a video: the sharpest one of each stretch of the camera's way.
+
+    For example
+        $ jaxsfm frames VIDEO.mp4 --out FRAMES
+        $ jaxsfm frames VIDEO.mp4 --out FRAMES --overlap 0.9 --most 200
+        $ jaxsfm reconstruct FRAMES --out OUT --pairs retrieval:20+sequential:6
+
+    Args:
+      video: The video file.
+      out: A new or empty folder for the frames. Their names have the number of the frame in the
+        video.
+      overlap: The part of its view that a chosen frame has in common with the one before it, from
+        0.2 to 0.98. More overlap gives more frames.
+      most: The largest number of frames. If there are more, frames at equal steps of the camera's
+        way are kept, with less overlap.
+    """
+    from jaxsfm.runs.video.frames import FrameOptions, frames_folder
+
+    found = frames_folder(video, out, FrameOptions(overlap=overlap, most=most), progress=True)
+    before = ", chosen before" if found.there else ""
+    print(
+        f"{len(found.names)} frames: {out} (neighbours have about {100 * found.common:.0f} % in "
+        f"common{before})"
+    )
+    return 0
+
+
+def pairs(
+    images: Positional[Path],
+    *,
+    out: Path,
+    pairs: str = "retrieval:20",
+    retrieval: Retrieval = "vlad",
+    backbone: BackboneName = "vgg16",
+    network: WeightsChoice,
+) -> int:
+    """Write the pairs that reconstruct would try to a file. reconstruct --pairs FILE reads it.
+
+    For example
+        $ jaxsfm pairs PHOTOS --out pairs.txt --pairs retrieval:20
+
+    Args:
+      images: Folder with the photos; sub-folders are included.
+      out: File.txt to write, with two image names on each line.
+      pairs: Which pairs are written. The values are those of --pairs in jaxsfm reconstruct --help.
+      retrieval: How a photo is described by one vector for retrieval:K. netvlad needs NetVLAD's
+        weights, given with --weights.
+      backbone: The network that describes the photos.
+    """
+    check_writable(out, "--out", (".txt",))
+    from tqdm import tqdm
+
+    from jaxsfm.io.atomic import write_atomic
+    from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
+    from jaxsfm.io.weights import chosen_weights
+    from jaxsfm.matching.pipeline import open_images
+    from jaxsfm.matching.retrieval import describe_photos, partner_pairs
+
+    usable, skipped = open_images(images, progress=True)
+    names = [image.name for image in usable]
+    selection = parse_pair_selection(chosen_pairs(pairs, len(names)))
+    if len(names) < 2:
+        raise UserError(f"{images}: {len(names)} usable images, at least 2 are needed")
+    found = set(selected_pairs(selection, names, [*names, *skipped]))
+    if selection.retrieval:
+        weights = chosen_weights(network, backbone)
+        with tqdm(total=len(usable), desc="retrieval", unit="image") as bar:
+            alone = describe_photos(weights, usable, kind=retrieval, on_image=bar.update)
+        found.update(partner_pairs(alone.vectors, selection.retrieval))
+        skipped |= {image.name: str(error) for image, error in alone.lost}
+        found = {pair for pair in found if not skipped.keys() & set(pair)}
+    for why in skipped.values():
+        print(f"skipped          {why}")
+    if not found:
+        raise UserError(f"{images}: there are no pairs to try")
+    for name in sorted({name for pair in found for name in pair}):
+        if name != name.strip() or name.startswith("#") or "\t" in name or "\n" in name:
+            raise UserError(f"--out {out}: {name!r} cannot be written in such a file; rename it")
+    lines = (f"{a}\t{b}\n" if " " in a + b else f"{a} {b}\n" for a, b in sorted(found))
+    write_atomic(out, "".join(lines).encode())
+    print(f"{len(found)} pairs of {len(names)} photos: {out}")
+    return 0

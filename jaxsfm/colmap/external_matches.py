@@ -13,8 +13,7 @@ from jaxsfm.colmap.formats.tables import Tables
 from jaxsfm.colmap.intrinsics import Intrinsics, KnownCameras, camera_of
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
-from jaxsfm.io.hashes import sha256_of
+from jaxsfm.io.atomic import Json, sha256_of
 from jaxsfm.io.images import ImageFile, shown_name
 from jaxsfm.io.pairs import LazyMatches, Pair, PairCounts, PairResult, united
 

@@ -1,12 +1,15 @@
 """Files and folders are written whole or not at all, even if the process is killed.
 
-Every result that jaxsfm writes goes through this module.
+Every result that jaxsfm writes goes through this module. Locks keep two processes from writing the
+same files, and digests say what is in them.
 """
 
 import contextlib
+import hashlib
 import json
 import os
 import shutil
+import sqlite3
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +17,7 @@ from typing import BinaryIO, TypeAlias
 
 import numpy as np
 import safetensors.numpy
+from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike
 
 from jaxsfm.errors import UserError, writing
@@ -136,3 +140,56 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         raise
     shutil.rmtree(path, ignore_errors=True)
     partial.rename(path)
+
+
+@contextlib.contextmanager
+def only_process(lock: Path, in_use: str) -> Iterator[None]:
+    """Hold a lock while the block runs.
+
+    The operating system holds it for its process, so it vanishes with the process, even if that is
+    killed.
+
+    Args:
+      lock: the file that is locked; it is made if it is missing. Its folder must exist.
+      in_use: what to tell the user if another process holds the lock.
+
+    Raises:
+      UserError: another process holds the lock. This is not waited for.
+      OSError: the file cannot be written, or its file system has no locks.
+    """
+    # On a file system without locks, filelock would write a file that a killed process leaves.
+    held = FileLock(lock, fallback_to_soft=False)
+    try:
+        held.acquire(blocking=False)
+    except Timeout as error:
+        raise UserError(in_use) from error
+    try:
+        yield
+    finally:
+        held.release()
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file's content, hexadecimal; the file is read in parts."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def rows_sha256(database: Path) -> str:
+    """The SHA-256 of every row of every table of an SQLite database, hexadecimal.
+
+    The file's own hash is of no use: COLMAP writes into a database's header whenever it opens it.
+
+    Raises:
+      sqlite3.DatabaseError: the database is damaged.
+    """
+    digest = hashlib.sha256()
+    uri = f"{database.absolute().as_uri()}?mode=ro&immutable=1"
+    with contextlib.closing(sqlite3.connect(uri, uri=True)) as db:
+        query = "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
+        for (table,) in db.execute(query).fetchall():
+            for row in db.execute(f'SELECT * FROM "{table}" ORDER BY rowid'):
+                for value in (table, *row):
+                    data = value if isinstance(value, bytes) else repr(value).encode()
+                    digest.update(b"%d:" % len(data) + data)
+    return digest.hexdigest()

@@ -1,13 +1,14 @@
 """The headers and pixels of photos in any format, from the bytes of their files.
 
 OpenCV decodes most formats. HEIC, AVIF and camera RAW are read by other packages, which the extra
-`formats` installs. This module knows which package reads what; `jaxsfm.io.images` checks the files
-and reports what is wrong with them.
+`formats` installs. This module knows which package reads what, and what EXIF says of the camera;
+`jaxsfm.io.images` checks the files and reports what is wrong with them.
 """
 
 import contextlib
 import io
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
@@ -49,6 +50,10 @@ SIDEWAYS = 4
 """The bit of LibRaw's `flip` that says that width and height change places."""
 TIFF = (b"II*\0", b"MM\0*")
 """How TIFF files begin."""
+_CAMERA = ("Make", "Model", "BodySerialNumber", "LensModel", "FocalLength", "DigitalZoomRatio")
+"""The tags that tell cameras apart."""
+_SCAN_END = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
+"""The first marker after the entropy-coded data of a JPEG scan."""
 _HOW = "pip install 'jaxsfm[formats]'"
 
 
@@ -194,3 +199,52 @@ def _raw_exif(data: bytes, raw: "rawpy.RawPy") -> Image.Exif:
                 exif.get_ifd(ExifTags.IFD.Exif)  # read now, while the preview is open
     exif.pop(ExifTags.Base.Orientation, None)
     return exif
+
+
+def exif_of(header: Header) -> dict[int, object]:
+    """The EXIF data of a photo; empty if there is none or it is damaged.
+
+    OpenCV turns a TIFF file upright when it decodes it, and Pillow gives its upright size. So its
+    orientation is left out.
+    """
+    try:
+        exif = header.getexif()
+        found = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:  # Pillow's readers can raise almost anything
+        return {}
+    if getattr(header, "format", None) == "TIFF":
+        found.pop(ExifTags.Base.Orientation, None)
+    return found
+
+
+def taken_with(exif: Mapping[int, object]) -> str:
+    """What EXIF says of the camera (`ImageFile.taken_with`)."""
+    if not exif.get(ExifTags.Base.Model):
+        return ""
+    values = (exif.get(ExifTags.Base[tag], "") for tag in _CAMERA)
+    return ", ".join(text for value in values if (text := str(value).strip("\0 ")))
+
+
+def jpeg_is_complete(data: bytes) -> bool:
+    """Whether the end marker follows the last scan; bytes that a camera appends are ignored.
+
+    Source: ITU-T T.81, B.1. Segments carry their length. Entropy-coded data ends at the next marker
+    that is neither a stuffed zero nor a restart.
+    """
+    position = 2
+    while position + 4 <= len(data):
+        if data[position] != 0xFF:
+            return False
+        marker = data[position + 1]
+        if marker == 0xD9:
+            return True
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD8:
+            position += 1 if marker == 0xFF else 2
+            continue
+        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+        if marker == 0xDA:
+            end = _SCAN_END.search(data, position)
+            if end is None:
+                return False
+            position = end.start()
+    return data[position : position + 2] == b"\xff\xd9"

@@ -20,7 +20,7 @@ import requests
 from tqdm import tqdm
 
 from jaxsfm.errors import UserError, writing
-from jaxsfm.io.locks import only_process
+from jaxsfm.io.atomic import only_process
 
 CHUNK = 1 << 16
 TIMEOUT = (10, 60)

@@ -20,12 +20,7 @@ from PIL import ExifTags
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 from jaxsfm.io import decoders, orientation
-from jaxsfm.io.image_headers import exif_of, jpeg_is_complete, taken_with
-from jaxsfm.io.masks import (
-    MaskFile,
-    read_mask,
-    without_blank_border,
-)
+from jaxsfm.io.masks import MaskFile, read_mask, without_blank_border
 
 logger = logging.getLogger(__name__)
 
@@ -147,7 +142,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
             warnings.simplefilter("ignore")  # about odd metadata; only the size is needed
             # Pillow is not given the path: reading from a file, it allocates what the header says.
             with decoders.open_header(data, path.suffix) as header:
-                size, exif = header.size, exif_of(header)
+                size, exif = header.size, decoders.exif_of(header)
     except decoders.MissingReader as error:
         raise ImageError(f"{shown}: {error}") from error
     except Exception as error:  # Pillow's readers can raise almost anything
@@ -157,7 +152,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
             f"{shown}: {size[0]} x {size[1]} pixels is too small (at least {MIN_SIDE} per side)"
         )
     # Decoders would fill the missing part of a JPEG with grey and not say so.
-    if data[:2] == b"\xff\xd8" and not jpeg_is_complete(data):
+    if data[:2] == b"\xff\xd8" and not decoders.jpeg_is_complete(data):
         raise ImageError(f"{shown}: the file is truncated")
     digest = hashlib.sha256(data).hexdigest()
     return ImageFile(
@@ -166,7 +161,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
         size=size,
         sha256=digest,
         orientation=orientation.checked(exif.get(ExifTags.Base.Orientation)),
-        taken_with=taken_with(exif),
+        taken_with=decoders.taken_with(exif),
     )
 
 
@@ -175,10 +170,10 @@ def shown_name(name: str) -> str:
     return name if name.isprintable() else name.encode("unicode_escape").decode()
 
 
-def named(names: Sequence[str], most: int = MOST_NAMED) -> str:
+def named(names: Sequence[str]) -> str:
     """The first names of a list for messages, and how many more there are."""
-    shown = ", ".join(shown_name(name) for name in names[:most])
-    return f"{shown} and {len(names) - most} more" if len(names) > most else shown
+    shown = ", ".join(shown_name(name) for name in names[:MOST_NAMED])
+    return f"{shown} and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else shown
 
 
 def image_bytes(image: ImageFile) -> bytes:

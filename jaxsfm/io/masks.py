@@ -6,7 +6,6 @@ and the mask of the photo `sub/a.jpg` is the file `sub/a.jpg.png` in the folder 
 
 import dataclasses
 import hashlib
-from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -98,21 +97,3 @@ def used_cells(used: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
     height, width = used.shape
     x, y = np.rint(keypoints).astype(int).T
     return used[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
-
-
-def missing_masks(folder: Path, names: Iterable[str]) -> list[str]:
-    """The photos without a mask, of which all pixels are used.
-
-    Raises:
-      UserError: there is no such folder, or it has no mask of any photo.
-    """
-    names = list(names)
-    if not folder.is_dir():
-        raise UserError(f"--masks {folder}: no such folder")
-    missing = [name for name in names if not mask_path(folder, name).is_file()]
-    if len(missing) == len(names):
-        raise UserError(
-            f"--masks {folder}: no mask of any photo (the mask of {names[0]} would be "
-            f"{mask_path(Path(), names[0])})"
-        )
-    return missing

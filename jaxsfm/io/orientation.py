@@ -15,8 +15,6 @@ UPRIGHT = 1
 CODES = range(1, 9)
 QUARTERS = (1, 6, 3, 8)
 """The code of a photo that is seen upright after 0, 1, 2, 3 quarter turns clockwise."""
-_UNDONE_BY = {6: 8, 8: 6}
-"""Quarter turns are undone by each other; half turns and mirrors undo themselves."""
 _TRANSPOSED, _MIRRORED_X, _MIRRORED_Y = {5, 6, 7, 8}, {2, 3, 7, 8}, {3, 4, 6, 7}
 
 

@@ -1,12 +1,15 @@
-"""The image files in a folder."""
+"""The image files in a folder, and their masks in another one."""
 
+import dataclasses
 import logging
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from jaxsfm.errors import UserError
 from jaxsfm.io import decoders
-from jaxsfm.io.images import named
+from jaxsfm.io.images import ImageFile, named
+from jaxsfm.io.masks import mask_path, open_mask
 
 logger = logging.getLogger(__name__)
 
@@ -61,3 +64,39 @@ def _without_doubles(names: list[str]) -> list[str]:
     if doubles:
         logger.info("left out, as the same photo is there in another format: %s", named(doubles))
     return sorted({*names} - {*doubles})
+
+
+def masks_of(images: Iterable[ImageFile]) -> dict[str, str]:
+    """The SHA-256 of the images' masks, by the names of the images."""
+    return {image.name: image.mask.sha256 for image in images if image.mask is not None}
+
+
+def with_masks(images: Iterable[ImageFile], folder: Path) -> tuple[list[ImageFile], list[str]]:
+    """The images with their masks, and the names of those that have none.
+
+    Of a photo without a mask, all pixels but a blank border are used.
+
+    Raises:
+      UserError: there is no such folder, it has no mask of any image, or a mask cannot be used.
+    """
+    images = list(images)
+    if not folder.is_dir():
+        raise UserError(f"--masks {folder}: no such folder")
+    bare = [image.name for image in images if not mask_path(folder, image.name).is_file()]
+    if len(bare) == len(images):
+        raise UserError(
+            f"--masks {folder}: no mask of any photo (the mask of {bare[0]} would be "
+            f"{mask_path(Path(), bare[0])})"
+        )
+    lacking = set(bare)
+    masked = [
+        image if image.name in lacking else with_mask(image, mask_path(folder, image.name))
+        for image in images
+    ]
+    return masked, bare
+
+
+def with_mask(image: ImageFile, path: Path | None) -> ImageFile:
+    """The image with the mask at a path, if there is one; UserError if it cannot be used."""
+    mask = None if path is None else open_mask(path, image.size)
+    return dataclasses.replace(image, mask=mask)

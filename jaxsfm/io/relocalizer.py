@@ -15,7 +15,7 @@ import numpy as np
 from jaxsfm.core.scores import PLACES, WALKED, Head
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.safetensors_files import Parameters, TensorFile, open_tensors, save_tensors
+from jaxsfm.io.weight_files import Parameters, TensorFile, open_tensors, save_tensors
 
 FORMAT = "jaxsfm relocalizer 1"
 SHIPPED = "relocalizer.safetensors"

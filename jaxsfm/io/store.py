@@ -7,7 +7,7 @@ does not depend on the change, and it never takes a file for something else.
 import hashlib
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +15,12 @@ from jaxtyping import Array
 
 from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
+from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, read_json, save_arrays, write_atomic
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import DamagedImage, ImageError, ImageFile, content
 from jaxsfm.io.orientation import checked
-from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.pairs import LazyMatches, Pair, PairResult, describe
 
 Identity = Mapping[str, Json]
 """What the matches of a run depend on: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
@@ -194,6 +195,26 @@ class Store:
         except (KeyError, ValueError, TypeError):
             return None
         return result if _are_matches(result) else None
+
+
+class SavedMatches(LazyMatches):
+    """The matches of pairs, read from their files when they are asked for.
+
+    Reading raises UserError if a file is missing or damaged.
+    """
+
+    def __init__(self, store: Store, pairs: Iterable[Pair]) -> None:
+        super().__init__(pairs)
+        self._store = store
+
+    def _load(self, pair: Pair) -> PairResult:
+        found = self._store.load_matches(pair)
+        if found is None:
+            raise UserError(
+                f"--out {self._store.path}: matches of {describe(pair)} are missing or "
+                "damaged, so run the same command again"
+            )
+        return found
 
 
 def _text(value: Json) -> str | None:

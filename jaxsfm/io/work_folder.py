@@ -1,20 +1,29 @@
 """The work folder of a run: its lock, the record of what it is a run of, its stages, its results.
 
-Commands that reconstruct or extend open it here; only one process at a time can.
+Commands that reconstruct or extend open it here; only one process at a time can. A stage is
+computed once, and its files are kept under a key made of all that they depend on.
 """
 
 import contextlib
 import json
 import logging
 import shutil
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from jaxsfm.errors import UserError, writing
-from jaxsfm.io.atomic import PARTIAL, Json, read_json, write_atomic
-from jaxsfm.io.kept_folders import forget, is_kept, keep
-from jaxsfm.io.locks import only_process
-from jaxsfm.io.store import FAILED, Identity, Store
+from jaxsfm.io.atomic import (
+    PARTIAL,
+    Json,
+    atomic_folder,
+    only_process,
+    read_json,
+    rows_sha256,
+    sha256_of,
+    write_atomic,
+)
+from jaxsfm.io.store import FAILED, Identity, Store, digest
 
 logger = logging.getLogger(__name__)
 
@@ -27,7 +36,7 @@ FRAMES_RECORD = "frames.json"
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")
-_MOVES, _LOCK = "moves.json", ".lock"
+_MOVES, _LOCK, _KEY = "moves.json", ".lock", "key"
 
 
 class WorkFolder(Store):
@@ -40,18 +49,21 @@ class WorkFolder(Store):
 
         Args:
           key: identifies everything that the stage depends on.
-          compute: runs the stage and writes its files into the given folder.
+          compute: runs the stage and writes its files into the given folder. They appear together,
+            and replace those that were there.
         """
         folder = self._stage_folder(name)
-        if is_kept(folder, key):
+        if _is_kept(folder, key):
             logger.info("%s: as before, nothing it depends on has changed", name)
-        else:
-            keep(folder, key, compute)
+            return folder
+        with atomic_folder(folder) as fresh:
+            compute(fresh)
+            (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
         return folder
 
     def forget_stage(self, name: str) -> None:
         """Make the next run compute a stage again."""
-        forget(self._stage_folder(name))
+        (self._stage_folder(name) / _KEY).unlink(missing_ok=True)
 
     def _stage_folder(self, name: str) -> Path:
         return self.path / "stages" / name
@@ -108,6 +120,30 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+def _is_kept(folder: Path, key: str) -> bool:
+    """Whether the files of a folder are whole and were made with this key."""
+    try:
+        found = (folder / _KEY).read_text(encoding="ascii")
+        return found == f"{key} {_content(folder)}"
+    except (OSError, ValueError):
+        return False
+
+
+def _content(folder: Path) -> str:
+    """A digest of the files; it shows files that a power failure tore."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and p != folder / _KEY)
+    return digest([[p.relative_to(folder).as_posix(), _hash(p)] for p in files])
+
+
+def _hash(file: Path) -> str:
+    if file.suffix != ".db":
+        return sha256_of(file)
+    try:
+        return rows_sha256(file)
+    except sqlite3.DatabaseError as error:
+        return f"damaged: {error}"
 
 
 _OPTIONS = {

@@ -16,7 +16,6 @@ from jaxsfm.config import Config
 from jaxsfm.core.features import Extraction, Walk
 from jaxsfm.core.sharded import extract_batch
 from jaxsfm.core.types import DenseFeatures
-from jaxsfm.io.compiled_programs import announce_compilation
 from jaxsfm.io.features import (
     ImageFeatures,
     check_memory,
@@ -25,6 +24,7 @@ from jaxsfm.io.features import (
     without_unused,
 )
 from jaxsfm.io.images import ImageError, ImageFile, WorkingImage, read_image, working_size
+from jaxsfm.io.libraries import announce_compilation
 from jaxsfm.io.traced_programs import Traced
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.execution import (
@@ -101,7 +101,7 @@ def image_features(weights: Weights, image: ImageFile, *, config: Config) -> Ima
 def describe_pixels(
     weights: Weights, image: ImageFile, working: WorkingImage, *, config: Config
 ) -> ImageFeatures:
-    """The features of pixels that have been read (`jaxsfm.io.photo_views`).
+    """The features of pixels that have been read (`jaxsfm.io.photos`).
 
     Args:
       image: the photo that the pixels are from. Coordinates are mapped to the pixels of a photo of

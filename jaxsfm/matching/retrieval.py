@@ -111,9 +111,7 @@ def describe_photos(
     )
 
 
-def partner_pairs(
-    vectors: Mapping[str, np.ndarray], k: int, *, candidates: int | None = None
-) -> list[Pair]:
+def partner_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
     """Pairs of each name with `k` partners, each pair once, in order of names.
 
     Partners are similar to it, and differ from each other (`jaxsfm.core.partners`). With fewer than
@@ -121,11 +119,9 @@ def partner_pairs(
 
     Args:
       vectors: global descriptors of unit length, float32 (c,).
-      candidates: the most similar ones, of which partners are chosen; `CANDIDATES` times k if None.
-        With k candidates, partners are the most similar ones.
 
     Raises:
-      ValueError: k is less than 1, or there are fewer candidates than partners.
+      ValueError: k is less than 1.
     """
     if k < 1:
         raise ValueError(f"k must be at least 1; got {k}")
@@ -134,8 +130,5 @@ def partner_pairs(
         return []
     table = jnp.asarray(np.stack([vectors[name] for name in names]))
     few = min(k, len(names) - 1)
-    among = CANDIDATES * k if candidates is None else candidates
-    if among < k:
-        raise ValueError(f"candidates must be at least k = {k}; got {among}")
-    rows = np.asarray(_partners(table, k=few, candidates=among))
+    rows = np.asarray(_partners(table, k=few, candidates=CANDIDATES * k))
     return sorted({make_pair(names[i], names[j]) for i, row in enumerate(rows) for j in row})

@@ -22,8 +22,8 @@ from jaxsfm.io.images import (
     read_image,
     size_and_scale,
 )
-from jaxsfm.io.masked_images import with_mask
 from jaxsfm.io.masks import MaskFile, mask_path
+from jaxsfm.io.photo_folder import with_mask
 from jaxsfm.io.store import Store
 from jaxsfm.io.work_folder import RECORD
 from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity

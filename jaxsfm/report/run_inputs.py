@@ -6,7 +6,7 @@ from dataclasses import field
 from typing import Annotated, TypeVar
 
 from jaxsfm.io.images import ImageFile, orientations
-from jaxsfm.io.masked_images import masks_of
+from jaxsfm.io.photo_folder import masks_of
 from jaxsfm.report.typed_json import OMITTED, OTHERS, Count, Range
 
 T = TypeVar("T")

@@ -12,10 +12,10 @@ from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
+from jaxsfm.io.libraries import versions
 from jaxsfm.io.orientation import UPRIGHT, quarters_between
 from jaxsfm.io.pairs import Pair, PairCounts
-from jaxsfm.io.saved_matches import SavedMatches
-from jaxsfm.io.versions import versions
+from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
 from jaxsfm.report.lost_photos import explained
 from jaxsfm.report.run_inputs import (

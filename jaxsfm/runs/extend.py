@@ -14,10 +14,10 @@ from pathlib import Path
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.libraries import versions
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
-from jaxsfm.io.saved_matches import SavedMatches
-from jaxsfm.io.versions import versions
+from jaxsfm.io.store import SavedMatches
 from jaxsfm.io.work_folder import RECORD, lock_folder, open_locked_folder
 from jaxsfm.matching.engines import Engine, chosen_engine
 from jaxsfm.matching.pipeline import open_images

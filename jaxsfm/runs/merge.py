@@ -8,7 +8,7 @@ from jaxsfm.colmap.given_model import ModelFigures, figures_of, looks_calibrated
 from jaxsfm.colmap.updated_model import has_rigs
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import named
-from jaxsfm.io.versions import versions
+from jaxsfm.io.libraries import versions
 from jaxsfm.options import check_threads
 from jaxsfm.runs.refine import check_new_folder, write_new_folder
 from jaxsfm.sfm.merged_models import merge_models

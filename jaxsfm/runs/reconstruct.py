@@ -17,9 +17,9 @@ from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile, named, orientations
-from jaxsfm.io.masked_images import masks_of, with_masks
 from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
+from jaxsfm.io.photo_folder import masks_of, with_masks
 from jaxsfm.io.store import FAILED
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import open_folder

@@ -18,7 +18,7 @@ from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import SPARE_BYTES, atomic_folder, check_disk_space
 from jaxsfm.io.images import shown_name
-from jaxsfm.io.versions import versions
+from jaxsfm.io.libraries import versions
 from jaxsfm.options import check_threads
 from jaxsfm.sfm.given_refinement import GivenRefinement, refine_given
 from jaxsfm.sfm.model_photos import ModelPhotos

@@ -16,8 +16,7 @@ from jaxsfm.colmap.pose_priors import write_pose_priors
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair
-from jaxsfm.io.saved_matches import SavedMatches
-from jaxsfm.io.store import digest
+from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.runs.matching_looks import MatchedPairs, timed
 from jaxsfm.runs.run_options import RunOptions

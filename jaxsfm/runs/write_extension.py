@@ -10,7 +10,7 @@ from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.io.photos import Photos
-from jaxsfm.io.saved_matches import SavedMatches
+from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.runs.build_report import NewPhotos, extended_report

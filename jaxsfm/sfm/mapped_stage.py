@@ -17,10 +17,10 @@ from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile
+from jaxsfm.io.libraries import package_versions
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
-from jaxsfm.io.versions import package_versions
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.check.check_files import read_outcomes, write_outcomes

@@ -15,8 +15,8 @@ from jaxsfm.bench.datasets import DATA_SETS, DataSet, RemoteFile
 from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io import download as downloads
+from jaxsfm.io.atomic import only_process
 from jaxsfm.io.download import download
-from jaxsfm.io.locks import only_process
 
 
 def sha(content):

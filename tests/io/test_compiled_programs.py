@@ -8,12 +8,12 @@ import zlib
 import pytest
 
 from jaxsfm.cli.main import main
-from jaxsfm.io.compiled_programs import announce_compilation, drop_cut_short
+from jaxsfm.io.libraries import announce_compilation, drop_cut_short
 
 OPTION = "jax_compilation_cache_dir"
 CODE = f"""
 import sys
-from jaxsfm.io.compiled_programs import keep_compiled
+from jaxsfm.io.libraries import keep_compiled
 assert "jax" not in sys.modules, "JAX was imported before its options were set"
 keep_compiled()
 import jax

@@ -10,14 +10,14 @@ import pytest
 from local_server import CONTENT, url
 
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import only_process
 from jaxsfm.io.download import download
-from jaxsfm.io.locks import only_process
 from jaxsfm.io.work_folder import lock_folder
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from jaxsfm.io.locks import only_process
+from jaxsfm.io.atomic import only_process
 with only_process(Path(sys.argv[1]), "in use"):
     print("held", flush=True)
     time.sleep(600)

@@ -15,8 +15,8 @@ from jaxsfm.io.images import (
     inspect_image,
     read_image,
 )
-from jaxsfm.io.masked_images import masks_of, with_mask, with_masks
 from jaxsfm.io.masks import BLANK, mask_path, without_blank_border
+from jaxsfm.io.photo_folder import masks_of, with_mask, with_masks
 from jaxsfm.io.photos import intensities
 
 SIZE = (90, 60)

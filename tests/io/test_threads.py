@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from jaxsfm.cli.main import BENCHMARKS
-from jaxsfm.io.threads import READ_ONCE, limit_threads
+from jaxsfm.cli.bench_commands import BENCHMARKS
+from jaxsfm.io.libraries import READ_ONCE, limit_threads
 
 CODE = """
 import os, sys, time

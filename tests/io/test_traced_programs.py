@@ -12,7 +12,7 @@ from core_calls import calls
 import jaxsfm.core
 from jaxsfm.io import traced_programs
 from jaxsfm.io.traced_programs import FOLDER, Traced, code_of_core
-from jaxsfm.matching import device_cache, extraction, pair_matching
+from jaxsfm.matching import extraction, pair_matching
 from jaxsfm.sfm.refine import patch_alignment
 
 
@@ -174,7 +174,7 @@ KEPT = {
     "align.make_templates": patch_alignment._make_templates,
     "align.align": patch_alignment._align,
     "sharded.extract_batch": extraction._extract,
-    "sharded.join_everywhere": device_cache._join,
+    "sharded.join_everywhere": pair_matching._join,
     "sharded.match_batch": pair_matching._match,
 }
 """The functions whose programs are kept."""

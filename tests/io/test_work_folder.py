@@ -10,8 +10,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import DamagedImage, ImageFile
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.io.saved_matches import SavedMatches
-from jaxsfm.io.store import Store
+from jaxsfm.io.store import SavedMatches, Store
 
 PAIRS = [("a.jpg", "b.jpg"), ("a b", "c"), ("a", "b c"), ("new\nline", "日本"), ("x", "\udcff")]
 CONFIG = {"octaves": 2, "threshold_px": 10.0}

@@ -26,11 +26,10 @@ from jaxsfm.core.sharded import device_mesh, join_everywhere
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import feature_capacity, image_capacity
 from jaxsfm.io.images import ImageError, read_image
-from jaxsfm.matching import device_cache, execution
-from jaxsfm.matching.device_cache import ImageCache, tile_order
+from jaxsfm.matching import execution, pair_matching
 from jaxsfm.matching.execution import Execution
 from jaxsfm.matching.extraction import extract_images, image_features
-from jaxsfm.matching.pair_matching import match_features
+from jaxsfm.matching.pair_matching import ImageCache, match_features, tile_order
 
 FIELDS = ("cells", "keypoints0", "keypoints1", "plane", "homographies", "num_tentative")
 MESH = device_mesh(jax.local_devices()[:1])
@@ -340,7 +339,7 @@ def test_matches_are_computed_from_descriptors_of_the_type_that_the_config_says(
         seen.append(found)
         return found
 
-    monkeypatch.setattr(device_cache, "_join", noted)
+    monkeypatch.setattr(pair_matching, "_join", noted)
     bare = [
         each._replace(
             dense=each.dense._replace(coarse=each.dense.coarse[:1], fine=each.dense.fine[:1])

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 import pytest
 
 from jaxsfm.errors import UserError
-from jaxsfm.matching.ray.cluster import connect, share_cpus
+from jaxsfm.matching.ray_cluster import connect, share_cpus
 
 # Not importorskip: it would import Ray before we have told it to be quiet.
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")

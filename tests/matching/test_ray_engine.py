@@ -21,9 +21,9 @@ from jaxsfm import preset
 from jaxsfm.cli.main import main
 from jaxsfm.io.pairs import exhaustive_pairs
 from jaxsfm.io.store import Store
-from jaxsfm.matching.ray import engine
-from jaxsfm.matching.ray.engine import CACHED_IMAGES, TILE, RayEngine, pair_blocks
-from jaxsfm.matching.ray.workers import TASKS_PER_WORKER
+from jaxsfm.matching import engines
+from jaxsfm.matching.engines import CACHED_IMAGES, TILE, RayEngine, pair_blocks
+from jaxsfm.matching.ray_workers import TASKS_PER_WORKER
 
 # Not importorskip: it would import Ray before we have told it to be quiet.
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
@@ -128,7 +128,7 @@ class OtherPool:
 @pytest.mark.parametrize("images", [20, 100, 200])
 def test_features_held_do_not_grow_with_the_pairs(images, monkeypatch):
     pool = OtherPool()
-    monkeypatch.setattr(engine, "worker_pool", lambda *_, **__: contextlib.nullcontext(pool))
+    monkeypatch.setattr(engines, "worker_pool", lambda *_, **__: contextlib.nullcontext(pool))
     pairs = exhaustive_pairs(f"{k:03}" for k in range(images))
     loads = []
 

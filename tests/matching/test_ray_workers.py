@@ -14,9 +14,9 @@ import pytest
 from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.matching.ray import workers
-from jaxsfm.matching.ray.cluster import connect, xla_threads
-from jaxsfm.matching.ray.workers import MAX_LOSSES, TASKS_PER_WORKER, Task, worker_pool
+from jaxsfm.matching import ray_workers
+from jaxsfm.matching.ray_cluster import connect, xla_threads
+from jaxsfm.matching.ray_workers import MAX_LOSSES, TASKS_PER_WORKER, Task, worker_pool
 
 # Not importorskip: it would import Ray before we have told it to be quiet.
 pytestmark = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is not installed")
@@ -158,8 +158,8 @@ def test_what_has_come_is_handed_out_before_an_interrupt(cluster):
 
 @pytest.mark.slow
 def test_workers_with_other_packages_are_refused(cluster, monkeypatch):
-    ours = workers.package_versions() | {"jaxsfm": "9.9"}
-    monkeypatch.setattr(workers, "package_versions", lambda: ours)
+    ours = ray_workers.package_versions() | {"jaxsfm": "9.9"}
+    monkeypatch.setattr(ray_workers, "package_versions", lambda: ours)
     with pytest.raises(UserError, match=r"worker has jaxsfm \d.*, this process 9\.9: install"):
         results(echo)
 

@@ -6,11 +6,13 @@ import shutil
 from pathlib import Path
 
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsfm
 from jaxsfm.cli.main import main
+from jaxsfm.core.partners import partners
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pair_selection import sequential_pairs
@@ -92,12 +94,11 @@ def test_partners_are_chosen_of_more_photos_than_the_most_similar_ones():
             x = np.asarray([np.cos(a), np.sin(a), light], np.float32)
             vectors[f"{k} {i:02d}"] = x / np.linalg.norm(x)
 
-    def joined(**options) -> bool:
-        return any(a[0] != b[0] for a, b in partner_pairs(vectors, 4, **options))
-
-    assert joined() and not joined(candidates=4)
-    with pytest.raises(ValueError, match="at least k = 4; got 3"):
-        partner_pairs(vectors, 4, candidates=3)
+    table = jnp.asarray(np.stack([*vectors.values()]))
+    most_similar = np.asarray(partners(table, k=4, candidates=4))
+    first, second = most_similar[: len(way)], most_similar[len(way) :]
+    assert (first < len(way)).all() and (second >= len(way)).all()
+    assert any(a[0] != b[0] for a, b in partner_pairs(vectors, 4))
 
 
 @pytest.mark.slow

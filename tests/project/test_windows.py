@@ -221,7 +221,7 @@ from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io.download import download
 from jaxsfm.io.features import total_memory
-from jaxsfm.io.threads import usable_cores
+from jaxsfm.io.libraries import usable_cores
 from jaxsfm.io.work_folder import lock_folder, open_folder
 
 assert total_memory() > 1e8 and usable_cores() >= 1

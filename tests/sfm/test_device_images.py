@@ -9,7 +9,7 @@ from room_scene import Room, exact_model, images_of, read_of
 
 from jaxsfm.config import Refinement
 from jaxsfm.core import align
-from jaxsfm.matching.device_cache import ImageCache
+from jaxsfm.matching.pair_matching import ImageCache
 from jaxsfm.sfm.refine import padding, patch_alignment, track_alignment
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.device_templates import DeviceTemplates

@@ -18,7 +18,7 @@ from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageFile, inspect_image, read_image
 from jaxsfm.io.orientation import CODES, to_stored
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.io.photo_views import PhotoView, read_view
+from jaxsfm.io.photos import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
 from jaxsfm.sfm.two_photos import evidence, matched, pair_looks, plane_looks, scale_search

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
 
-from jaxsfm.io.threads import usable_cores
+from jaxsfm.io.libraries import usable_cores
 
 # Set before JAX starts: both sides of every comparison use the cores that this process may use.
 os.environ.setdefault("OMP_NUM_THREADS", str(usable_cores()))

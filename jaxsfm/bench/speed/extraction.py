@@ -10,7 +10,7 @@ from jaxsfm.bench.speed import machine
 from jaxsfm.bench.speed.timing import Metric, median, ratio, seconds
 from jaxsfm.core.types import Levels
 from jaxsfm.core.vgg import BLOCKS, LAYERS, VGG16
-from jaxsfm.io.threads import usable_cores
+from jaxsfm.io.libraries import usable_cores
 from jaxsfm.io.weights import load_weights
 
 HEIGHT, WIDTH = 1024, 1536

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxsfm.bench.speed.timing import Metric, median, seconds
 from jaxsfm.core.numerics import descriptor_products
 from jaxsfm.core.pair_shape import Products
-from jaxsfm.io.threads import usable_cores
+from jaxsfm.io.libraries import usable_cores
 
 SIDE = 3072
 STREAM_ENTRIES = 1 << 26

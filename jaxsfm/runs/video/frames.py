@@ -11,8 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxsfm.errors import UserError, writing
-from jaxsfm.io.atomic import Json, atomic_folder, read_json
-from jaxsfm.io.hashes import sha256_of
+from jaxsfm.io.atomic import Json, atomic_folder, read_json, sha256_of
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.video import Video, open_video
 from jaxsfm.io.work_folder import FRAMES_RECORD

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.orientation import to_stored
-from jaxsfm.io.photo_views import PhotoView
+from jaxsfm.io.photos import PhotoView
 
 SIZE = 1200
 """The longer side of the common view, pixels. Larger ones take longer and find no more

@@ -9,7 +9,7 @@ from jaxsfm.config import Config
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.io.photo_views import PhotoView
+from jaxsfm.io.photos import PhotoView
 from jaxsfm.matching.pair_matching import match_features
 from jaxsfm.sfm.two_photos.common_view import Located, mapped, upright
 from jaxsfm.sfm.two_photos.evidence import BY_CHANCE, Described, plane_evidence, total

@@ -8,8 +8,7 @@ from jaxsfm.config import Config
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.io.photo_views import read_view
-from jaxsfm.io.photos import intensities
+from jaxsfm.io.photos import intensities, read_view
 from jaxsfm.io.weights import Weights
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches, align, align_matches
 from jaxsfm.sfm.two_photos.common_view import mapped

@@ -13,7 +13,7 @@ from jaxsfm.config import Config
 from jaxsfm.core.octaves import smaller
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
-from jaxsfm.io.photo_views import PhotoView, read_view
+from jaxsfm.io.photos import PhotoView, read_view
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import describe_pixels
 from jaxsfm.sfm.two_photos.look import Look, look

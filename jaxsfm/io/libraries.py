@@ -1,13 +1,17 @@
-"""Compiled programs are kept between runs in JAX's persistent compilation cache.
+"""The libraries of a process: their versions, their threads, and the programs that JAX keeps.
 
-The cache is in the user's cache folder. With it, matching two photos with the preset `paper` took
-14 s instead of 22 s.
+This module imports none of them, because some of it must be said before they start. Compiled
+programs are kept between runs in JAX's persistent compilation cache, in the user's cache folder.
+With it, matching two photos with the preset `paper` took 14 s instead of 22 s.
 """
 
 import contextlib
 import importlib
+import importlib.metadata
 import logging
 import os
+import platform
+import sys
 import zlib
 from pathlib import Path
 
@@ -15,10 +19,75 @@ import platformdirs
 
 logger = logging.getLogger("jaxsfm")
 
+PACKAGES = (
+    "jaxsfm",
+    "jax",
+    "jaxlib",
+    "flax",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+    "pycolmap",
+)
+READ_ONCE = {
+    "jax": "NPROC",
+    "numpy": "OPENBLAS_NUM_THREADS",
+    "pycolmap": "OMP_NUM_THREADS",
+    "cv2": "OPENCV_FOR_THREADS_NUM",
+}
+"""Library -> the variable that says how many threads it may have. The library reads it once,
+when it starts."""
 LEAST_SECONDS = 0.2
 """Programs that took longer than this to compile are kept; JAX's own default is one second."""
 _CHECKED, _ENTRIES = ".checked", "*-cache"
 _ZSTANDARD = b"\x28\xb5\x2f\xfd"
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide a result, by name.
+
+    This does not import the packages.
+    """
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:  # for example another build of OpenCV
+            found[name] = "not known"
+    return found
+
+
+def versions() -> dict[str, str]:
+    """Return `package_versions`, the operating system and the devices of JAX, by name."""
+    import jax
+
+    devices = jax.devices()
+    return {
+        **package_versions(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "devices": f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform})",
+    }
+
+
+def limit_threads(count: int) -> None:
+    """Let JAX, NumPy, OpenCV and OpenMP use `count` threads; -1 changes nothing.
+
+    This must be called before the libraries are imported. One that has been imported is left alone,
+    because its threads may exist already, and other threads may be using them. COLMAP's own threads
+    are options of its calls.
+    """
+    if count < 1:
+        return
+    for library, variable in READ_ONCE.items():
+        if library not in sys.modules:
+            os.environ[variable] = str(count)
+
+
+def usable_cores() -> int:
+    """The number of cores that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def keep_compiled() -> None:

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.io.compiled_programs import keep_compiled
-from jaxsfm.io.versions import package_versions
-from jaxsfm.matching.ray.cluster import connect, worker_resources, xla_threads
+from jaxsfm.io.libraries import keep_compiled, package_versions
+from jaxsfm.matching.ray_cluster import connect, worker_resources, xla_threads
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from jaxsfm.errors import UserError
-from jaxsfm.io.threads import usable_cores
+from jaxsfm.io.libraries import usable_cores
 
 if TYPE_CHECKING:
     from types import ModuleType

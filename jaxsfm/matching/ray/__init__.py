@@ -1,1 +1,0 @@
-"""Features and matches from workers on a Ray cluster."""
