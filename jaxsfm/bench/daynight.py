@@ -14,7 +14,7 @@ from jaxsfm.bench import scenes
 from jaxsfm.bench.aachen import PAIRS, aachen_scene, write_submission
 from jaxsfm.bench.curves import write_curves
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
-from jaxsfm.bench.methods import NAIVE, RUN_METHODS
+from jaxsfm.bench.methods import METHODS, NAIVE
 from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night_protocol import LIMITS, SubsetRow, Summary, judge, limit_name, summary
 from jaxsfm.bench.scenes import Scene
@@ -48,7 +48,7 @@ Totals = dict[str, Summary]
 
 def bench_daynight(options: DayNightOptions) -> BenchFigures[DayNightRow, Totals]:
     """Run all methods on all subsets of all scenes (`jaxsfm.bench.scenes`)."""
-    methods = options.chosen_methods(RUN_METHODS)
+    methods = options.chosen_methods(METHODS)
     folders = scenes.find_scenes(options.root, options.chosen_sets())
     aachen = (options.root / scenes.PHOTOS).is_dir()
     if not aachen and (options.subsets or options.poses):

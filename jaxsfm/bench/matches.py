@@ -56,7 +56,7 @@ class Matcher:
 
         Args:
           image0, image1: two images of one folder, called by their files' names.
-          method: one of `jaxsfm.bench.methods.PAIR_METHODS`.
+          method: one of `jaxsfm.bench.methods.METHODS`.
         """
         seeds = range(self._options.seeds)
         if method == "rootsift":

@@ -34,9 +34,8 @@ class _Runs(SetOptions, NetworkOptions):
         pixels instead of relocalization. paper-k4: K = 4 instead of 2. paper-conv4, paper-pool5:
         the layers conv4_3/conv3_3 or pool5/conv5_3 instead of pool4/pool3. grid, reloc, learned:
         the preset default without refinement; keypoints are at the centres of cells (grid), at the
-        largest norms (reloc) or at the largest learned scores (learned). PRESET-no-IDEA,
-        PRESET-norm and so on: as in bench wxbs. PRESET-no-placing: default or robust without the
-        separate placing of weak views.
+        largest norms (reloc) or at the largest learned scores (learned). default-products-float16,
+        default-products-bfloat16: the preset default with descriptors of this type.
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
     """
 

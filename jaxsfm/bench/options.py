@@ -100,14 +100,10 @@ class WxbsOptions(SetOptions, NetworkOptions, SeedOptions):
       methods: Methods to compare, separated by commas or blanks. rootsift: COLMAP's own features.
         paper, default, robust: the presets. paper-learned: the preset paper with keypoints at the
         largest learned scores. paper-naive, paper-k4, paper-conv4, paper-pool5: as in bench
-        strecha. grid, reloc, learned: the preset default without alignment;
-        keypoints are at the centres of cells (grid), at the largest norms (reloc) or at the largest
-        learned scores (learned). PRESET-no-IDEA: default or robust without one idea, which is
-        octaves, centring, consensus, competition, closer-looks or alignment; for robust also
-        enlarging.
-        PRESET-norm, PRESET-learned, PRESET-alexnet, PRESET-bfloat16: default or robust with this
-        keypoint rule, network or number format of the network. PRESET-products-float16,
-        PRESET-products-bfloat16: with descriptors of this type.
+        strecha. grid, reloc, learned: the preset default without alignment; keypoints are at the
+        centres of cells (grid), at the largest norms (reloc) or at the largest learned scores
+        (learned). default-products-float16, default-products-bfloat16: the preset default with
+        descriptors of this type.
       max_size: Limit for the longer side of a photo, in pixels. Without it, that of the preset.
       protocol: How matches are judged. ours: the best of five fundamental matrices, limits of 1 to
         20 px. lo: as published for other methods, with one run of MAGSAC++ (0.25 px, 100,000

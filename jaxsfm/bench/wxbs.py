@@ -15,7 +15,7 @@ import numpy as np
 from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, table
 from jaxsfm.bench.inputs import check_root, choose_sets, read_rows, usable_image
 from jaxsfm.bench.matches import Matcher, Matches
-from jaxsfm.bench.methods import PAIR_METHODS
+from jaxsfm.bench.methods import METHODS
 from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
@@ -94,7 +94,7 @@ def _image(folder: Path, stem: str) -> ImageFile:
 
 def bench_wxbs(options: WxbsOptions) -> BenchFigures[WxbsRow, Means]:
     """Run all methods on all pairs (CATEGORY/NAME/{01,02}.png, corrs.txt)."""
-    methods = options.chosen_methods(PAIR_METHODS)
+    methods = options.chosen_methods(METHODS)
     inputs = {
         folder: (
             _image(folder, "01"),
