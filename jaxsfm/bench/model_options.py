@@ -98,8 +98,6 @@ class DayNightOptions(_OneSeed):
         file (figure 4 of the paper). The errors themselves are in the --json file.
       severity: How dark the synthetic night is. 0 is day, 1 is clean, 2 is noisy, 3 is dark, 5 is
         nothing but noise.
-      denoise: Whether the camera of the synthetic night removes noise.
-      jpeg: Whether the camera of the synthetic night stores JPEG.
     """
 
     root: Path
@@ -108,8 +106,6 @@ class DayNightOptions(_OneSeed):
     poses: Path | None = None
     curves: Path | None = None
     severity: float = 2.0
-    denoise: bool = True
-    jpeg: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

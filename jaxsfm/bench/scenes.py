@@ -73,8 +73,6 @@ def synthetic_scene(folder: Path, target: Path, options: DayNightOptions) -> Sce
             rgb,
             severity=options.severity,
             seed=(options.seed + zlib.crc32(f"{folder.name}/{name}".encode())) % 2**32,
-            denoise=options.denoise,
-            jpeg=options.jpeg,
         )
         night = f"{NIGHT}{Path(name).stem}.png"
         write_photo(target / night, dark)
