@@ -4,8 +4,9 @@
 
 Two views of a rendered room are the photos. Features and pairs run in the batches that a run takes
 on this device. Their rates are compared with the device's own rates of matrix products and of
-memory, which are measured in the same run, and with the counts of `jaxsfm.bench.on_paper`. On an
-accelerator the results are compared with those of the CPU.
+memory, which are measured in the same run, by counted operations and bytes
+(`jaxsfm.bench.accelerator_programs`). On an accelerator the results are compared with those of the
+CPU.
 """
 
 import dataclasses
@@ -22,21 +23,16 @@ import jax.numpy as jnp
 import tyro
 
 from jaxsfm.bench.accelerator_programs import (
+    Found,
     PaddedPhotos,
+    Stage,
     agreement,
     compiled_programs,
+    image_work,
+    pair_work,
     rendered_photos,
 )
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.on_paper import (
-    Found,
-    Stage,
-    image_work,
-    in_numbers,
-    pair_work,
-    paper_lines,
-    rate_text,
-)
 from jaxsfm.config import Config, Convolutions, preset
 from jaxsfm.core.numerics import descriptor_products
 from jaxsfm.core.sharded import device_mesh
@@ -160,9 +156,10 @@ def table_head() -> str:
 def table_line(row: Measured) -> str:
     """The measured figures as a line of the table."""
     same = "" if row.same_as_cpu is None else f"{row.same_as_cpu:.2%}"
+    rate = f"{row.per_second:.0f}" if row.per_second >= 100 else f"{row.per_second:.3g}"
     return (
         f"| {row.preset} | {row.numbers} | {row.what} | {row.at_once} | "
-        f"{rate_text(row.per_second)} | {row.products:.0%} | {row.memory:.0%} | "
+        f"{rate} | {row.products:.0%} | {row.memory:.0%} | "
         f"{row.megabytes:.0f} | {same} |"
     )
 
@@ -173,7 +170,7 @@ def main(
     numbers: tuple[Convolutions, ...] = ("float32", "bfloat16"),
     json: Path | None = None,
 ) -> int:
-    """Measure this device, compare it with its own limits, and print what others could do.
+    """Measure this device, and compare it with its own limits.
 
     Args:
       size: width and height of the photos, pixels.
@@ -195,13 +192,14 @@ def main(
     found: dict[str, Found] = {}
     for name in presets:
         for kind in numbers:
-            config = in_numbers(dataclasses.replace(preset(name), max_size=max(size)), kind)
+            config = dataclasses.replace(
+                preset(name), max_size=max(size), convolutions=kind, products=kind
+            )
             more, counts = measure(weights, name, config, photos, rates)
             found.setdefault(name, counts)
             rows += more
             # At once: on an accelerator, the next ones can take minutes to compile.
             print(*map(table_line, more), sep="\n", flush=True)
-    print("\n".join(["", *paper_lines(found, size)]))
     if json is not None:
         figures = {
             "device": f"{device.device_kind} ({device.platform})",
