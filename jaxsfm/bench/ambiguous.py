@@ -13,7 +13,7 @@ from typing import NamedTuple
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.inputs import choose_sets
 from jaxsfm.bench.methods import AMBIGUOUS_METHODS, MAPPERS
-from jaxsfm.bench.model_options import AmbiguousOptions
+from jaxsfm.bench.options import AmbiguousOptions
 from jaxsfm.bench.outcomes import OUTCOMES, Outcome, doubt, judge
 from jaxsfm.bench.repeated import SCENES, write_repeated
 from jaxsfm.bench.strecha import ModelRow, camera_errors, not_evaluated_lines

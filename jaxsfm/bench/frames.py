@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxsfm.bench.model_options import CameraUse
+from jaxsfm.bench.options import CameraUse
 from jaxsfm.colmap.poses import Poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.pair_selection import natural

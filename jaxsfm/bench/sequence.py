@@ -16,8 +16,7 @@ import numpy as np
 
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.frames import FrameSequence, chosen_frames, linked
-from jaxsfm.bench.model_options import SequenceOptions
-from jaxsfm.bench.options import whole_numbers
+from jaxsfm.bench.options import SequenceOptions, whole_numbers
 from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images

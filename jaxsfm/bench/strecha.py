@@ -10,7 +10,7 @@ import numpy as np
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.memory import forget_peak, peak_bytes
 from jaxsfm.bench.methods import SET_METHODS
-from jaxsfm.bench.model_options import StrechaOptions
+from jaxsfm.bench.options import StrechaOptions
 from jaxsfm.bench.strecha_models import MethodRun, SetModels, set_models
 from jaxsfm.bench.strecha_sets import StrechaSet, read_sets
 from jaxsfm.colmap.poses import Poses, model_poses

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 from jaxsfm.bench.frames import linked
 from jaxsfm.bench.methods import NAIVE, method_config
-from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.night_matches import NightMatches, night_matches
+from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Scene
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import drop_pairs

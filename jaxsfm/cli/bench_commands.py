@@ -5,14 +5,15 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from jaxsfm.bench.model_options import (
+from jaxsfm.bench.options import (
     AmbiguousOptions,
+    BenchOptions,
     DayNightOptions,
     LedgerOptions,
     SequenceOptions,
     StrechaOptions,
+    WxbsOptions,
 )
-from jaxsfm.bench.options import BenchOptions, WxbsOptions
 from jaxsfm.cli.run_commands import check_writable
 from jaxsfm.io.threads import limit_threads
 

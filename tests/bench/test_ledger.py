@@ -16,7 +16,7 @@ from jaxsfm.bench.ledger_photos import as_frames, as_phototourism, as_turned
 from jaxsfm.bench.ledger_runs import SECONDS, LedgerRun, SetPhotos, apart, run_set
 from jaxsfm.bench.ledger_sets import DRAWN, choose_ledger_sets, ledger_sets
 from jaxsfm.bench.ledger_table import counts, markdown, set_cells, table_lines
-from jaxsfm.bench.model_options import LedgerOptions
+from jaxsfm.bench.options import LedgerOptions
 from jaxsfm.bench.synthetic import camera_text, write_photo
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.model_folders import write_models

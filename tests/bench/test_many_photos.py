@@ -11,7 +11,7 @@ import pytest
 from jaxsfm.bench import driver, other_features, sequence
 from jaxsfm.bench.frames import chosen_frames
 from jaxsfm.bench.long_street import SIZE, walk, write_street
-from jaxsfm.bench.model_options import SequenceOptions
+from jaxsfm.bench.options import SequenceOptions
 from jaxsfm.bench.simulated import NOISE_PX, REACH, SimulatedStreet
 from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.cli.main import main
