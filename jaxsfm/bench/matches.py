@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.bench.methods import NAIVE, method_config
-from jaxsfm.bench.naive import match_pairs_naively
 from jaxsfm.bench.options import WxbsOptions
+from jaxsfm.bench.other_methods import match_pairs_naively
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.rootsift import write_rootsift_database

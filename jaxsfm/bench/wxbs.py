@@ -20,11 +20,7 @@ from jaxsfm.bench.options import WxbsOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photo_folder import SUFFIXES
-from jaxsfm.sfm.epipolar import (
-    epipolar_residuals,
-    fundamental_matrix,
-    single_fundamental_matrix,
-)
+from jaxsfm.sfm.epipolar import epipolar_residuals, fundamental_matrix, single_fundamental_matrix
 
 THRESHOLDS_PX = np.arange(1, 21)
 PUBLISHED_THRESHOLDS_PX = np.arange(11)

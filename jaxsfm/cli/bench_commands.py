@@ -45,10 +45,10 @@ def ledger(bench: Unnamed[LedgerOptions]) -> int:
     """
     limit_threads(bench.threads)
     from jaxsfm.bench.ledger import bench_ledger
-    from jaxsfm.bench.ledger_curve import lines_with_curve
+    from jaxsfm.bench.ledger_table import table_lines
 
     check_writable(bench.markdown, "--markdown", (".md",))
-    return _run(bench_ledger, lines_with_curve, bench)
+    return _run(bench_ledger, table_lines, bench)
 
 
 def strecha(bench: Unnamed[StrechaOptions]) -> int:

@@ -1,6 +1,6 @@
 """Laws of the folders with links to some photos."""
 
-from jaxsfm.bench.frames import linked
+from jaxsfm.bench.inputs import linked
 
 
 def names(folder) -> dict[str, str]:

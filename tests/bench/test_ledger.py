@@ -12,9 +12,15 @@ from verdicts import check_of
 
 from jaxsfm.bench import ledger, ledger_runs
 from jaxsfm.bench.ledger import bench_ledger
-from jaxsfm.bench.ledger_photos import as_frames, as_phototourism, as_turned
 from jaxsfm.bench.ledger_runs import SECONDS, LedgerRun, SetPhotos, apart, run_set
-from jaxsfm.bench.ledger_sets import DRAWN, choose_ledger_sets, ledger_sets
+from jaxsfm.bench.ledger_sets import (
+    DRAWN,
+    as_frames,
+    as_phototourism,
+    as_turned,
+    choose_ledger_sets,
+    ledger_sets,
+)
 from jaxsfm.bench.ledger_table import counts, markdown, set_cells, table_lines
 from jaxsfm.bench.options import LedgerOptions
 from jaxsfm.bench.synthetic import camera_text, write_photo

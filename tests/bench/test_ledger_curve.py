@@ -1,6 +1,6 @@
 """The error rates of the check over its threshold."""
 
-from jaxsfm.bench.ledger_curve import THRESHOLDS, error_curve
+from jaxsfm.bench.ledger_table import THRESHOLDS, error_curve
 
 
 def row(outcome, wrong):

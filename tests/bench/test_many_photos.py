@@ -8,11 +8,11 @@ import sys
 import numpy as np
 import pytest
 
-from jaxsfm.bench import driver, other_features, sequence
-from jaxsfm.bench.frames import chosen_frames
+from jaxsfm.bench import driver, sequence
+from jaxsfm.bench.driver import NOISE_PX, REACH, SimulatedStreet
+from jaxsfm.bench.inputs import chosen_frames
 from jaxsfm.bench.long_street import SIZE, walk, write_street
 from jaxsfm.bench.options import SequenceOptions
-from jaxsfm.bench.simulated import NOISE_PX, REACH, SimulatedStreet
 from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
@@ -130,9 +130,9 @@ def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
         seen.append(([image.name for image in images], pairs))
         raise UserError("seen")
 
-    monkeypatch.setattr(other_features, "trained_networks", lambda: None)
+    monkeypatch.setattr(sequence, "trained_networks", lambda: None)
     monkeypatch.setattr(sequence, "with_jaxsfm", lambda given, name: ({}, chosen))
-    monkeypatch.setattr(other_features, "write_lightglue_database", write_lightglue_database)
+    monkeypatch.setattr(sequence, "write_lightglue_database", write_lightglue_database)
     options = SequenceOptions(
         root=street_sequence, every=("2",), methods=("default,aliked+lightglue",), out=tmp_path
     )
