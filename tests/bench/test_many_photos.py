@@ -10,7 +10,7 @@ import pytest
 
 from jaxsfm.bench import driver, sequence
 from jaxsfm.bench.driver import NOISE_PX, REACH, SimulatedStreet
-from jaxsfm.bench.inputs import chosen_frames
+from jaxsfm.bench.inputs import chosen_frames, linked
 from jaxsfm.bench.long_street import SIZE, walk, write_street
 from jaxsfm.bench.options import SequenceOptions
 from jaxsfm.bench.synthetic import camera_matrix
@@ -80,6 +80,30 @@ def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street_sequen
     assert len(second.mapped) == 4 and not {*second.mapped} & {*second.localized}
     with pytest.raises(UserError, match="fewer than three"):
         chosen_frames(folder, 5, 0) and chosen_frames(folder, 10, 0)
+
+
+def linked_photos(folder) -> dict[str, str]:
+    found = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in found}
+
+
+def test_a_folder_has_the_asked_photos_of_the_asked_folder_and_no_others(tmp_path):
+    for folder in ("one", "two"):
+        for name in ("a.jpg", "night/b.jpg", "night/c.jpg"):
+            path = tmp_path / folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{folder} {name}")
+    target = tmp_path / "links"
+    linked(tmp_path / "one", ["a.jpg", "night/b.jpg"], target)
+    assert linked_photos(target) == {"a.jpg": "one a.jpg", "night/b.jpg": "one night/b.jpg"}
+    linked(tmp_path / "two", ["night/b.jpg", "night/c.jpg"], target)
+    assert linked_photos(target) == {
+        "night/b.jpg": "two night/b.jpg",
+        "night/c.jpg": "two night/c.jpg",
+    }
+    (tmp_path / "two" / "night" / "b.jpg").unlink()
+    linked(tmp_path / "one", ["night/b.jpg"], target)
+    assert linked_photos(target) == {"night/b.jpg": "one night/b.jpg"}
 
 
 @pytest.mark.parametrize(
