@@ -1,10 +1,12 @@
 """Compares a conversion with its source: every layer of an image is computed in two ways.
 
-One way is `weights_conversion.forward`, in float64, on the source file in its own convention. The
-other way is jaxsfm's network, in float32, on the converted file.
+One way is VGG-16 in numpy and float64, on the source file in the convention of its own framework:
+channels first or last, BGR or RGB, convolution or correlation. This network is independent of
+jaxsfm's network and of the conversion. Each tap of a kernel is added separately, which is slow;
+images should be small. The other way is jaxsfm's network, in float32, on the converted file.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +19,6 @@ from jaxsfm.core.blocks import Layer, convolve, pool
 from jaxsfm.core.vgg import preprocess
 from jaxsfm.errors import UserError
 from jaxsfm.io.weight_files import ConvertedWeights, read_converted, read_extras
-from weights_conversion.forward import layer_maps
 from weights_conversion.source import Source
 
 LIMIT = 1e-5
@@ -36,6 +37,76 @@ class MapComparison(NamedTuple):
     """The largest absolute value of the source's map."""
     difference: float
     """The largest absolute difference over `largest`; infinite if the shapes differ."""
+
+
+def _input(source: Source, rgb: np.ndarray) -> np.ndarray:
+    """Preprocess an image as the framework does, with the axes in its order."""
+    image = rgb.astype(np.float64)
+    if source.convention.bgr:
+        image = np.stack([image[..., 2], image[..., 1], image[..., 0]], axis=-1)
+    scale, mean, std = source.preprocessing
+    for channel in range(3):
+        image[..., channel] = (image[..., channel] / scale - mean[channel]) / std[channel]
+    return image if source.convention.layout == "HWIO" else np.moveaxis(image, -1, 0)
+
+
+def _taps(size: int, tap: int, convolution: bool) -> tuple[slice, slice]:
+    """Return, along one axis, the outputs to which a tap (0, 1 or 2) adds and the inputs it takes.
+
+    A correlation is y[n] = sum over t of w[t] x[n + t - 1]; a convolution has x[n + 1 - t] instead.
+    """
+    shift = 1 - tap if convolution else tap - 1
+    inside = slice(max(0, -shift), size - max(0, shift))
+    return inside, slice(inside.start + shift, inside.stop + shift)
+
+
+def _layer(x: np.ndarray, kernel: np.ndarray, bias: np.ndarray, source: Source) -> np.ndarray:
+    """Apply one layer: a convolution with zero padding of one pixel, plus the bias."""
+    convolution = source.convention.convolution
+    kernel, bias = kernel.astype(np.float64), bias.astype(np.float64)
+    last = source.convention.layout == "HWIO"
+    height, width = x.shape[:2] if last else x.shape[1:]
+    y = np.zeros((height, width, bias.size) if last else (bias.size, height, width))
+    for i in range(3):
+        rows, from_rows = _taps(height, i, convolution)
+        for j in range(3):
+            columns, from_columns = _taps(width, j, convolution)
+            if last:
+                y[rows, columns] += x[from_rows, from_columns] @ kernel[i, j]
+            else:
+                part = x[:, from_rows, from_columns]
+                y[:, rows, columns] += np.tensordot(kernel[:, :, i, j], part, axes=(1, 0))
+    return y + (bias if last else bias[:, None, None])
+
+
+def _pool(x: np.ndarray, last: bool) -> np.ndarray:
+    """Take the maximum of 2 x 2 values; an odd last row or column is dropped."""
+    height, width = x.shape[:2] if last else x.shape[1:]
+    height, width = height // 2 * 2, width // 2 * 2
+    x = x[:height, :width] if last else x[:, :height, :width]
+    corners = [x[i::2, j::2] if last else x[:, i::2, j::2] for i in (0, 1) for j in (0, 1)]
+    return np.maximum.reduce(corners)
+
+
+def layer_maps(source: Source, rgb: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Compute all maps of an image: conv1_1 .. conv5_3 before their rectifiers, and pool1 .. pool5.
+
+    Args:
+      source: the weights.
+      rgb: (h, w, 3), 0 .. 255.
+
+    Yields: the name of each map and the map, float64 (h, w, channels).
+    """
+    last = source.convention.layout == "HWIO"
+    x = _input(source, rgb)
+    names = [*source.layers, "end"]
+    for (name, (kernel, bias)), following in zip(source.layers.items(), names[1:], strict=True):
+        x = _layer(x, kernel, bias, source)
+        yield name, x if last else np.moveaxis(x, 0, -1)
+        x = np.maximum(x, 0.0)
+        if following[:5] != name[:5]:  # this layer is the last of its block
+            x = _pool(x, last)
+            yield f"pool{name[4]}", x if last else np.moveaxis(x, 0, -1)
 
 
 def noise_image(size: tuple[int, int]) -> np.ndarray:

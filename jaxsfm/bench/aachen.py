@@ -17,14 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.bench.scenes import (
-    PHOTOS,
-    Scene,
-    Subset,
-    check_cameras,
-    inspected,
-    reference_of,
-)
+from jaxsfm.bench.scenes import PHOTOS, Scene, Subset, check_cameras, inspected, reference_of
 from jaxsfm.colmap.given_cameras import read_camera_list
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model

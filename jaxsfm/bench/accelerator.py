@@ -4,12 +4,17 @@
 
 Two views of a rendered room are the photos. Features and pairs run in the batches that a run takes
 on this device. Their rates are compared with the device's own rates of matrix products and of
-memory, which are measured in the same run, and with the counts of `jaxsfm.bench.on_paper`. On an
-accelerator the results are compared with those of the CPU.
+memory, which are measured in the same run, by counted operations and bytes
+(`jaxsfm.bench.accelerator_programs`). On an accelerator the results are compared with those of the
+CPU.
 """
 
 import dataclasses
+import functools
+import statistics
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, NamedTuple, get_args
 
@@ -18,27 +23,25 @@ import jax.numpy as jnp
 import tyro
 
 from jaxsfm.bench.accelerator_programs import (
+    Found,
     PaddedPhotos,
+    Stage,
     agreement,
     compiled_programs,
+    image_work,
+    pair_work,
     rendered_photos,
 )
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.on_paper import (
-    Found,
-    Stage,
-    image_work,
-    in_numbers,
-    pair_work,
-    paper_lines,
-    rate_text,
-)
-from jaxsfm.bench.speed.machine import SIDE, STREAM_ENTRIES, add_one, matrix_product
-from jaxsfm.bench.speed.timing import median
-from jaxsfm.bench.speed.timing import seconds as timed
 from jaxsfm.config import Config, Convolutions, preset
+from jaxsfm.core.numerics import descriptor_products
 from jaxsfm.core.sharded import device_mesh
 from jaxsfm.io.weights import Weights, load_weights
+
+REPEAT = 5
+"""How often each thing is timed."""
+SIDE, STREAM_ENTRIES = 3072, 1 << 26
+"""The side of the matrices and the entries of the array by which a CPU's own rates are measured."""
 
 
 class Rates(NamedTuple):
@@ -72,17 +75,38 @@ class Measured(NamedTuple):
     """The counted work."""
 
 
+def median_seconds(*work: Callable[[], object]) -> list[float]:
+    """The median time of each function.
+
+    The functions run in turns, so that a slow minute of the machine affects all of them. The first
+    call of each function compiles and is not counted.
+    """
+    for function in work:
+        jax.block_until_ready(function())
+    times: list[list[float]] = [[] for _ in work]
+    for _ in range(REPEAT):
+        for function, own in zip(work, times, strict=True):
+            start = time.perf_counter()
+            jax.block_until_ready(function())
+            own.append(time.perf_counter() - start)
+    return [statistics.median(own) for own in times]
+
+
 def device_rates() -> Rates:
     """Matrix products and memory of the default device."""
     # An accelerator gets larger arrays, so that starting the work takes no time in comparison.
     cpu = jax.default_backend() == "cpu"
     side, entries = (SIDE, STREAM_ENTRIES) if cpu else (8192, 8 * STREAM_ENTRIES)
-    a = jnp.zeros(entries, jnp.float32)
-    float32, bfloat16 = matrix_product(side), matrix_product(side, "bfloat16")
-    *times, stream = timed(float32.compute, bfloat16.compute, lambda: add_one(a))
-    rates = [float32.operations / median(each) for each in times]
+    square = jax.random.normal(jax.random.key(0), (side, side))
+    half, row = square.astype("bfloat16"), jnp.zeros(entries, jnp.float32)
+    product = jax.jit(functools.partial(descriptor_products, "ij,jk->ik"))
+    add_one = jax.jit(lambda a: a + 1)  # reads and writes every entry once
+    *times, stream = median_seconds(
+        lambda: product(square, square), lambda: product(half, half), lambda: add_one(row)
+    )
+    rates = [2.0 * side**3 / each for each in times]
     products = dict(zip(get_args(Convolutions), rates, strict=True))
-    return Rates(products, 2 * a.nbytes / median(stream))
+    return Rates(products, 2 * row.nbytes / stream)
 
 
 def measure(
@@ -95,16 +119,16 @@ def measure(
     if first.platform != "cpu":
         cpu = compiled_programs(weights, config, photos, device_mesh(jax.devices("cpu")[:1]))
         same = list(agreement(programs, cpu))
-    extraction, matching = timed(programs.extract, programs.match)
+    extraction, matching = median_seconds(programs.extract, programs.match)
     height, width = map(int, photos.size)
     rows = []
-    for what, times, at_once, used, stages, equal in (
+    for what, seconds, at_once, used, stages, equal in (
         ("images", extraction, programs.images, programs.bytes_per_image,
          image_work(width, height, config), same[0]),
         ("pairs", matching, programs.pairs, programs.bytes_per_pair,
          pair_work(width, height, config, programs.found), same[1]),
     ):  # fmt: skip
-        each = median(times) / at_once
+        each = seconds / at_once
         rows.append(
             Measured(
                 what=what,
@@ -132,9 +156,10 @@ def table_head() -> str:
 def table_line(row: Measured) -> str:
     """The measured figures as a line of the table."""
     same = "" if row.same_as_cpu is None else f"{row.same_as_cpu:.2%}"
+    rate = f"{row.per_second:.0f}" if row.per_second >= 100 else f"{row.per_second:.3g}"
     return (
         f"| {row.preset} | {row.numbers} | {row.what} | {row.at_once} | "
-        f"{rate_text(row.per_second)} | {row.products:.0%} | {row.memory:.0%} | "
+        f"{rate} | {row.products:.0%} | {row.memory:.0%} | "
         f"{row.megabytes:.0f} | {same} |"
     )
 
@@ -145,7 +170,7 @@ def main(
     numbers: tuple[Convolutions, ...] = ("float32", "bfloat16"),
     json: Path | None = None,
 ) -> int:
-    """Measure this device, compare it with its own limits, and print what others could do.
+    """Measure this device, and compare it with its own limits.
 
     Args:
       size: width and height of the photos, pixels.
@@ -167,13 +192,14 @@ def main(
     found: dict[str, Found] = {}
     for name in presets:
         for kind in numbers:
-            config = in_numbers(dataclasses.replace(preset(name), max_size=max(size)), kind)
+            config = dataclasses.replace(
+                preset(name), max_size=max(size), convolutions=kind, products=kind
+            )
             more, counts = measure(weights, name, config, photos, rates)
             found.setdefault(name, counts)
             rows += more
             # At once: on an accelerator, the next ones can take minutes to compile.
             print(*map(table_line, more), sep="\n", flush=True)
-    print("\n".join(["", *paper_lines(found, size)]))
     if json is not None:
         figures = {
             "device": f"{device.device_kind} ({device.platform})",

@@ -1,6 +1,9 @@
-"""The programs of a preset on one device, with two rendered photos as their input.
+"""The programs of a preset on one device, and the operations and bytes that they need at least.
 
-They are those of a run, in the batches that a run takes on the device.
+The programs are those of a run, in the batches that a run takes on the device. Their input are two
+rendered photos. Operations and bytes are counted from shapes. Bytes are those of the large arrays
+that do not fit into a cache: each is counted once where it is written and once for every stage that
+reads it. Everything else (decoding, the host, small arrays) counts nothing.
 """
 
 from collections.abc import Callable
@@ -10,9 +13,10 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from jaxsfm.bench.on_paper import Found
 from jaxsfm.bench.synthetic import arc, render, room
 from jaxsfm.config import Config
+from jaxsfm.core.coarse_to_fine import SIDE
+from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.pair import pair_key
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.core.sharded import extract_batch, join_everywhere, match_batch
@@ -25,6 +29,15 @@ from jaxsfm.matching.pair_matching import thresholds
 
 ENOUGH = 256
 """Images, or pairs, of which batches are made: as many as a run has at least."""
+LAYERS = (
+    *((3, 64, 1), (64, 64, 1)),
+    *((64, 128, 4), (128, 128, 4)),
+    *((128, 256, 16), (256, 256, 16), (256, 256, 16)),
+    *((256, 512, 64), (512, 512, 64), (512, 512, 64)),
+)
+"""Convolutions of VGG-16 up to pool4: channels in, channels out, pixels of the image per cell."""
+COARSE, FINE = 512, 256
+"""Channels of a coarse and of a fine descriptor of one octave."""
 
 
 class PaddedPhotos(NamedTuple):
@@ -45,6 +58,17 @@ def rendered_photos(width: int, height: int) -> PaddedPhotos:
     images[:, :height, :width] = views
     size = np.asarray([height, width], np.int32)
     return PaddedPhotos(images, size, feature_capacity((width, height)).num_coarse)
+
+
+class Found(NamedTuple):
+    """What a pair's work depends on beside its size."""
+
+    coarse: int
+    """Mutual coarse matches."""
+    tentative: int
+    """Fine correspondences."""
+    hypotheses: int
+    """Hypotheses scored, over all planes."""
 
 
 class Programs(NamedTuple):
@@ -136,3 +160,69 @@ def agreement(ours: Programs, cpu: Programs) -> tuple[float, float]:
         for found in (ours.matches, cpu.matches)
     )
     return keypoints, len(expected & same) / max(len(expected), 1)
+
+
+class Stage(NamedTuple):
+    """What one stage needs for one image or one pair."""
+
+    name: str
+    products: float
+    """Operations (a multiplication and an addition are two) in matrix products and convolutions."""
+    bytes: float
+    """Bytes that are read from or written to the device's memory."""
+
+
+def image_work(width: int, height: int, config: Config) -> list[Stage]:
+    """The stages of `jaxsfm.core.features.extract` for one image of this size.
+
+    Keypoints and descriptors are left out: they read the network's maps once, which counts here.
+    """
+    size = 2 if config.convolutions == "bfloat16" else 4
+    pixels = sum(width * height / 4**k for k in range(config.octaves))
+    products = sum(18 * a * b * pixels / cells for a, b, cells in LAYERS)
+    maps = sum(size * (a + b) * pixels / cells for a, b, cells in LAYERS)
+    # The last map of each block is read by its pooling, and that of three blocks by the norms.
+    read = sum(size * b * pixels / cells for _, b, cells in (LAYERS[k] for k in (1, 3, 6, 9)))
+    return [Stage("network", products, maps + 2 * read)]
+
+
+def pair_work(width: int, height: int, config: Config, found: Found) -> list[Stage]:
+    """The stages of `jaxsfm.core.pair.match_pair` for two images of this size."""
+    n, shape = feature_capacity((width, height)).num_coarse, config.pair.for_accelerators()
+    size = 4.0 if config.products == "float32" else 2.0  # bytes of a channel
+    tile = min(shape.coarse_tile, n)
+    radius = shape.consensus
+    margin = 2 * radius * (shape.coarse_columns + 1) if radius else 0
+    rows, columns = -(-n // tile) * (tile + margin), n + margin  # with the neighbours of each tile
+    entries = float(rows * columns)
+    table = 4.0 * entries
+    smaller = [octave_capacity(n, k) for k in range(1, config.octaves)]
+    if radius:
+        products = 2.0 * COARSE * (entries + sum(smaller) * columns)
+    else:
+        products = 2.0 * COARSE * config.octaves * entries
+    read = 2 * size * n * COARSE * config.octaves
+    stages = [Stage("coarse products", products, read + table)]
+    if radius and smaller:
+        # Four rows of a small table are read for every row; a tile of the sum stays in the cache.
+        parts = 4.0 * sum(smaller) * columns
+        stages.append(Stage("octaves", 0, 2 * parts + 2 * table))
+    if radius:
+        stages.append(Stage("consensus", 0, 2 * table))
+    stages.append(Stage("mutual neighbours", 0, 2 * table))
+    cells, channels = SIDE * SIDE, FINE * config.octaves
+    gathered = 2 * cells * channels * size * found.coarse
+    windows = 2.0 * cells * cells * channels * found.coarse
+    # Rows are read, written next to each other, and read by the product.
+    stages.append(Stage("windows", windows, 3 * gathered))
+    # Nine slots per cell: built, sorted, compared, compacted.
+    stages.append(Stage("correspondences", 0, 9 * 4.0 * 4 * n * 12))
+    if shape.one_to_one == "similarity":
+        stages.append(Stage("similarities", 0, 3 * 2 * channels * size * found.tentative))
+    # Every hypothesis is scored on all correspondences: later planes have fewer.
+    batches = found.hypotheses / shape.hypotheses_per_step / shape.steps_at_once
+    stages.append(Stage("hypotheses", 0, 16.0 * found.tentative * batches))
+    # A plane has about three new best hypotheses, and each is refitted until nothing is gained.
+    fits = shape.max_planes * (3 * min(shape.local_refits, 2) + shape.plane_rounds)
+    stages.append(Stage("refits", 0, 40.0 * found.tentative * fits))
+    return stages

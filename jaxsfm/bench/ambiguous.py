@@ -2,7 +2,7 @@
 
 Rendered scenes (`jaxsfm.bench.repeated`) and sets in Strecha's layout are reconstructed at several
 sizes, by our presets and by COLMAP's mappers. What counts as right is defined in
-`jaxsfm.bench.outcomes`.
+`jaxsfm.bench.judges`.
 """
 
 import tempfile
@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
-from jaxsfm.bench.inputs import choose_sets
+from jaxsfm.bench.inputs import StrechaSet, choose_sets, find_sets, read_set
+from jaxsfm.bench.judges import OUTCOMES, Outcome, doubt, judge
 from jaxsfm.bench.methods import AMBIGUOUS_METHODS, MAPPERS
-from jaxsfm.bench.model_options import AmbiguousOptions
-from jaxsfm.bench.outcomes import OUTCOMES, Outcome, doubt, judge
+from jaxsfm.bench.options import AmbiguousOptions
 from jaxsfm.bench.repeated import SCENES, write_repeated
 from jaxsfm.bench.strecha import ModelRow, camera_errors, not_evaluated_lines
 from jaxsfm.bench.strecha_models import MethodRun, set_models, take_matches
-from jaxsfm.bench.strecha_sets import StrechaSet, find_sets, read_set
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import UserError, writing
 from jaxsfm.sfm.check.common_places import extent, groups

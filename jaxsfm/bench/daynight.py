@@ -10,16 +10,20 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from jaxsfm.bench import scenes
 from jaxsfm.bench.aachen import PAIRS, aachen_scene, write_submission
-from jaxsfm.bench.curves import write_curves
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
-from jaxsfm.bench.methods import NAIVE, RUN_METHODS
-from jaxsfm.bench.model_options import DayNightOptions
+from jaxsfm.bench.methods import METHODS, NAIVE
 from jaxsfm.bench.night_protocol import LIMITS, SubsetRow, Summary, judge, limit_name, summary
+from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Scene
 from jaxsfm.bench.subset_models import dense_models, naive_models, rootsift_models
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import write_atomic
+from jaxsfm.report.plot import COLOURS, encode_figure
 
 PUBLISHED = {
     "DoG + RootSIFT": (48, 1910, (15.31, 25.61, 36.73, 35.71, 39.80)),
@@ -48,7 +52,7 @@ Totals = dict[str, Summary]
 
 def bench_daynight(options: DayNightOptions) -> BenchFigures[DayNightRow, Totals]:
     """Run all methods on all subsets of all scenes (`jaxsfm.bench.scenes`)."""
-    methods = options.chosen_methods(RUN_METHODS)
+    methods = options.chosen_methods(METHODS)
     folders = scenes.find_scenes(options.root, options.chosen_sets())
     aachen = (options.root / scenes.PHOTOS).is_dir()
     if not aachen and (options.subsets or options.poses):
@@ -87,21 +91,54 @@ def bench_daynight(options: DayNightOptions) -> BenchFigures[DayNightRow, Totals
     return figures
 
 
+def cumulative(errors: Sequence[float], number: int) -> tuple[np.ndarray, np.ndarray]:
+    """The cumulative curve of errors as the corners of a step function.
+
+    Args:
+      errors: the errors that are known, (n,).
+      number: how many things there are, at least n. Those without an error are never reached.
+
+    Returns:
+      x (n + 1,): 0, then the errors in ascending order. y (n + 1,): the share of things whose error
+      is at most x.
+    """
+    if number < max(len(errors), 1):
+        raise ValueError(f"number must be at least {max(len(errors), 1)}; got {number}")
+    share = np.arange(len(errors) + 1) / number
+    return np.concatenate([[0.0], np.sort(np.asarray(errors, np.float64))]), share
+
+
 def _write_curves(path: Path, whole: Totals) -> None:
+    """Write the cumulative curves of the errors of night photos, as in figure 4 of the paper.
+
+    The PNG file has a panel for each kind of error.
+    """
     judged = {method: of for method, of in whole.items() if of["nights_with_reference"]}
     if not judged:
         print(f"--curves {path}: not written, because no night photo has a reference pose")
         return
     positions = {method: of["sorted_positions"] for method, of in judged.items()}
     rotations = {method: of["sorted_rotations_deg"] for method, of in judged.items()}
-    write_curves(
-        path,
-        {
-            "position error, units of the reference": positions,
-            "rotation error, degrees": rotations,
-        },
-        {method: of["nights_with_reference"] for method, of in judged.items()},
-    )
+    panels = {
+        "position error, units of the reference": positions,
+        "rotation error, degrees": rotations,
+    }
+    figure = Figure(figsize=(6 * len(panels), 4.5), dpi=120, layout="constrained")
+    for k, (label, methods) in enumerate(panels.items(), start=1):
+        axes = figure.add_subplot(1, len(panels), k)
+        known = [error for errors in methods.values() for error in errors if error > 0]
+        least, largest = (min(known) / 2, max(known) * 2) if known else (0.1, 10.0)
+        for (method, errors), colour in zip(methods.items(), COLOURS * len(methods), strict=False):
+            x, y = cumulative(errors, judged[method]["nights_with_reference"])
+            axes.step([*x, largest], [*y, y[-1]], where="post", color=colour, label=method)
+        axes.set_xscale("log")
+        axes.set_xlim(least, largest)
+        axes.set_ylim(0, 1.02)
+        axes.set_xlabel(label)
+        axes.set_ylabel("share of night photos")
+        axes.grid(alpha=0.3)
+    figure.axes[0].legend(loc="upper left")
+    write_atomic(path, encode_figure(figure, ".png"))
 
 
 def totals(rows: Sequence[DayNightRow]) -> Totals:

@@ -1,7 +1,9 @@
-"""Figures that a benchmark measures: spreads over seeds, tables, JSON."""
+"""Figures that a benchmark measures: spreads over seeds, tables, JSON, and the most memory held."""
 
+import contextlib
 import dataclasses
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Generic, TypedDict, TypeVar
@@ -16,6 +18,7 @@ Row = TypeVar("Row")
 Summary = TypeVar("Summary")
 Cells = dict[str, str]
 """One row of a table as text, by the heads of its columns."""
+_STATUS, _FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class BenchFigures(TypedDict, Generic[Row, Summary]):
@@ -99,3 +102,17 @@ def table(rows: Sequence[Cells], *, names: int = 2) -> list[str]:
 def write_json(path: Path, figures: Mapping[str, object]) -> None:
     """Write figures as JSON; the file appears whole or not at all."""
     write_atomic(path, json.dumps(figures, indent=1, allow_nan=False).encode())
+
+
+def forget_peak() -> None:
+    """Count the most memory from now on; without effect on other systems."""
+    with contextlib.suppress(OSError):
+        _FORGET.write_text("5", encoding="ascii")  # proc(5): resets VmHWM
+
+
+def peak_bytes() -> int | None:
+    """The largest resident set since `forget_peak`, bytes; None where the system does not say."""
+    with contextlib.suppress(OSError):
+        found = re.search(r"^VmHWM:\s*(\d+) kB", _STATUS.read_text(encoding="ascii"), re.MULTILINE)
+        return int(found[1]) * 1024 if found else None
+    return None

@@ -15,19 +15,19 @@ from typing import Any, NamedTuple
 
 import jaxsfm
 from jaxsfm.bench.figures import Cells, collect
-from jaxsfm.bench.ledger_judges import Judged, judged
-from jaxsfm.bench.ledger_parts import NOTHING_AFTER, part_runs
-from jaxsfm.bench.ledger_photos import SetPhotos
+from jaxsfm.bench.judges import doubt, judge
 from jaxsfm.bench.ledger_runs import (
+    NOTHING_AFTER,
     SECONDS,
     LedgerRun,
     apart,
     finished_run,
     kept_run,
+    part_runs,
     run_rootsift,
     run_set,
 )
-from jaxsfm.bench.ledger_sets import LedgerSet, choose_ledger_sets
+from jaxsfm.bench.ledger_sets import LedgerSet, SetPhotos, choose_ledger_sets
 from jaxsfm.bench.ledger_table import (
     LedgerFigures,
     LedgerRow,
@@ -36,8 +36,7 @@ from jaxsfm.bench.ledger_table import (
     counts,
     markdown,
 )
-from jaxsfm.bench.model_options import LedgerOptions
-from jaxsfm.bench.outcomes import doubt
+from jaxsfm.bench.options import LedgerOptions
 from jaxsfm.bench.strecha import camera_errors
 from jaxsfm.colmap.poses import Poses, model_poses, read_model
 from jaxsfm.errors import UserError
@@ -116,7 +115,7 @@ def judged_row(
     except UserError as error:
         return {**row, "error": str(error)}
     said, errors = doubt(report), _errors(each, given, models)
-    found: Judged = judged(models, given.truth, names, each.judge, bool(said))
+    found = judge(models, given.truth, noticed=bool(said), how=each.judge, names=names)
     total = sum(report.seconds.values())
     times = total / sum(rootsift["seconds"].values()) if rootsift else None
     return {

@@ -1,41 +1,62 @@
-"""The runs of `bench ledger`, each in a process of its own, and RootSIFT's on the same photos.
+"""The runs of `bench ledger`: whole sets, RootSIFT's on the same photos, and parts of sets.
 
-A run that fails, or whose process dies, becomes a sentence, and the ledger goes on.
+A run of a whole set has a process of its own. If it fails, or its process dies, it becomes a
+sentence, and the ledger goes on.
+
+A part is photos that stand near each other in the order of their names, with gaps. Each part is
+mapped once, and nothing mends, splits or refines the model before it is judged: how often is the
+check wrong? A few sets give many models in this way, most of them right. They are not independent
+of each other: parts of one set share photos and matches.
 """
 
 import dataclasses
 import multiprocessing
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple, TypeVarTuple
 
+import numpy as np
+
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.ledger_photos import SetPhotos
+from jaxsfm.bench.inputs import linked
+from jaxsfm.bench.ledger_sets import SetPhotos
 from jaxsfm.bench.methods import method_config
+from jaxsfm.bench.strecha_models import map_rootsift, take_matches
+from jaxsfm.bench.subset_models import forget_results
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import build_models
-from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.atomic import read_json
 from jaxsfm.io.pairs import Pair
+from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.store import FAILED
-from jaxsfm.matching.pipeline import open_images
+from jaxsfm.options import Step
 from jaxsfm.report.run_report import FILE, RunReport, read_report
-from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.evaluation import of_photos
 
 Given = TypeVarTuple("Given")
 ERROR, SECONDS = "error.json", "seconds.json"
 """The file beside a run that says why it ended, and that in RootSIFT's folder that says how long
 its stages took. The second one is written last."""
+NOTHING_AFTER: tuple[Step, ...] = (
+    "upright",
+    "map-again",
+    "split",
+    "second-places",
+    "refine",
+    "register",
+)
+"""What a run leaves out so that its first mapping is judged as it is."""
+LEAST, MOST = 5, 16
+"""Sizes of parts, photos. Smaller ones say little, and larger ones are much alike."""
+WITHIN = 2
+"""A part is drawn from so many times as many photos that follow each other."""
 
 
 class LedgerRun(NamedTuple):
@@ -135,25 +156,55 @@ def run_rootsift(run: LedgerRun, folder: Path, pairs: list[Pair] | None) -> None
       folder: gets sparse/ and the seconds of the stages.
       pairs: those to match; None: all.
     """
-    given, options, seconds = run.given, run.options, dict[str, float]()
-    folder.mkdir(parents=True, exist_ok=True)
-    database, (images, _) = folder / "database.db", open_images(given.photos)
-    known = parse_cameras(given.intrinsics) if given.intrinsics else None
-    verification = VerificationOptions(seed=options.seed, threads=options.threads)
-    with timed(seconds, "matching"):  # COLMAP does not say how long its extraction takes
-        write_rootsift_database(
-            database,
-            given.photos,
-            images,
-            Cameras(known=known),
-            verification,
-            pairs=pairs,
-            max_size=run.max_size,
-        )
+    known = parse_cameras(run.given.intrinsics) if run.given.intrinsics else None
     mapping = MapOptions(
-        refine_intrinsics=known is None, seed=options.seed, threads=options.threads
+        refine_intrinsics=known is None, seed=run.options.seed, threads=run.options.threads
     )
-    with timed(seconds, "mapping"):
-        models = build_models(database, read_two_views(database), mapping)
-    write_models(models, folder / "sparse")
-    write_json(folder / SECONDS, seconds)
+    folder.mkdir(parents=True, exist_ok=True)
+    made = map_rootsift(
+        run.given.photos, folder, Cameras(known=known), mapping, pairs=pairs, max_size=run.max_size
+    )
+    write_json(folder / SECONDS, made.seconds)
+
+
+def part_of(names: Sequence[str], number: int) -> list[str]:
+    """The photos of a part, sorted; it depends on the names and the number alone.
+
+    Args:
+      names: of all photos, in order; more than `LEAST`.
+    """
+    random = np.random.default_rng(number)
+    size = int(random.integers(LEAST, min(MOST, len(names) - 1) + 1))
+    reach = min(WITHIN * size, len(names))
+    start = int(random.integers(0, len(names) - reach + 1))
+    inside = random.choice(reach, size, replace=False)
+    return sorted(names[start + int(k)] for k in inside)
+
+
+def part_runs(
+    run: LedgerRun, home: Path, whole: Path, count: int
+) -> Iterator[tuple[int, SetPhotos, Path]]:
+    """Map parts of a set; yields the number of each, its photos, and the folder of its run.
+
+    The folder is used again for the next part. Matches of the whole set are used where they fit.
+
+    Args:
+      run: of the whole set; its options are those of the parts.
+      home: a folder for the runs.
+      whole: the folder of a run of the whole set, if there is one.
+      count: the number of parts. 0, or a set that is too small: the only part is the whole set.
+    """
+    given, folder = run.given, home / "run"
+    truth, names = given.truth, sorted(find_images(given.photos))
+    if truth is not None:
+        names = [name for name in names if of_photos(truth, [name])]
+    take_matches(folder, whole)
+    divided = count > 0 and len(names) > LEAST
+    for number in range(count if divided else 1):
+        if folder.is_dir():
+            forget_results(folder)
+        part = part_of(names, number) if divided else names
+        photos = linked(given.photos, part, home / "photos")
+        each = given._replace(photos=photos, truth=truth and of_photos(truth, part))
+        reconstruct_set(run._replace(given=each), folder)
+        yield number, each, folder

@@ -1,17 +1,22 @@
-"""The rows of `bench ledger`, what they add up to, and their tables as text and as Markdown."""
+"""The rows of `bench ledger`, what they add up to, and their tables as text and as Markdown.
+
+One table has the error rates of the check over its threshold: false alarms, and wrong models that
+pass.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypedDict
+from typing import Literal, NamedTuple, TypedDict
 
 import numpy as np
 from scipy.stats import binomtest
 
 from jaxsfm.bench.figures import BenchFigures, Cells, table
-from jaxsfm.bench.ledger_judges import LedgerOutcome
+from jaxsfm.bench.judges import Outcome
 from jaxsfm.bench.ledger_sets import Half, Kind
 
 SURE = 0.95
 """The probability of the intervals (Clopper and Pearson)."""
+THRESHOLDS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)
 
 
 class RootsiftFigures(TypedDict):
@@ -48,7 +53,7 @@ class LedgerRow(TypedDict):
     rotation_deg: float | None
     verdict: str
     """The worst over the models; empty if none was checked."""
-    outcome: LedgerOutcome
+    outcome: Outcome | Literal["ended in an error"]
     doubt: str
     """What the run says against its models; empty if it says nothing."""
     wrong: float | None
@@ -96,6 +101,19 @@ class LedgerCounts(TypedDict):
     """The mean."""
 
 
+class ErrorRates(NamedTuple):
+    """How often the check is wrong about models, if it doubts those above a threshold."""
+
+    threshold: float
+    """A model is doubted if it is wrong with a larger probability, as the check says."""
+    false_alarms: int
+    right: int
+    """The number of rows with right models."""
+    misses: int
+    wrong: int
+    """The number of rows with a wrong model."""
+
+
 LedgerFigures = BenchFigures[LedgerRow, list[LedgerCounts]]
 
 
@@ -133,6 +151,23 @@ def _counts(kind: Kind, half: Half, rows: list[LedgerRow]) -> LedgerCounts:
         "right_share": float(np.mean(shares)) if shares else None,
         "times_rootsift": float(np.mean(times)) if times else None,
     }
+
+
+def error_curve(rows: Sequence[LedgerRow]) -> list[ErrorRates]:
+    """The error rates over the threshold. Only what photos contradict counts here."""
+    known = [(row["outcome"], wrong) for row in rows if (wrong := row["wrong"]) is not None]
+    right = [wrong for outcome, wrong in known if outcome in ("right", "split")]
+    false = [wrong for outcome, wrong in known if outcome.startswith("wrong")]
+    return [
+        ErrorRates(
+            limit,
+            sum(each > limit for each in right),
+            len(right),
+            sum(each <= limit for each in false),
+            len(false),
+        )
+        for limit in THRESHOLDS
+    ]
 
 
 def _range(values: Iterable[float | None], form: Callable[[float], str]) -> str:
@@ -198,13 +233,24 @@ def counts_cells(each: LedgerCounts) -> Cells:
     }
 
 
+def curve_cells(each: ErrorRates) -> Cells:
+    """A row of the table of the curve."""
+    return {
+        "doubted above": f"{each.threshold:g}",
+        "right, doubted": f"{each.false_alarms} of {each.right}",
+        "wrong, passed": f"{each.misses} of {each.wrong}",
+    }
+
+
 def table_lines(figures: LedgerFigures) -> list[str]:
-    """All rows, why runs ended or doubt their models, and the sums."""
+    """All rows, why runs ended or doubt their models, the sums, and the check's error rates."""
     lines = table([cells(row) for row in figures["rows"]])
     for row in figures["rows"]:
         if said := row["error"] or row["doubt"]:
             lines.append(f"{row['set']}, seed {row['seed']}: {said}")
-    return [*lines, "", *table([counts_cells(each) for each in figures["summary"]])]
+    lines += ["", *table([counts_cells(each) for each in figures["summary"]])]
+    curve = [curve_cells(each) for each in error_curve(figures["rows"])]
+    return [*lines, "", *table(curve, names=1)]
 
 
 def _markdown(rows: Sequence[Cells]) -> list[str]:

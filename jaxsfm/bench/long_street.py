@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from jaxsfm.bench.rendered_video import turned
 from jaxsfm.bench.synthetic import (
     TexturedPlane,
     camera_matrix,
@@ -86,6 +85,11 @@ def houses(metres: float, *, seed: int = 0) -> list[TexturedPlane]:
             ),
         ]
     return planes
+
+
+def turned(degrees: np.ndarray) -> np.ndarray:
+    """A small turn, float64 (3, 3), from degrees about x, y and z."""
+    return cv2.Rodrigues(np.radians(np.asarray(degrees, float)))[0]
 
 
 def walk(photos: int, *, seed: int = 0) -> list[CameraPose]:

@@ -28,20 +28,21 @@ import numpy as np
 
 from jaxsfm.bench.ordinary_parts import (
     Brush,
+    Look,
+    OrdinaryScene,
     arc_around,
     box,
     brush_for,
     flat,
     ground,
+    ordinary_photo,
     place_at,
     sky,
     upright,
     walk_along,
     walls,
 )
-from jaxsfm.bench.ordinary_photos import Look, OrdinaryScene, ordinary_photo
-from jaxsfm.bench.scene_folder import ScenePhotos, check_scene, write_scene_folder
-from jaxsfm.bench.synthetic import TexturedPlane, look_at
+from jaxsfm.bench.synthetic import TexturedPlane, check_scene, look_at, write_scene_folder
 from jaxsfm.bench.walls import moved
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.sfm.evaluation import Similarity
@@ -266,10 +267,12 @@ def ordinary_scene(name: str, seed: int) -> OrdinaryScene:
 
 
 def write_ordinary(folder: Path, name: str, seed: int, size: tuple[int, int]) -> None:
-    """Write a scene that is called as in `SCENES` (`write_scene_folder`)."""
+    """Write a scene that is called as in `SCENES` (`write_scene_folder`).
 
-    def draw() -> ScenePhotos:
-        scene = ordinary_scene(name, seed)
-        return ScenePhotos(scene.poses, lambda i: ordinary_photo(scene, i, size))
-
-    write_scene_folder(folder, draw, size)
+    A folder that is there already stays as it is.
+    """
+    if folder.is_dir():
+        return
+    scene = ordinary_scene(name, seed)
+    photos = (ordinary_photo(scene, i, size) for i in range(len(scene.poses)))
+    write_scene_folder(folder, scene.poses, photos, size)

@@ -25,8 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.bench.scene_folder import ScenePhotos, check_scene, write_scene_folder
-from jaxsfm.bench.synthetic import TexturedPlane, look_at, render
+from jaxsfm.bench.synthetic import TexturedPlane, check_scene, look_at, render, write_scene_folder
 from jaxsfm.bench.walls import moved, posters, shift, texture, turn, wall
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.sfm.evaluation import Similarity
@@ -159,10 +158,12 @@ def repeated_scene(name: str, seed: int) -> RepeatedScene:
 
 
 def write_repeated(folder: Path, name: str, seed: int, size: tuple[int, int]) -> None:
-    """Write a scene that is called as in `SCENES` (`write_scene_folder`)."""
+    """Write a scene that is called as in `SCENES` (`write_scene_folder`).
 
-    def draw() -> ScenePhotos:
-        scene = repeated_scene(name, seed)
-        return ScenePhotos(scene.poses, lambda i: render(scene.planes, scene.poses[i], size))
-
-    write_scene_folder(folder, draw, size)
+    A folder that is there already stays as it is.
+    """
+    if folder.is_dir():
+        return
+    scene = repeated_scene(name, seed)
+    photos = (render(scene.planes, pose, size) for pose in scene.poses)
+    write_scene_folder(folder, scene.poses, photos, size)

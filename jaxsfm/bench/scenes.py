@@ -15,10 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxsfm.bench.inputs import check_root, choose_sets, usable_image
-from jaxsfm.bench.model_options import DayNightOptions
+from jaxsfm.bench.inputs import check_root, choose_sets, strecha_intrinsics, usable_image
 from jaxsfm.bench.night import synthetic_night
-from jaxsfm.bench.strecha_sets import strecha_intrinsics
+from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.colmap.given_cameras import parse_cameras, parse_intrinsics
 from jaxsfm.colmap.intrinsics import MODELS, KnownCameras, check_fits
@@ -73,8 +72,6 @@ def synthetic_scene(folder: Path, target: Path, options: DayNightOptions) -> Sce
             rgb,
             severity=options.severity,
             seed=(options.seed + zlib.crc32(f"{folder.name}/{name}".encode())) % 2**32,
-            denoise=options.denoise,
-            jpeg=options.jpeg,
         )
         night = f"{NIGHT}{Path(name).stem}.png"
         write_photo(target / night, dark)

@@ -8,17 +8,17 @@ and the last tenth of the frames (drift).
 
 import dataclasses
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.frames import FrameSequence, chosen_frames, linked
-from jaxsfm.bench.model_options import SequenceOptions
-from jaxsfm.bench.options import whole_numbers
-from jaxsfm.bench.other_features import OTHERS, presets_and_others, write_other_matches
+from jaxsfm.bench.inputs import Frames, chosen_frames, linked
+from jaxsfm.bench.methods import LIGHTGLUE, ROOTSIFT
+from jaxsfm.bench.options import BenchOptions, CameraUse, SequenceOptions, whole_numbers
+from jaxsfm.bench.other_methods import trained_networks, write_lightglue_database
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.given_cameras import parse_cameras
@@ -27,12 +27,17 @@ from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import run_mapper
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
+from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.colmap.view import View
-from jaxsfm.config import preset
+from jaxsfm.config import PRESETS, preset
+from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.pixels import Pixels
+from jaxsfm.matching.pipeline import open_images
+from jaxsfm.options import Mapper
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizedPhoto
 from jaxsfm.runs.matching_looks import timed
@@ -49,6 +54,8 @@ from jaxsfm.sfm.evaluation import (
 if TYPE_CHECKING:
     import pycolmap
 
+OTHERS = (ROOTSIFT, LIGHTGLUE)
+"""The methods that get the pairs of a preset."""
 END = 0.1
 """The share of the frames at either end whose errors are reported apart."""
 NEAR, NEAR_DEG = 0.05, 5.0
@@ -56,6 +63,31 @@ NEAR, NEAR_DEG = 0.05, 5.0
 limits of 7-Scenes (Shotton et al. 2013)."""
 MATCH_ERROR_PX = 12.0
 """Of a match of RootSIFT with a point: the limit of COLMAP's mapper."""
+
+
+class FrameSequence(NamedTuple):
+    """The input of all methods."""
+
+    folder: Path
+    """Of the frames and their poses."""
+    frames: Frames
+    work: Path
+    """Where results are kept."""
+    camera: CameraUse
+    """What is done with the camera of the folder."""
+    mapper: Mapper
+    """Of the presets."""
+    truth: Poses
+
+    @property
+    def intrinsics(self) -> str | None:
+        """The value of `--intrinsics`; None: the camera is not known."""
+        return None if self.camera == "unknown" else str(self.folder / "K.txt")
+
+    @property
+    def held(self) -> str | None:
+        """The value of `--intrinsics` for photos whose camera is not adjusted."""
+        return self.intrinsics if self.camera == "known" else None
 
 
 def errors(model: Poses, truth: Poses) -> dict[str, Json]:
@@ -127,6 +159,31 @@ def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[P
     return row, pairs
 
 
+def write_other_matches(
+    database: Path, folder: Path, method: str, pairs: Iterable[Pair], cameras: Cameras
+) -> dict[str, float]:
+    """Describe the photos of a folder with the features of a method, match and verify the pairs.
+
+    Args:
+      database: is written anew; its folder is made.
+      method: one of `OTHERS`.
+
+    Returns:
+      The seconds of the stages.
+    """
+    database.parent.mkdir(parents=True, exist_ok=True)
+    images, _ = open_images(folder)
+    verification, chosen, seconds = VerificationOptions(), sorted(pairs), dict[str, float]()
+    if method == ROOTSIFT:
+        with timed(seconds, "matching"):
+            write_rootsift_database(database, folder, images, cameras, verification, pairs=chosen)
+    else:
+        write_lightglue_database(
+            database, images, cameras, verification, pairs=chosen, seconds=seconds
+        )
+    return seconds
+
+
 def with_other_features(given: FrameSequence, method: str, pairs: set[Pair]) -> dict[str, Json]:
     """The same of `OTHERS` on given pairs: a model of COLMAP's incremental mapper, and frames
     localized by the matches with points of the model."""
@@ -191,6 +248,22 @@ def _placed_by_matches(
             pose = to_truth.moved(at.pose)
             found[frame.name] = pose_error(pose, given.truth[frame.stem])
     return found
+
+
+def presets_and_others(options: BenchOptions) -> list[str]:
+    """The chosen methods, presets and `OTHERS`; presets come first, because they choose the pairs.
+
+    Raises:
+      UserError: a method is unknown, there is no preset, or a package is missing.
+    """
+    methods = options.chosen_methods([*PRESETS, *OTHERS])
+    if methods[0] in OTHERS:
+        raise UserError(
+            f"--methods: {methods[0]} needs a preset beside it, which chooses the pairs"
+        )
+    if LIGHTGLUE in methods:
+        trained_networks()  # say at once what is missing
+    return methods
 
 
 def _measured(given: FrameSequence, methods: list[str]) -> Iterator[dict[str, Json]]:

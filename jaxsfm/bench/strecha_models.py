@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.bench.figures import write_json
-from jaxsfm.bench.lightglue import write_lightglue_database
+from jaxsfm.bench.inputs import StrechaSet
 from jaxsfm.bench.methods import (
     LIGHTGLUE,
     MAPPERS,
@@ -17,8 +17,7 @@ from jaxsfm.bench.methods import (
     ROOTSIFT,
     method_config,
 )
-from jaxsfm.bench.naive import match_pairs_naively
-from jaxsfm.bench.strecha_sets import StrechaSet
+from jaxsfm.bench.other_methods import match_pairs_naively, write_lightglue_database
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
@@ -29,7 +28,7 @@ from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.errors import writing
 from jaxsfm.io.atomic import atomic_folder
-from jaxsfm.io.pairs import best_pairs, exhaustive_pairs
+from jaxsfm.io.pairs import Pair, best_pairs, exhaustive_pairs
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import RECORD
@@ -117,26 +116,46 @@ def take_matches(work: Path, other: Path) -> None:
                 shutil.copyfile(other / name, fresh / name)
 
 
-def _run_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
-    """The models of a set by COLMAP's own features."""
-    photos, database = each.folder / "images", work / "database.db"
-    images, _ = open_images(photos)
+def map_rootsift(
+    photos: Path,
+    work: Path,
+    cameras: Cameras,
+    mapping: MapOptions,
+    *,
+    pairs: list[Pair] | None = None,
+    max_size: int | None = None,
+) -> SetModels:
+    """The models of photos by COLMAP's own features, verification and mapper.
+
+    Args:
+      photos, work: the folder of the photos, and one for the database and for sparse/.
+      pairs: those to match; None: all.
+      max_size: the longer side of the working images, pixels; None: COLMAP's own.
+    """
+    database, (images, _) = work / "database.db", open_images(photos)
     seconds: dict[str, float] = {}
-    cameras = run.cameras(each)
-    verification = VerificationOptions(seed=run.seed, threads=run.threads)
+    verification = VerificationOptions(seed=mapping.seed, threads=mapping.threads)
     with timed(seconds, "matching"):  # COLMAP does not say how long its extraction takes
         write_rootsift_database(
-            database, photos, images, cameras, verification, max_size=run.max_size
+            database, photos, images, cameras, verification, pairs=pairs, max_size=max_size
         )
-    return _mapped(database, work, run, seconds)
+    return _mapped(database, work, mapping, seconds)
 
 
-def _mapped(database: Path, work: Path, run: MethodRun, seconds: dict[str, float]) -> SetModels:
+def _mapped(
+    database: Path, work: Path, mapping: MapOptions, seconds: dict[str, float]
+) -> SetModels:
     """The models of the verified pairs in a database."""
     with timed(seconds, "mapping"):
-        models = build_models(database, read_two_views(database), run.mapping)
+        models = build_models(database, read_two_views(database), mapping)
     write_models(models, work / "sparse")
     return SetModels(models, seconds, None)
+
+
+def _run_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
+    """The models of a set by COLMAP's own features."""
+    photos, cameras = each.folder / "images", run.cameras(each)
+    return map_rootsift(photos, work, cameras, run.mapping, max_size=run.max_size)
 
 
 def _run_refined_rootsift(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
@@ -187,7 +206,7 @@ def _run_lightglue(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:
     seconds: dict[str, float] = {}
     options = VerificationOptions(seed=run.seed, threads=run.threads)
     write_lightglue_database(database, images, run.cameras(each), options, seconds=seconds)
-    return _mapped(database, work, run, seconds)
+    return _mapped(database, work, run.mapping, seconds)
 
 
 def _run_naive(each: StrechaSet, work: Path, run: MethodRun) -> SetModels:

@@ -1,10 +1,12 @@
-"""A small rendered scene with exact cameras: textured planes seen from an arc, one view at night.
+"""Rendered scenes with exact cameras: photos of textured planes, and the folders of scenes.
 
-The textures are photographs from the scikit-image package. `jaxsfm demo` and the tests use the
-scene. Results on it must be called synthetic.
+A small room, seen from an arc and once at night, is the scene of `jaxsfm demo` and of the tests.
+The textures are photographs from the scikit-image package. Results on rendered scenes must be
+called synthetic.
 """
 
 import dataclasses
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,7 @@ import numpy as np
 
 from jaxsfm.colmap.poses import CameraPose, Poses
 from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import atomic_folder
 
 SUPERSAMPLING = 2
 
@@ -201,3 +204,36 @@ def write_scene(
         poses[name] = pose
     np.savetxt(folder / "K.txt", k, fmt="%.9g")
     return poses
+
+
+def check_scene(name: str, scenes: Collection[str]) -> None:
+    """Raise ValueError unless there is a scene of this name."""
+    if name not in scenes:
+        raise ValueError(f"name must be one of {', '.join(scenes)}; got {name!r}")
+
+
+def write_scene_folder(
+    folder: Path, poses: Sequence[CameraPose], photos: Iterable[np.ndarray], size: tuple[int, int]
+) -> None:
+    """Write a scene in the layout of Strecha's sets: images/ with K.txt, and gt_dense_cameras/.
+
+    The photos are called view00.png, view01.png and so on. The folder is written whole or not at
+    all.
+
+    Args:
+      poses: in the order of the photos' names.
+      photos: those of the poses, uint8 RGB; each is taken when it is written.
+      size: width and height of the photos, pixels.
+    """
+    k = camera_matrix(size)
+    # In these sets, pixels are counted from the corner of the top-left pixel, as COLMAP does.
+    k[:2, 2] += 0.5
+    with atomic_folder(folder) as fresh:
+        images, cameras = fresh / "images", fresh / "gt_dense_cameras"
+        images.mkdir()
+        cameras.mkdir()
+        np.savetxt(images / "K.txt", k, fmt="%.9g")
+        for i, (pose, photo) in enumerate(zip(poses, photos, strict=True)):
+            name = f"view{i:02d}.png"
+            write_photo(images / name, photo)
+            (cameras / f"{name}.camera").write_text(camera_text(k, pose, size), encoding="ascii")

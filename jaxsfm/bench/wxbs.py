@@ -5,26 +5,34 @@ hand. The figure is the mean average accuracy (mAA): the share of these points w
 their epipolar lines, averaged over t = 1, 2, ..., 20.
 """
 
+import functools
 import hashlib
+import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
 from jaxsfm.bench.figures import BenchFigures, Cells, Spread, collect, spread, table
 from jaxsfm.bench.inputs import check_root, choose_sets, read_rows, usable_image
-from jaxsfm.bench.matches import Matcher, Matches
-from jaxsfm.bench.methods import PAIR_METHODS
+from jaxsfm.bench.methods import METHODS, NAIVE, method_config
 from jaxsfm.bench.options import WxbsOptions
+from jaxsfm.bench.other_methods import match_pairs_naively
+from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.database import read_matches
+from jaxsfm.colmap.rootsift import write_rootsift_database
+from jaxsfm.colmap.two_views import VerificationOptions
+from jaxsfm.config import Config
 from jaxsfm.errors import UserError
+from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photo_folder import SUFFIXES
-from jaxsfm.sfm.epipolar import (
-    epipolar_residuals,
-    fundamental_matrix,
-    single_fundamental_matrix,
-)
+from jaxsfm.io.weights import chosen_weights
+from jaxsfm.matching.extraction import image_features
+from jaxsfm.sfm.epipolar import epipolar_residuals, fundamental_matrix, single_fundamental_matrix
+from jaxsfm.sfm.two_photos.matched import match_photos
 
 THRESHOLDS_PX = np.arange(1, 21)
 PUBLISHED_THRESHOLDS_PX = np.arange(11)
@@ -35,6 +43,8 @@ PUBLISHED = {"DKM": 0.589, "RoMa": 0.801}
 HALVES = ("half A", "half B")
 """The pairs are split by a hash of their names, so that choices can be made on half A and reported
 on half B."""
+FEATURES = 8
+"""How many images' features are held: those of two images for each of four methods."""
 Means = dict[str, dict[str, Spread]]
 """mAA by method and category."""
 
@@ -92,9 +102,93 @@ def _image(folder: Path, stem: str) -> ImageFile:
     return usable_image(found[0])
 
 
+class Matches(NamedTuple):
+    """The matches of one pair by one method with one seed."""
+
+    xy0: np.ndarray
+    """float64 (n, 2): original pixels, centre of the top-left pixel (0, 0)."""
+    xy1: np.ndarray
+    seconds: float
+    """Time of extracting both images and of matching; the first image of a size also compiles."""
+    evidence: float | None = None
+    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos`); None if the method
+    does not say it."""
+
+
+class Matcher:
+    """Matches pairs of images.
+
+    The features of an image are computed once for all its pairs and all methods that use the same
+    features.
+    """
+
+    def __init__(self, options: WxbsOptions) -> None:
+        self._options = options
+        self._weights = functools.cache(functools.partial(chosen_weights, options.network))
+        self._extract = functools.lru_cache(maxsize=FEATURES)(self._timed_features)
+
+    def match(self, image0: ImageFile, image1: ImageFile, method: str) -> list[Matches]:
+        """The matches of a pair for each seed.
+
+        Args:
+          image0, image1: two images of one folder, called by their files' names.
+          method: one of `METHODS`.
+        """
+        seeds = range(self._options.seeds)
+        if method == "rootsift":
+            start = time.monotonic()
+            xy0, xy1 = _rootsift(image0, image1)
+            taken = time.monotonic() - start
+            return [Matches(xy0, xy1, taken)] * len(seeds)  # nothing is random
+        config = method_config(method, max_size=self._options.max_size)
+        if method == NAIVE:
+            return [self._naive(image0, image1, config, seed) for seed in seeds]
+        (features0, seconds0), (features1, seconds1) = (
+            self._extract(image, config.extraction()) for image in (image0, image1)
+        )
+        results = []
+        for seed in seeds:
+            start = time.monotonic()
+            weights = self._weights(config.backbone)
+            found = match_photos(weights, features0, features1, config=config, seed=seed)
+            taken = seconds0 + seconds1 + time.monotonic() - start
+            xy0, xy1 = found.result.keypoints0.astype(np.float64), found.aligned.keypoints1
+            results.append(Matches(xy0, xy1, taken, found.evidence))
+        return results
+
+    def _naive(self, image0: ImageFile, image1: ImageFile, config: Config, seed: int) -> Matches:
+        start = time.monotonic()
+        images = {image.name: image for image in (image0, image1)}
+        weights = self._weights(config.backbone)
+        pair = (image0.name, image1.name)
+        (found,) = match_pairs_naively(weights, images, [pair], config=config, seed=seed)
+        xy0, xy1 = (xy.astype(np.float64) for xy in (found.keypoints0, found.keypoints1))
+        return Matches(xy0, xy1, time.monotonic() - start)
+
+    def _timed_features(self, image: ImageFile, config: Config) -> tuple[ImageFeatures, float]:
+        weights = self._weights(config.backbone)
+        start = time.monotonic()
+        features = image_features(weights, image, config=config)
+        return features, time.monotonic() - start
+
+
+def _rootsift(image0: ImageFile, image1: ImageFile) -> tuple[np.ndarray, np.ndarray]:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        database = Path(scratch) / "database.db"
+        # A fundamental matrix needs eight matches.
+        write_rootsift_database(
+            database,
+            image0.path.parent,
+            [image0, image1],
+            Cameras(),
+            VerificationOptions(min_inliers=8),
+        )
+        return read_matches(database, (image0.name, image1.name), verified=False)
+
+
 def bench_wxbs(options: WxbsOptions) -> BenchFigures[WxbsRow, Means]:
     """Run all methods on all pairs (CATEGORY/NAME/{01,02}.png, corrs.txt)."""
-    methods = options.chosen_methods(PAIR_METHODS)
+    methods = options.chosen_methods(METHODS)
     inputs = {
         folder: (
             _image(folder, "01"),

@@ -6,14 +6,15 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from jaxsfm.bench.model_options import (
+from jaxsfm.bench.options import (
     AmbiguousOptions,
+    BenchOptions,
     DayNightOptions,
     LedgerOptions,
     SequenceOptions,
     StrechaOptions,
+    WxbsOptions,
 )
-from jaxsfm.bench.options import BenchOptions, WxbsOptions
 from jaxsfm.cli.run_commands import Positional, check_writable
 from jaxsfm.cli.subcommands import one_of
 from jaxsfm.io.libraries import limit_threads
@@ -46,10 +47,10 @@ def ledger(bench: Unnamed[LedgerOptions]) -> int:
     """
     limit_threads(bench.threads)
     from jaxsfm.bench.ledger import bench_ledger
-    from jaxsfm.bench.ledger_curve import lines_with_curve
+    from jaxsfm.bench.ledger_table import table_lines
 
     check_writable(bench.markdown, "--markdown", (".md",))
-    return _run(bench_ledger, lines_with_curve, bench)
+    return _run(bench_ledger, table_lines, bench)
 
 
 def strecha(bench: Unnamed[StrechaOptions]) -> int:

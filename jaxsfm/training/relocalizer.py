@@ -1,29 +1,34 @@
-"""The training of a relocalizer's scores, for the command `jaxsfm train relocalizer`."""
+"""The training of a relocalizer's scores, for the command `jaxsfm train relocalizer`.
+
+A checkpoint is the state of a training in one safetensors file, from which it can go on.
+"""
 
 import dataclasses
 import functools
 import hashlib
 import importlib.metadata
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import safetensors
+import safetensors.numpy
 from jaxtyping import PyTree
 from tqdm import tqdm
 
 from jaxsfm.core.scores import HIDDEN, init_scores
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.io.atomic import Json
+from jaxsfm.io.atomic import Json, write_atomic
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.relocalizer import save_relocalizer
 from jaxsfm.io.weights import Weights
-from jaxsfm.training.checkpoint import load_checkpoint, save_checkpoint
 from jaxsfm.training.objective import (
     Examples,
     Objective,
@@ -41,6 +46,8 @@ SAVED_EVERY = 10
 """The number of steps between two checkpoints, of 0.1 MB each."""
 EVALUATION_STEP = 1 << 30
 """The held-out views are drawn with step numbers from here on, which no training reaches."""
+Tree = TypeVar("Tree")
+FORMAT = "jaxsfm training 1"
 Progress = list[Mapping[str, Json]]
 """What was measured at each evaluation: the step, the loss and its parts, and the shares."""
 
@@ -118,6 +125,40 @@ def start_state(options: TrainOptions) -> State:
     """Return the state before the first step, in which scores equal squared norms."""
     scores = init_scores(jax.random.key(options.seed), hidden=options.hidden)
     return State(scores, _optimizer(options).init(scores), np.zeros((), np.int32))
+
+
+def save_checkpoint(path: Path, state: PyTree, about: Mapping[str, Json]) -> None:
+    """Write the state of a training, a tree of arrays.
+
+    Args:
+      about: which training it is, and what it has measured.
+
+    Raises:
+      UserError: the file cannot be written.
+    """
+    leaves = {str(k): np.asarray(leaf) for k, leaf in enumerate(jax.tree.leaves(state))}
+    write_atomic(path, safetensors.numpy.save(leaves, metadata={FORMAT: json.dumps(about)}))
+
+
+def load_checkpoint(path: Path, like: Tree) -> tuple[Tree, dict[str, Json]]:
+    """Read the state of a training, and what was saved about it.
+
+    Args:
+      like: a state with the same structure and shapes.
+
+    Raises:
+      UserError: the file is not a checkpoint, or its state has another structure.
+    """
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            about = json.loads((file.metadata() or {})[FORMAT])
+            leaves = [file.get_tensor(str(k)) for k in range(len(file.keys()))]
+    except Exception as error:  # a damaged file can raise more than safetensors' own error
+        raise UserError(f"{path}: not a readable checkpoint; delete it to start again") from error
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(like)]
+    if [leaf.shape for leaf in leaves] != shapes or not isinstance(about, dict):
+        raise UserError(f"{path}: a checkpoint of another training; delete it to start again")
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), about
 
 
 def train_relocalizer(

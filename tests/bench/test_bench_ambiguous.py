@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from jaxsfm.bench.ambiguous import cells, counts, table_lines
-from jaxsfm.bench.methods import AMBIGUOUS_METHODS, RUN_METHODS, method_config
-from jaxsfm.bench.model_options import AmbiguousOptions
-from jaxsfm.bench.outcomes import OUTCOMES
+from jaxsfm.bench.judges import OUTCOMES
+from jaxsfm.bench.methods import AMBIGUOUS_METHODS, METHODS, method_config
+from jaxsfm.bench.options import AmbiguousOptions
 from jaxsfm.bench.strecha_models import take_matches
 from jaxsfm.cli.main import main
 from jaxsfm.config import preset
@@ -22,7 +22,7 @@ def test_colmaps_mappers_get_the_matches_of_default_and_all_of_its_pairs():
     assert config == method_config("colmap-global", max_size=400)
     assert config.matching() == dataclasses.replace(preset("default"), max_size=400).matching()
     assert not config.view_graph and config.refinement is None
-    more = {*AMBIGUOUS_METHODS} - {*RUN_METHODS}
+    more = {*AMBIGUOUS_METHODS} - {*METHODS}
     assert more == {"rootsift+refined", "aliked+lightglue", "colmap", "colmap-global"}
 
 

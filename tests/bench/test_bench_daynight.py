@@ -11,13 +11,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.bench import scenes
-from jaxsfm.bench.curves import cumulative
-from jaxsfm.bench.daynight import PUBLISHED, table_lines
-from jaxsfm.bench.model_options import DayNightOptions
-from jaxsfm.bench.night_matches import NightMatches, epipolar_distance
+from jaxsfm.bench.daynight import PUBLISHED, cumulative, table_lines
 from jaxsfm.bench.night_protocol import LIMITS, judge, summary
+from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Subset
-from jaxsfm.bench.subset_models import SubsetModel, dense_models, naive_models, rootsift_models
+from jaxsfm.bench.subset_models import (
+    NightMatches,
+    SubsetModel,
+    dense_models,
+    epipolar_distance,
+    naive_models,
+    rootsift_models,
+)
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import CameraPose, read_poses
 from jaxsfm.errors import UserError

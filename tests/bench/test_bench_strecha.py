@@ -6,9 +6,9 @@ import shutil
 
 import pytest
 
+from jaxsfm.bench.inputs import find_sets
 from jaxsfm.bench.methods import method_config
 from jaxsfm.bench.strecha import PUBLISHED, means, ratios, table_lines
-from jaxsfm.bench.strecha_sets import find_sets
 from jaxsfm.cli.main import main
 from jaxsfm.config import preset
 

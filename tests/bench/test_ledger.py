@@ -12,11 +12,24 @@ from verdicts import check_of
 
 from jaxsfm.bench import ledger, ledger_runs
 from jaxsfm.bench.ledger import bench_ledger
-from jaxsfm.bench.ledger_photos import as_frames, as_phototourism, as_turned
 from jaxsfm.bench.ledger_runs import SECONDS, LedgerRun, SetPhotos, apart, run_set
-from jaxsfm.bench.ledger_sets import DRAWN, choose_ledger_sets, ledger_sets
-from jaxsfm.bench.ledger_table import counts, markdown, set_cells, table_lines
-from jaxsfm.bench.model_options import LedgerOptions
+from jaxsfm.bench.ledger_sets import (
+    DRAWN,
+    as_frames,
+    as_phototourism,
+    as_turned,
+    choose_ledger_sets,
+    ledger_sets,
+)
+from jaxsfm.bench.ledger_table import (
+    THRESHOLDS,
+    counts,
+    error_curve,
+    markdown,
+    set_cells,
+    table_lines,
+)
+from jaxsfm.bench.options import LedgerOptions
 from jaxsfm.bench.synthetic import camera_text, write_photo
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.model_folders import write_models
@@ -400,6 +413,37 @@ def test_the_markdown_has_a_line_for_each_set_and_the_commit_in_its_caption():
     assert len(widths) == 1
     assert "commit" not in markdown(figures, "2026-12-01", "")
     assert "statue, seed 0: it failed" in table_lines(figures)
+
+
+# -- the error rates of the check over its threshold -----------------------------------------------
+
+
+def checked(outcome, wrong):
+    return row(outcome=outcome, wrong=wrong)
+
+
+def test_right_models_above_the_threshold_are_false_alarms_and_wrong_ones_below_it_misses():
+    rows = [checked("right", 0.04), checked("split", 0.4), checked("wrong, noticed", 0.25)]
+    rows += [
+        checked("wrong, not noticed", 0.0),
+        checked("no model", None),
+        checked("not judged", 0.9),
+    ]
+    found = {each.threshold: each for each in error_curve(rows)}
+    assert found[0.02][1:] == (2, 2, 1, 2)
+    assert found[0.2][1:] == (1, 2, 1, 2)
+    assert found[0.3][1:] == (1, 2, 2, 2)
+    assert found[0.5][1:] == (0, 2, 2, 2)
+
+
+def test_with_the_threshold_false_alarms_fall_and_misses_grow():
+    rows = [checked("right", k / 10) for k in range(10)] + [
+        checked("wrong, noticed", k / 10) for k in (2, 8)
+    ]
+    curve = error_curve(rows)
+    assert [each.threshold for each in curve] == sorted(THRESHOLDS)
+    for before, after in zip(curve, curve[1:], strict=False):
+        assert after.false_alarms <= before.false_alarms and after.misses >= before.misses
 
 
 # -- the command -----------------------------------------------------------------------------------

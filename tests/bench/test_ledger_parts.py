@@ -5,11 +5,11 @@ import json
 import pytest
 from test_ledger import SET, TRUTH, judged_rows, write_run, write_set
 
-from jaxsfm.bench import ledger_parts
+from jaxsfm.bench import ledger_runs
 from jaxsfm.bench.ledger import bench_ledger
-from jaxsfm.bench.ledger_parts import LEAST, MOST, NOTHING_AFTER, part_of
-from jaxsfm.bench.ledger_photos import SetPhotos
-from jaxsfm.bench.model_options import LedgerOptions
+from jaxsfm.bench.ledger_runs import LEAST, MOST, NOTHING_AFTER, part_of
+from jaxsfm.bench.ledger_sets import SetPhotos
+from jaxsfm.bench.options import LedgerOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.photo_folder import find_images
 
@@ -34,7 +34,7 @@ def made(monkeypatch):
             path.rename(folder / path.name)
         models.rmdir()
 
-    monkeypatch.setattr(ledger_parts, "reconstruct_set", reconstruct_set)
+    monkeypatch.setattr(ledger_runs, "reconstruct_set", reconstruct_set)
     return asked
 
 

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxsfm.bench.lightglue import lightglue_matches
+from jaxsfm.bench.other_methods import lightglue_matches
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import KeypointMatches, read_matches, write_keypoint_matches
 from jaxsfm.errors import UserError

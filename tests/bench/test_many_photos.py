@@ -8,11 +8,11 @@ import sys
 import numpy as np
 import pytest
 
-from jaxsfm.bench import driver, other_features, sequence
-from jaxsfm.bench.frames import chosen_frames
+from jaxsfm.bench import driver, sequence
+from jaxsfm.bench.driver import NOISE_PX, REACH, SimulatedStreet
+from jaxsfm.bench.inputs import chosen_frames, linked
 from jaxsfm.bench.long_street import SIZE, walk, write_street
-from jaxsfm.bench.model_options import SequenceOptions
-from jaxsfm.bench.simulated import NOISE_PX, REACH, SimulatedStreet
+from jaxsfm.bench.options import SequenceOptions
 from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
@@ -82,6 +82,30 @@ def test_frames_are_chosen_by_name_and_each_is_mapped_or_localized(street_sequen
         chosen_frames(folder, 5, 0) and chosen_frames(folder, 10, 0)
 
 
+def linked_photos(folder) -> dict[str, str]:
+    found = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in found}
+
+
+def test_a_folder_has_the_asked_photos_of_the_asked_folder_and_no_others(tmp_path):
+    for folder in ("one", "two"):
+        for name in ("a.jpg", "night/b.jpg", "night/c.jpg"):
+            path = tmp_path / folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{folder} {name}")
+    target = tmp_path / "links"
+    linked(tmp_path / "one", ["a.jpg", "night/b.jpg"], target)
+    assert linked_photos(target) == {"a.jpg": "one a.jpg", "night/b.jpg": "one night/b.jpg"}
+    linked(tmp_path / "two", ["night/b.jpg", "night/c.jpg"], target)
+    assert linked_photos(target) == {
+        "night/b.jpg": "two night/b.jpg",
+        "night/c.jpg": "two night/c.jpg",
+    }
+    (tmp_path / "two" / "night" / "b.jpg").unlink()
+    linked(tmp_path / "one", ["night/b.jpg"], target)
+    assert linked_photos(target) == {"night/b.jpg": "one night/b.jpg"}
+
+
 @pytest.mark.parametrize(
     ("given", "says"),
     [
@@ -130,9 +154,9 @@ def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
         seen.append(([image.name for image in images], pairs))
         raise UserError("seen")
 
-    monkeypatch.setattr(other_features, "trained_networks", lambda: None)
+    monkeypatch.setattr(sequence, "trained_networks", lambda: None)
     monkeypatch.setattr(sequence, "with_jaxsfm", lambda given, name: ({}, chosen))
-    monkeypatch.setattr(other_features, "write_lightglue_database", write_lightglue_database)
+    monkeypatch.setattr(sequence, "write_lightglue_database", write_lightglue_database)
     options = SequenceOptions(
         root=street_sequence, every=("2",), methods=("default,aliked+lightglue",), out=tmp_path
     )

@@ -8,9 +8,9 @@ import pytest
 from room_scene import hidden
 
 from jaxsfm.bench import ordinary_parts
+from jaxsfm.bench.inputs import read_set
 from jaxsfm.bench.ordinary import KINDS, PREFIX, SCENES, ordinary_scene, write_ordinary
-from jaxsfm.bench.ordinary_photos import SHADE, Look, developed, ordinary_photo, planes_in
-from jaxsfm.bench.strecha_sets import read_set
+from jaxsfm.bench.ordinary_parts import SHADE, Look, developed, ordinary_photo, planes_in
 from jaxsfm.bench.synthetic import TexturedPlane, camera_matrix, render
 
 SIZE = (160, 120)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from verdicts import check_of
 
-from jaxsfm.bench.outcomes import doubt, judge
+from jaxsfm.bench.judges import doubt, judge
 from jaxsfm.bench.synthetic import look_at
 from jaxsfm.bench.walls import turn
 from jaxsfm.colmap.poses import CameraPose
@@ -72,7 +72,7 @@ def outcome(models, truth, noticed=False):
 def test_a_model_is_right_in_any_position_scale_and_direction(seed):
     truth = ring()
     exact = moved(truth, similarity(seed))
-    assert judge([exact], truth, noticed=False) == ("right", [[20]])
+    assert judge([exact], truth, noticed=False) == ("right", [[20]], 20)
     near = disturbed(truth, position=0.3 * POSITION_SHARE * extent(truth), rotation_deg=1.0)
     assert outcome([moved(near, similarity(seed))], truth) == "right"
 
@@ -144,7 +144,7 @@ def test_one_photo_of_twenty_may_be_misplaced_but_not_two():
 def test_parts_that_are_right_but_not_joined_are_split():
     truth = ring()
     parts = [moved(part(truth, 0, 12), similarity(1)), moved(part(truth, 12, 20), similarity(2))]
-    assert judge(parts, truth, noticed=False) == ("split", [[12], [8]])
+    assert judge(parts, truth, noticed=False) == ("split", [[12], [8]], 20)
     assert outcome(parts[:1], truth) == "split"
     assert outcome([part(truth, 0, 18)], truth) == "right"  # one photo of ten may be missing
     wrong = folded(parts[1], sorted(parts[1])[:4], np.pi)
@@ -165,7 +165,7 @@ def test_cameras_on_a_line_are_judged_too():
     shifted = truth | {
         name: CameraPose(np.eye(3), truth[name].centre - [3.0, 0, 0]) for name in sorted(truth)[4:]
     }
-    assert judge([shifted], truth, noticed=False) == ("wrong, not noticed", [[4, 4]])
+    assert judge([shifted], truth, noticed=False) == ("wrong, not noticed", [[4, 4]], 0)
 
 
 def test_the_order_of_photos_has_no_effect():

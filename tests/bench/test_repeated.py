@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from room_scene import hidden
 
+from jaxsfm.bench.inputs import read_set
 from jaxsfm.bench.repeated import KINDS, PREFIX, SCENES, repeated_scene, write_repeated
-from jaxsfm.bench.strecha_sets import read_set
 from jaxsfm.bench.synthetic import TexturedPlane, camera_matrix, render
 from jaxsfm.bench.walls import moved
 from jaxsfm.sfm.check.common_places import POSITION_SHARE, ROTATION_DEG

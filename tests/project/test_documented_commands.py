@@ -104,8 +104,7 @@ def home(plain, scene, tmp_path, monkeypatch):
     monkeypatch.setenv("JAXSFM_DATA", str(tmp_path / "data"))
     for each in pkgutil.walk_packages(jaxsfm.__path__, "jaxsfm."):
         # Before anything is replaced: a module that is imported later would keep the replacement.
-        # The measurements of speed import what they compare with; no command runs them.
-        if not each.name.startswith("jaxsfm.bench.speed") and not each.name.endswith("__main__"):
+        if not each.name.endswith("__main__"):
             importlib.import_module(each.name)
     for path in LONG:
         module, _, name = path.rpartition(".")

@@ -266,7 +266,7 @@ def test_every_module_is_imported_and_small_parts_work_without_what_windows_lack
     told = json.loads(as_on_windows(SMALL_PARTS, tmp_path, url(server)).splitlines()[-1])
     assert told["refused"] == []
     # Packages of extras that are not installed.
-    assert {*told["missing"]} <= {"torch", "faiss", "ray", "viser", "lightglue", "skimage"}
+    assert {*told["missing"]} <= {"torch", "ray", "viser", "lightglue", "skimage"}
     assert (tmp_path / "file").read_bytes() == CONTENT
     assert forbidden_names(tmp_path) == []
 

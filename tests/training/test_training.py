@@ -18,10 +18,14 @@ from jaxsfm.io.weights import load_weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.training import relocalizer
-from jaxsfm.training.checkpoint import load_checkpoint, save_checkpoint
 from jaxsfm.training.objective import Objective
 from jaxsfm.training.photos import Crops, split
-from jaxsfm.training.relocalizer import TrainOptions, train_relocalizer
+from jaxsfm.training.relocalizer import (
+    TrainOptions,
+    load_checkpoint,
+    save_checkpoint,
+    train_relocalizer,
+)
 
 SMALL = TrainOptions(steps=6, batch=2, view=64, crop=128, hidden=4)
 

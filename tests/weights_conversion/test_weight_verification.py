@@ -13,10 +13,16 @@ from jaxsfm.core.vgg import LAYERS, VGG16, preprocess
 from jaxsfm.io.weight_files import read_converted
 from jaxsfm.io.weights import TORCHVISION, load_weights
 from weights_conversion.convert import read_source, write_converted
-from weights_conversion.forward import layer_maps
 from weights_conversion.source import Convention, Source
 from weights_conversion.torchvision import CONVENTION
-from weights_conversion.verify import LIMIT, agrees, compare, noise_image, table_lines
+from weights_conversion.verify import (
+    LIMIT,
+    agrees,
+    compare,
+    layer_maps,
+    noise_image,
+    table_lines,
+)
 
 SIZE = (33, 42)
 """The number of rows is odd, so the last one is not pooled."""
