@@ -1,7 +1,7 @@
 """Two models that share photos as one model: whether they agree, and what the one looks like."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,6 +28,8 @@ MIN_SHARE = 0.5
 """The least share of the common points that fall together."""
 ERROR_PX = 4.0
 """The largest error of a right observation in pixels, as in COLMAP."""
+COARSE = 4.0
+"""The first adjustment has observations whose error is up to so many times larger."""
 
 
 class Join(NamedTuple):
@@ -102,18 +104,12 @@ def joined(
 
 
 def adjusted(
-    model: Model,
-    *,
-    error_px: float,
-    refine_intrinsics: bool,
-    threads: int,
-    slacks: Sequence[float] = (4.0, 1.0),
+    model: Model, *, error_px: float, refine_intrinsics: bool, threads: int
 ) -> "pycolmap.Reconstruction":
-    """Filter the observations and adjust the bundle, again and again; the first filter is coarse.
+    """Filter the observations and adjust the bundle, twice; the first filter is coarse.
 
     Args:
       error_px: the largest error of a right observation, pixels of the views.
-      slacks: so many times that error is allowed, one adjustment after the other.
     """
 
     def once(slack: float) -> "pycolmap.Reconstruction":
@@ -123,6 +119,5 @@ def adjusted(
         bundle_adjust(made, loss_px=loss_px, refine_intrinsics=refine_intrinsics, threads=threads)
         return made
 
-    for slack in slacks[:-1]:
-        model = Model.from_colmap(once(slack), model.sizes)
-    return once(slacks[-1])
+    model = Model.from_colmap(once(COARSE), model.sizes)
+    return once(1.0)
