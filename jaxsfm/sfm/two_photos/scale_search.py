@@ -52,10 +52,10 @@ def at_other_scales(
             yield look(side0, side1, images, config=config, seed=seed)
 
 
-def turned_view(image: ImageFile, quarters: int, *, size: int = TURNED_SIZE) -> PhotoView:
-    """The whole upright photo after quarter turns clockwise, reduced to `size` pixels at most."""
+def turned_view(image: ImageFile, quarters: int) -> PhotoView:
+    """The whole upright photo after quarter turns clockwise, of at most `TURNED_SIZE`."""
     width, height = image.upright_size
-    factor = min(size / max(width, height), 1.0)
+    factor = min(TURNED_SIZE / max(width, height), 1.0)
     turns = np.eye(3)
     for _ in range(quarters % 4):  # (x, y) of a photo of `height` rows becomes (height - 1 - y, x)
         turns = np.asarray([[0, -1, height - 1], [1, 0, 0], [0, 0, 1.0]]) @ turns
