@@ -54,6 +54,7 @@ FILES = (
     "jaxsfm/sfm/register",
     "jaxsfm/sfm/road.py",
     "jaxsfm/sfm/settled_stage.py",
+    "jaxsfm/sfm/stage_files.py",
     "jaxsfm/sfm/told_apart.py",
     "jaxsfm/sfm/view_graph.py",
 )
@@ -86,7 +87,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "check/other_places": ("tests/sfm/test_check_places.py", CHECK),
     "check/pair_fit": ("tests/sfm/test_check_places.py", CHECK),
     "check/thinning": ("tests/sfm/test_check_thinning.py",),
-    "check/check_files": ("tests/sfm/test_stage_files.py",),
     "check/check_model": (CHECK, "tests/sfm/test_check_scale.py"),
     "check/model_check": ("tests/sfm/test_settled_stage.py", "tests/report/test_verdict.py"),
     "check/scale": ("tests/sfm/test_check_scale.py",),
