@@ -12,8 +12,8 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.sfm.check.check_model import pair_fits
 from jaxsfm.sfm.check.other_places import Surface, shown_by
-from jaxsfm.sfm.check.pair_fit import pair_fits
 from jaxsfm.sfm.limits import CHECK, REGISTER
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
