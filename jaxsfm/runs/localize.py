@@ -1,7 +1,7 @@
 """Localization of photos in a finished run, whose models do not change.
 
 Each photo is matched with photos of the run, and its pose is found in the model of which it shows
-most (`jaxsfm.sfm.register.place`). The result of a photo depends on its content, the run and
+most (`jaxsfm.sfm.register.locate_view`). The result of a photo depends on its content, the run and
 the options. It does not depend on the other photos of the same call, nor on the photo's name,
 unless a list of known cameras names it.
 """
@@ -46,7 +46,7 @@ from jaxsfm.runs.working_model import (
     weights_of_run,
 )
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.register.place import Place, UnregisteredView, best_place, place_in
+from jaxsfm.sfm.register.locate_view import Place, UnregisteredView, best_place, place_in
 
 MANY_INLIERS = 100
 """A pose that so many matches agree with is not looked for again. A photo of a sixth of the size

@@ -108,12 +108,16 @@ TESTS: dict[str, tuple[str, ...]] = {
     "refine/weak_views": (WEAK,),
     "register/grow": (
         "tests/sfm/test_new_points.py",
+        "tests/sfm/test_placed_views.py",
         "tests/sfm/test_refused_places.py",
         "tests/runs/test_extend.py",
     ),
     "register/lost": ("tests/sfm/test_lost_views.py",),
-    "register/locate_view": ("tests/sfm/test_single_view.py", "tests/sfm/test_new_points.py"),
-    "register/place": ("tests/sfm/test_new_points.py", "tests/runs/test_localize.py"),
+    "register/locate_view": (
+        "tests/sfm/test_single_view.py",
+        "tests/sfm/test_new_points.py",
+        "tests/runs/test_localize.py",
+    ),
     "register/triangulate": ("tests/sfm/test_new_points.py",),
     "runs/turned_photos": ("tests/runs/test_turned_photos.py", "tests/runs/test_run_photos.py"),
     "sfm/mapping": (ROAD, "tests/sfm/test_two_mappings.py"),
