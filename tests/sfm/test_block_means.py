@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxsfm.sfm.refine.padding import block_means
+from jaxsfm.sfm.refine.device_images import block_means
 
 
 def image() -> np.ndarray:

@@ -26,7 +26,7 @@ from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck
 from jaxsfm.sfm.limits import CHECK
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.refine.fixed_structure import MATCH_ERROR_PX, matched_points
 
 MIN_POINTS = 30
 """A model with fewer points is not checked."""

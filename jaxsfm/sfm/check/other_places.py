@@ -23,7 +23,7 @@ from jaxsfm.sfm.limits import SECOND_PLACES
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import may_show
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.refine.fixed_structure import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 

@@ -18,8 +18,12 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
-from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
+from jaxsfm.sfm.refine.fixed_structure import (
+    MATCH_ERROR_PX,
+    AlignedPoints,
+    FixedStructure,
+    matched_points,
+)
 from jaxsfm.sfm.refine.octave_pose import (
     MAX_DOUBT_PX,
     MAX_SEARCHED_DOUBT_PX,
