@@ -39,8 +39,8 @@ from jaxsfm.report.run_report import RunReport
 from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
-from jaxsfm.sfm.reconstruction import reconstruct
 from jaxsfm.sfm.refined_models import Believed, refine_models
+from jaxsfm.sfm.road import reconstruct
 
 if TYPE_CHECKING:
     import pycolmap

@@ -27,7 +27,7 @@ from jaxsfm.io.work_folder import RECORD
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.mapped_stage import DATABASE
-from jaxsfm.sfm.reconstruction import reconstruct
+from jaxsfm.sfm.road import reconstruct
 
 FEATURES = 64
 """Photos whose features are kept for the next subset (at least those of one): 25 MB each at 1536 x

@@ -1,4 +1,4 @@
-"""The refinement of a model that another tool has made: with its photos, and back to where it lay."""
+"""The refinement of a model that another tool has made, from its photos and in its frame."""
 
 import dataclasses
 import functools
