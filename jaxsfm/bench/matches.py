@@ -20,7 +20,7 @@ from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.extraction import image_features
-from jaxsfm.sfm.two_photos.matched import match_photos
+from jaxsfm.sfm.two_photos.pair_looks import match_photos
 
 FEATURES = 8
 """How many images' features are held: those of two images for each of four methods."""

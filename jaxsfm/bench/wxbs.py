@@ -52,7 +52,7 @@ class WxbsRow(TypedDict):
     """mAA for each seed."""
     matches: Spread
     evidence: Spread | None
-    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos.evidence`)."""
+    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos.look`)."""
     seconds: float
 
 

@@ -150,7 +150,7 @@ def match(
     from jaxsfm.io.masked_images import with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
-    from jaxsfm.sfm.two_photos.matched import match_photos
+    from jaxsfm.sfm.two_photos.pair_looks import match_photos
 
     check_seed(seed)
     files = [
