@@ -164,10 +164,10 @@ def plane_evidence(
     """The evidence of each plane of a pair, float64 (p,).
 
     It says how strongly the plane speaks for it that the two photos show the same. The number of
-    inliers does not say it: a plane of thirty inliers can be true or chance. It
-    depends on how many matches were tried, how large the photos are and how near a match must be.
-    The evidence of a plane is -log10 of the expected number of such planes among matches that are
-    placed at random. So it can be compared between looks at different sizes of the photos.
+    inliers does not say it: a plane of thirty inliers can be true or chance. It depends on how many
+    matches were tried, how large the photos are and how near a match must be. The evidence of a
+    plane is -log10 of the expected number of such planes among matches that are placed at random.
+    So it can be compared between looks at different sizes of the photos.
 
     Source: Moisan and Stival 2004, "A probabilistic criterion to detect rigid point matches between
     two images and estimate the fundamental matrix"; here for homographies.
