@@ -28,7 +28,7 @@ from jaxsfm.io.pairs import Pair
 from jaxsfm.io.store import FAILED
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.report.run_report import FILE, RunReport, read_report
-from jaxsfm.runs.matching_looks import timed
+from jaxsfm.runs.job import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 

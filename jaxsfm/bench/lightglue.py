@@ -20,7 +20,7 @@ from jaxsfm.colmap.two_views import VerificationOptions, verify
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, read_image
 from jaxsfm.io.pairs import Pair, exhaustive_pairs
-from jaxsfm.runs.matching_looks import timed
+from jaxsfm.runs.job import timed
 
 MAX_KEYPOINTS, MAX_SIZE = 2048, 1024
 """Keypoints of a photo, and pixels of its longer side. LightGlue's authors evaluate with both."""

@@ -13,7 +13,7 @@ from jaxsfm.config import PRESETS
 from jaxsfm.errors import UserError
 from jaxsfm.io.pairs import Pair
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.runs.matching_looks import timed
+from jaxsfm.runs.job import timed
 
 OTHERS = (ROOTSIFT, LIGHTGLUE)
 """The methods that get the pairs of a preset."""

@@ -79,9 +79,8 @@ def reconstruct(
     from jaxsfm.io.store import FAILED
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
-    from jaxsfm.runs.reconstruct import reconstruct_folder
+    from jaxsfm.runs.reconstruct import reconstruct_folder, reconstruct_video
     from jaxsfm.runs.run_options import RunOptions
-    from jaxsfm.runs.video.reconstruct import reconstruct_video
 
     with named_options():
         checked = Execution(**vars(execution))
