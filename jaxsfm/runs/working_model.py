@@ -1,5 +1,5 @@
-"""What `localize` and `extend` need of a finished run: its models, its weights, its cameras, and its
-photos, of which those that look most similar are matched with a new one.
+"""What `localize` and `extend` need of a finished run: its models, its cameras, its weights, and
+its photos, of which those that look most similar are matched with a new one.
 """
 
 import contextlib

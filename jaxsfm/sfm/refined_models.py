@@ -34,7 +34,7 @@ from jaxsfm.sfm.refine.passes import (
     refine_model,
 )
 from jaxsfm.sfm.refine.weak_views import taken_out
-from jaxsfm.sfm.told_apart import adjusted_part
+from jaxsfm.sfm.settled_stage import adjusted_part
 
 if TYPE_CHECKING:
     import pycolmap

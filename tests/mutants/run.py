@@ -55,7 +55,6 @@ FILES = (
     "jaxsfm/sfm/road.py",
     "jaxsfm/sfm/settled_stage.py",
     "jaxsfm/sfm/stage_files.py",
-    "jaxsfm/sfm/told_apart.py",
     "jaxsfm/sfm/view_graph.py",
 )
 ALIGN = ("tests/core/test_align.py", "tests/core/test_alignment_noise.py")
@@ -129,7 +128,11 @@ TESTS: dict[str, tuple[str, ...]] = {
     "runs/turned_photos": ("tests/runs/test_turned_photos.py", "tests/runs/test_run_photos.py"),
     "sfm/mapping": (ROAD, "tests/sfm/test_two_mappings.py"),
     "sfm/refined_models": ("tests/sfm/test_held_parts.py", "tests/sfm/test_refined_models.py"),
-    "sfm/settled_stage": ("tests/sfm/test_settled_stage.py", ROAD),
+    "sfm/settled_stage": (
+        "tests/sfm/test_settled_stage.py",
+        "tests/sfm/test_told_apart.py",
+        ROAD,
+    ),
     "sfm/view_graph": ("tests/sfm/test_viewgraph.py", "tests/sfm/test_placing.py"),
 }
 """Module (last two parts of its path) -> the tests that should notice a mistake in it, quickest
