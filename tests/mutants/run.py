@@ -92,7 +92,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "check/model_check": ("tests/sfm/test_settled_stage.py", "tests/report/test_verdict.py"),
     "refine/candidates": (REFINE, WEAK),
     "refine/device_images": (
-        "tests/sfm/test_block_means.py",
         DEVICE,
         "tests/sfm/test_placing.py",
         "tests/sfm/test_pair_alignment.py",
