@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from jaxsfm.runs.run_options import RunOptions as RunOptions
     from jaxsfm.sfm.evaluation import Evaluation as Evaluation
     from jaxsfm.sfm.evaluation import evaluate as evaluate
-    from jaxsfm.sfm.reconstruction import reconstruct as reconstruct
     from jaxsfm.sfm.refine.pair_alignment import align as align
-    from jaxsfm.sfm.two_photos.matched import match_photos as match_photos
+    from jaxsfm.sfm.road import reconstruct as reconstruct
+    from jaxsfm.sfm.two_photos.pair_looks import match_photos as match_photos
 
 _HOME = {
     "Config": "config",
@@ -56,9 +56,9 @@ _HOME = {
     "align": "sfm.refine.pair_alignment",
     "extract": "matching.pipeline",
     "match": "matching.pipeline",
-    "match_photos": "sfm.two_photos.matched",
+    "match_photos": "sfm.two_photos.pair_looks",
     "open_images": "matching.pipeline",
-    "reconstruct": "sfm.reconstruction",
+    "reconstruct": "sfm.road",
     "RunOptions": "runs.run_options",
     "shortlist": "matching.retrieval",
     "run_folder": "runs.reconstruct",

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.sfm.evaluation import Similarity, umeyama
-from jaxsfm.sfm.georeference.control_points import views_by_name
+from jaxsfm.sfm.georeference.georeference import views_by_name
 
 SIZE, FOCAL = (2000, 1500), 1400.0
 

@@ -34,7 +34,7 @@ from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import thresholds, to_original_pixels
-from jaxsfm.runs.matching_looks import timed
+from jaxsfm.runs.job import timed
 
 HELD = 4
 """Images whose maps are held. Those of a photo of 1536 x 1024 take 0.28 GB."""

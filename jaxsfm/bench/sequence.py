@@ -38,9 +38,9 @@ from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import Mapper
+from jaxsfm.runs.job import timed
 from jaxsfm.runs.localize import localize_photos
 from jaxsfm.runs.localize_report import LocalizedPhoto
-from jaxsfm.runs.matching_looks import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import LocalizeOptions, RunOptions
 from jaxsfm.sfm.evaluation import (

@@ -35,11 +35,11 @@ from jaxsfm.io.work_folder import RECORD
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.runs.matching_looks import timed
+from jaxsfm.runs.job import timed
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
-from jaxsfm.sfm.reconstruction import reconstruct
 from jaxsfm.sfm.refined_models import Believed, refine_models
+from jaxsfm.sfm.road import reconstruct
 
 if TYPE_CHECKING:
     import pycolmap

@@ -28,7 +28,7 @@ from jaxsfm.io.work_folder import RECORD
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.mapped_stage import DATABASE
-from jaxsfm.sfm.reconstruction import reconstruct
+from jaxsfm.sfm.road import reconstruct
 
 if TYPE_CHECKING:
     import pycolmap

@@ -32,7 +32,7 @@ from jaxsfm.io.photo_folder import SUFFIXES
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.epipolar import epipolar_residuals, fundamental_matrix, single_fundamental_matrix
-from jaxsfm.sfm.two_photos.matched import match_photos
+from jaxsfm.sfm.two_photos.pair_looks import match_photos
 
 THRESHOLDS_PX = np.arange(1, 21)
 PUBLISHED_THRESHOLDS_PX = np.arange(11)
@@ -62,7 +62,7 @@ class WxbsRow(TypedDict):
     """mAA for each seed."""
     matches: Spread
     evidence: Spread | None
-    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos.evidence`)."""
+    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos.look`)."""
     seconds: float
 
 

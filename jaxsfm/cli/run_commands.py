@@ -81,9 +81,8 @@ def reconstruct(
     from jaxsfm.io.store import FAILED
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
-    from jaxsfm.runs.reconstruct import reconstruct_folder
+    from jaxsfm.runs.reconstruct import reconstruct_folder, reconstruct_video
     from jaxsfm.runs.run_options import RunOptions
-    from jaxsfm.runs.video.reconstruct import reconstruct_video
 
     with named_options():
         checked = Execution(**vars(execution))
@@ -152,7 +151,7 @@ def match(
     from jaxsfm.io.photo_folder import with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
-    from jaxsfm.sfm.two_photos.matched import match_photos
+    from jaxsfm.sfm.two_photos.pair_looks import match_photos
 
     check_seed(seed)
     files = [

@@ -20,8 +20,7 @@ from jaxsfm.io.store import Store
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.runs.job import Job
 from jaxsfm.sfm.limits import REGISTER
-from jaxsfm.sfm.two_photos.pair_looks import HOPELESS, looks_at_pair
-from jaxsfm.sfm.two_photos.plane_looks import as_one, one_match_each
+from jaxsfm.sfm.two_photos.pair_looks import HOPELESS, as_one, looks_at_pair, one_match_each
 
 KEPT_FEATURES = REGISTER.partners + 1
 """Photos whose features are in memory: those of one photo and of its partners."""

@@ -1,4 +1,4 @@
-"""A whole run in its work folder: from photos to a COLMAP model, a database and a report."""
+"""A whole run in its work folder: from photos or a video to a COLMAP model and a report."""
 
 import dataclasses
 import importlib.metadata
@@ -17,12 +17,13 @@ from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.images import ImageFile, named, orientations
-from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
+from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.photo_folder import masks_of, with_masks
 from jaxsfm.io.store import FAILED
+from jaxsfm.io.video import open_video
 from jaxsfm.io.weights import chosen_weights
-from jaxsfm.io.work_folder import open_folder
+from jaxsfm.io.work_folder import FRAMES, lock_folder, open_folder
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs
@@ -33,11 +34,11 @@ from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import from_json, to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.georeferencing import measured_positions
-from jaxsfm.runs.job import Job, pairs_without
-from jaxsfm.runs.matching_looks import timed
+from jaxsfm.runs.job import Job, pairs_without, timed
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
 from jaxsfm.runs.run_stages import RunStages
+from jaxsfm.runs.video.frames import frames_folder
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.refined_stage import Reconstructed
 
@@ -184,6 +185,28 @@ def reconstruct_folder(
         # that it shows.
         page_after_run(out if made.models or not (out / "sparse").exists() else out / FAILED)
         return report
+
+
+def reconstruct_video(video: Path, out: Path, *, config: Config, options: RunOptions) -> RunReport:
+    """Reconstruct a video: frames are chosen, and reconstructed as photos (`reconstruct_folder`).
+
+    The frames are chosen once and kept in `out`/frames, which is the run's folder of photos. Frames
+    of this video that are there already, for example chosen with another overlap, are used as they
+    are.
+
+    Raises:
+      UserError: the video or an option cannot be used. What was computed is kept.
+    """
+    check_options(options)
+    with open_video(video):  # what is no video makes no folder
+        pass
+    with lock_folder(out):
+        found = frames_folder(video, out / FRAMES, progress=options.progress)
+    how = "have been chosen before" if found.there else "were chosen"
+    logger.info("%d frames %s, in %s", len(found.names), how, out / FRAMES)
+    pairs = chosen_pairs(options.pairs, len(found.names), many_frames(found.common))
+    options = dataclasses.replace(options, pairs=pairs)
+    return reconstruct_folder(out / FRAMES, out, config=config, options=options)
 
 
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:

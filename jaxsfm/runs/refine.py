@@ -20,8 +20,7 @@ from jaxsfm.io.atomic import SPARE_BYTES, atomic_folder, check_disk_space
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.libraries import versions
 from jaxsfm.options import check_threads
-from jaxsfm.sfm.given_refinement import GivenRefinement, refine_given
-from jaxsfm.sfm.model_photos import ModelPhotos
+from jaxsfm.sfm.given_refinement import GivenRefinement, ModelPhotos, refine_given
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 if TYPE_CHECKING:

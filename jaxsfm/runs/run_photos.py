@@ -12,12 +12,13 @@ from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.closer_looks import closest_pairs, look_closer, pairs_to_look_at
-from jaxsfm.runs.job import Job, pairs_without
-from jaxsfm.runs.matching_looks import (
+from jaxsfm.runs.job import (
+    Job,
     MatchedPairs,
     first_look,
     job_of_look,
     match_pairs,
+    pairs_without,
 )
 from jaxsfm.runs.turned_photos import Trials, find_turned
 from jaxsfm.sfm.limits import REGISTER

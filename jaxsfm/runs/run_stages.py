@@ -18,7 +18,7 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.work_folder import WorkFolder
-from jaxsfm.runs.matching_looks import MatchedPairs, timed
+from jaxsfm.runs.job import MatchedPairs, timed
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.georeference.georeference import Georeference, MeasuredPositions, move_models
 from jaxsfm.sfm.mapped_stage import (

@@ -14,8 +14,7 @@ from jaxsfm.io import orientation
 from jaxsfm.io.images import ImageFile, named
 from jaxsfm.io.pairs import Pair, PairCounts, components, make_pair
 from jaxsfm.report.run_inputs import RunIdentity
-from jaxsfm.runs.job import Job
-from jaxsfm.runs.matching_looks import job_of_look, match_pairs
+from jaxsfm.runs.job import Job, job_of_look, match_pairs
 from jaxsfm.sfm.limits import TRUST, UPRIGHT
 from jaxsfm.sfm.view_graph import relative_strengths
 

@@ -1,9 +1,15 @@
-"""What `localize` and `extend` need of a finished run: its models, its weights and its photos."""
+"""What `localize` and `extend` need of a finished run: its models, its cameras, its weights, and
+its photos, of which those that look most similar are matched with a new one.
+"""
 
+import contextlib
+import functools
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from jaxsfm.colmap.cameras import Cameras, estimated_camera
 from jaxsfm.colmap.intrinsics import KnownCameras
@@ -11,10 +17,15 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import read_model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
+from jaxsfm.core.partners import TIE
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageFile, shown_name, size_and_scale
+from jaxsfm.io.images import ImageError, ImageFile, shown_name, size_and_scale
 from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights, chosen_weights
+from jaxsfm.matching.execution import Execution
+from jaxsfm.matching.global_descriptors import GEM
+from jaxsfm.matching.retrieval import describe_photos
 from jaxsfm.options import WeightsChoice
 from jaxsfm.report.finished_run import FinishedRun, sizes_within
 from jaxsfm.report.run_inputs import UsedWeights
@@ -22,6 +33,9 @@ from jaxsfm.report.typed_json import from_json
 
 if TYPE_CHECKING:
     import pycolmap
+
+Shortlist = Callable[[ImageFile, Sequence[str]], Sequence[str]]
+"""From a photo and the names of other photos to the names of those that it is matched with."""
 
 
 class WorkingModel(NamedTuple):
@@ -154,3 +168,58 @@ def photos_of_run(run: FinishedRun, names: Sequence[str]) -> dict[str, ImageFile
             )
         files[name] = image
     return files
+
+
+def similar_photos(
+    run: FinishedRun,
+    weights: Weights,
+    k: int,
+    new: Mapping[str, ImageFile],
+    execution: Execution,
+) -> Shortlist:
+    """A shortlist of the `k` most similar photos of a run; equally similar ones are taken by name.
+
+    Photos are compared by GeM, which describes each photo by itself. The descriptors of the run's
+    photos are kept in its folder, if it can be written. The shortlist raises ImageError if the
+    photo that it is called with cannot be decoded.
+
+    Args:
+      new: photos that are not in the run, by name.
+
+    Raises:
+      UserError: k is less than 1.
+    """
+    if k < 1:
+        raise UserError(f"--shortlist must be at least 1; got {k}")
+
+    def describe(image: ImageFile, store: Store | None = None) -> np.ndarray:
+        found = describe_photos(weights, [image], kind="gem", store=store, execution=execution)
+        for _, error in found.lost:
+            raise error
+        return found.vectors[image.name]
+
+    @functools.cache
+    def descriptor(name: str) -> np.ndarray:
+        if name in new:
+            return describe(new[name])
+        saved = run.store.load_descriptor(run.photos.recorded(name), GEM)
+        if saved is not None:
+            return saved
+        image = photos_of_run(run, [name])[name]
+        try:
+            return describe(image, run.store)
+        except ImageError:
+            raise
+        except UserError:  # the run's folder cannot be written
+            return describe(image)
+
+    def shortlist(image: ImageFile, names: Sequence[str]) -> Sequence[str]:
+        if k >= len(names):
+            return names
+        own, nearness = descriptor(image.name), {}
+        for name in names:
+            with contextlib.suppress(ImageError):  # the other photo cannot be decoded
+                nearness[name] = round(float(descriptor(name) @ own) / TIE)
+        return sorted(nearness, key=lambda name: (-nearness[name], name))[:k]
+
+    return shortlist

@@ -13,8 +13,9 @@ from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
-from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model, second_places
+from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck, repeats
+from jaxsfm.sfm.check.other_places import second_places
 from jaxsfm.sfm.refine.device_images import DeviceImages
 
 if TYPE_CHECKING:

@@ -2,8 +2,8 @@
 
 Other numbers stand where they are used. How many photos a mapping may leave out, and from which
 pairs it may start, is said in `jaxsfm.colmap.mapper`; when a model is doubted in
-`jaxsfm.sfm.check.doubt`; how patches are compared in `jaxsfm.sfm.check.agreement`; when a view is
-weak in `jaxsfm.sfm.refine.one_pass`; and how a pose is followed and trusted in
+`jaxsfm.sfm.check.grouping`; how patches are compared in `jaxsfm.sfm.check.agreement`; when a view
+is weak in `jaxsfm.sfm.refine.one_pass`; and how a pose is followed and trusted in
 `jaxsfm.sfm.refine.octave_pose`.
 """
 

@@ -23,11 +23,10 @@ from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm import stage_files
-from jaxsfm.sfm.check.check_files import read_outcomes, write_outcomes
 from jaxsfm.sfm.check.check_model import CHECKED_BY
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
-from jaxsfm.sfm.stage_files import VerificationFigures
+from jaxsfm.sfm.stage_files import VerificationFigures, read_outcomes, write_outcomes
 
 DATABASE, SPARSE, ALTERNATIVE, OUTCOMES = "database.db", "sparse", "alternative", "outcomes.json"
 

@@ -3,16 +3,23 @@
 `walk` has all steps but the first two, which describe and match the photos and turn those that are
 stored sideways (`jaxsfm.runs.run_photos`). Each step is a function that is described where it is
 written. A step in `Step` can be skipped by name, which says what it is worth (`jaxsfm bench ledger
---without STEP`).
+--without STEP`). `reconstruct` walks the road for those who have their own matches.
 """
 
 import contextlib
 import logging
-from collections.abc import Callable, Collection
+import tempfile
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import NamedTuple
 
+from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.config import Config
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.options import Step
 from jaxsfm.sfm.mapped_stage import (
     MatchedPhotos,
@@ -20,6 +27,7 @@ from jaxsfm.sfm.mapped_stage import (
     VerifiedStage,
     map_trusted,
     mapper_of,
+    matched_photos,
     verify_matches,
 )
 from jaxsfm.sfm.mapping import MappedModels, Mapper
@@ -114,3 +122,41 @@ def _map_again(
         return None
     logger.info("%s; mapping once more", why)
     return map_trusted(given, verified, trust, "mapped-again", kept)
+
+
+def reconstruct(
+    images: list[ImageFile],
+    matches: Mapping[Pair, PairResult],
+    database: Path,
+    *,
+    config: Config,
+    cameras: Cameras | None = None,
+    options: MapOptions | None = None,
+) -> Reconstructed:
+    """Make COLMAP models from verified matches: mapping of trusted pairs, check, refinement.
+
+    Pixel thresholds are multiplied by `Photos.median_scale`. Points get the colours of the photos.
+
+    Args:
+      matches: the result of `match`.
+      database: where to write the COLMAP database; a file there is replaced.
+      config: the one that the matches were made with. Its `view_graph`, `checked` and `refinement`
+        switch those parts on.
+      cameras: what is known and assumed of the cameras; by default no camera is known.
+      options: of the mapper. By default it is incremental, and refines the intrinsics unless the
+        cameras are known.
+
+    Raises:
+      UserError: the cameras do not fit the images, or COLMAP fails.
+    """
+    given = matched_photos(
+        images,
+        matches,
+        config=config,
+        described=config,
+        cameras=cameras or Cameras(),
+        options=options,
+    )
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        stages = StageCache(WorkFolder(Path(scratch), {}), "")
+        return walk(given, stages, database)

@@ -1,13 +1,15 @@
-"""The figures that the stages of a reconstruction leave beside their models, as JSON."""
+"""What the stages of a reconstruction leave beside their models, as JSON: figures and checks."""
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.io.pairs import Pair
-from jaxsfm.sfm.check.check_files import check_from_json
+from jaxsfm.sfm.check.check_model import Checked
+from jaxsfm.sfm.check.model_check import Alternative, Contradiction, ModelCheck, OtherPlace
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures, figures_from_json
 from jaxsfm.sfm.view_graph import Verdict
@@ -41,6 +43,62 @@ def read_verification(folder: Path) -> VerificationFigures:
         verified={(a, b): count for (a, b), count, _ in plain},
         angles={(a, b): angle for (a, b), _, angle in plain},
     )
+
+
+def check_from_json(row: dict[str, Any]) -> ModelCheck:
+    """The check whose fields are given as plain data (`dataclasses.asdict`)."""
+    return ModelCheck(
+        groups=row["groups"],
+        contradictions=[Contradiction(**each) for each in row["contradictions"]],
+        other_places=[OtherPlace(**each) for each in row["other_places"]],
+        alternative=row["alternative"] and Alternative(**row["alternative"]),
+        apart=row["apart"],
+        told_apart=row["told_apart"],
+        shrunk=row["shrunk"],
+        doubt=row["doubt"],
+        unconfirmed=row["unconfirmed"],
+    )
+
+
+def write_outcomes(file: Path, outcomes: Sequence[Checked | None]) -> None:
+    """Write the outcomes of the checks of some models; None where one was not checked."""
+    plain = [each and _plain_outcome(each) for each in outcomes]
+    file.write_text(json.dumps(plain), encoding="utf-8")
+
+
+def read_outcomes(file: Path) -> list[Checked | None]:
+    """Read what `write_outcomes` wrote."""
+    return [row and _outcome(row) for row in json.loads(file.read_text(encoding="utf-8"))]
+
+
+def _plain_outcome(found: Checked) -> dict[str, Any]:
+    return {
+        "check": dataclasses.asdict(found.check),
+        "refuted": _plain_pairs(found.refuted),
+        "suspected": _plain_pairs(found.suspected),
+        "explained": sorted(found.explained),
+        "against": sorted(found.against),
+        "parts": found.parts,
+    }
+
+
+def _outcome(row: dict[str, Any]) -> Checked:
+    return Checked(
+        check=check_from_json(row["check"]),
+        refuted=_pairs(row["refuted"]),
+        suspected=_pairs(row["suspected"]),
+        explained={(a, b) for a, b in row["explained"]},
+        against={(a, b) for a, b in row["against"]},
+        parts=row["parts"],
+    )
+
+
+def _plain_pairs(found: Mapping[Pair, Contradiction]) -> list[tuple[Pair, dict[str, Any]]]:
+    return [(pair, dataclasses.asdict(each)) for pair, each in found.items()]
+
+
+def _pairs(rows: Sequence[tuple[Pair, dict[str, Any]]]) -> dict[Pair, Contradiction]:
+    return {(a, b): Contradiction(**each) for (a, b), each in rows}
 
 
 def write_mapping(folder: Path, figures: MappingFigures) -> None:

@@ -30,7 +30,7 @@ PAGES = (
 )
 LONG = (
     "jaxsfm.runs.reconstruct.reconstruct_folder",
-    "jaxsfm.runs.video.reconstruct.reconstruct_video",
+    "jaxsfm.runs.reconstruct.reconstruct_video",
     "jaxsfm.runs.video.frames.frames_folder",
     "jaxsfm.bench.demo.run_demo",
     "jaxsfm.matching.retrieval.shortlist",

@@ -20,7 +20,6 @@ from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.run_report import read_report
 from jaxsfm.runs import extend as extend_module
-from jaxsfm.runs import write_extension
 from jaxsfm.sfm.evaluation import umeyama
 
 OLD = ("view0.png", "view1_night.png", "view2.png")
@@ -54,7 +53,7 @@ def extended(plain, scene, tmp_path_factory) -> Extended:
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(write_extension, "grow", interrupted)
+        patch.setattr(extend_module, "grow", interrupted)
         assert main(["extend", str(run)]) == 130
     assert (run / "report.json").read_text() == report
     assert {n: c for n, c in contents(run).items() if "/sparse/" in n and "stages" not in n} == {

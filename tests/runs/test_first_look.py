@@ -7,7 +7,7 @@ import pytest
 
 from jaxsfm.config import preset
 from jaxsfm.io.images import ImageFile
-from jaxsfm.runs.matching_looks import first_look
+from jaxsfm.runs.job import first_look
 
 DEFAULT = preset("default")
 

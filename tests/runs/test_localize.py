@@ -26,16 +26,15 @@ from jaxsfm.matching.execution import Execution
 from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.runs import localize as localize_module
-from jaxsfm.runs.localize import localize_photos
+from jaxsfm.runs.localize import cameras_of_query, localize_photos
 from jaxsfm.runs.localize_report import LocalizationReport, LocalizedPhoto, localize_lines
-from jaxsfm.runs.queries import cameras_of_query
 from jaxsfm.runs.run_options import LocalizeOptions
-from jaxsfm.runs.similar_photos import similar_photos
 from jaxsfm.runs.working_model import (
     WorkingModel,
     camera_prior,
     camera_priors,
     read_working_model,
+    similar_photos,
 )
 from jaxsfm.sfm.register.locate_view import Localization
 

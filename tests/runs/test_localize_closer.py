@@ -10,8 +10,7 @@ from pair_results import result
 from jaxsfm.config import preset
 from jaxsfm.runs import localize
 from jaxsfm.runs.localize_report import LocalizedPhoto
-from jaxsfm.sfm.register.locate_view import Localization
-from jaxsfm.sfm.register.place import Place
+from jaxsfm.sfm.register.locate_view import Localization, Place
 
 SOME_VIEW: Any = SimpleNamespace(centre=None)
 LOST = Localization(why="lost", on_surface=5)

@@ -8,7 +8,7 @@ import pytest
 
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import PairCounts
-from jaxsfm.runs.matching_looks import match_pairs
+from jaxsfm.runs.job import match_pairs
 
 PAIRS = [("a", "b"), ("a", "c")]
 

@@ -16,8 +16,7 @@ from jaxsfm.io.pairs import Pair, exhaustive_pairs
 from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs import run_photos
-from jaxsfm.runs.job import Job
-from jaxsfm.runs.matching_looks import MatchedPairs, match_pairs
+from jaxsfm.runs.job import Job, MatchedPairs, match_pairs
 from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
 from jaxsfm.runs.turned_photos import turned
 from jaxsfm.sfm.limits import REGISTER

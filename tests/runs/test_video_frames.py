@@ -13,11 +13,11 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.pair_selection import FEW, MOST_NEIGHBOURS, chosen_pairs, many_frames
 from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.work_folder import lock_folder
+from jaxsfm.runs import reconstruct as reconstruct_module
+from jaxsfm.runs.reconstruct import reconstruct_video
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.runs.video import frames as frames_module
-from jaxsfm.runs.video import reconstruct as reconstruct_module
 from jaxsfm.runs.video.frames import FrameOptions, frames_folder
-from jaxsfm.runs.video.reconstruct import reconstruct_video
 
 
 @pytest.fixture(scope="module")

@@ -25,9 +25,9 @@ from jaxsfm.sfm.check.check_model import (
     Checked,
     VerifiedMatches,
     check_model,
-    second_places,
 )
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
+from jaxsfm.sfm.check.other_places import second_places
 
 FIRST, OTHERS = [f"{k}.png" for k in range(3)], [f"{k}.png" for k in range(3, 6)]
 ANGLES = [-10.0, -4.0, 3.0, -7.0, 0.0, 8.0]

@@ -22,8 +22,8 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.io.pairs import PairResult
+from jaxsfm.sfm.check.check_model import pair_fits
 from jaxsfm.sfm.check.other_places import Refused, Surface, other_place, other_places
-from jaxsfm.sfm.check.pair_fit import pair_fits
 from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.limits import CHECK, SECOND_PLACES
 from jaxsfm.sfm.refine import plane_geometry

@@ -13,8 +13,14 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
-from jaxsfm.sfm.check.check_model import VerifiedMatches, check_model
-from jaxsfm.sfm.check.scale import MOST_SPREAD, OUTER, median_depths, shrunk
+from jaxsfm.sfm.check.check_model import (
+    MOST_SPREAD,
+    OUTER,
+    VerifiedMatches,
+    check_model,
+    median_depths,
+    shrunk,
+)
 
 
 def seeing_at(*depths: float) -> Model:

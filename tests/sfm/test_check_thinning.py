@@ -8,8 +8,8 @@ from wall_scene import big_wall, cameras, poster, scene
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
-from jaxsfm.sfm.check import thinning as module
-from jaxsfm.sfm.check.thinning import FACING, thinned
+from jaxsfm.sfm.check import check_model as module
+from jaxsfm.sfm.check.check_model import FACING, thinned
 
 ANGLES = [-10.0, -4.0, 3.0, -7.0, 0.0, 8.0]
 

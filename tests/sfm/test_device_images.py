@@ -10,9 +10,8 @@ from room_scene import Room, exact_model, images_of, read_of
 from jaxsfm.config import Refinement
 from jaxsfm.core import align
 from jaxsfm.matching.pair_matching import ImageCache
-from jaxsfm.sfm.refine import padding, patch_alignment, track_alignment
-from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.device_templates import DeviceTemplates
+from jaxsfm.sfm.refine import device_images, patch_alignment, track_alignment
+from jaxsfm.sfm.refine.device_images import DeviceImages, DeviceTemplates, block_means
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits, overlapped
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
 
@@ -169,7 +168,7 @@ def test_blocks_equal_alignment_from_the_host_bit_for_bit(rendered):
 def test_the_calls_of_accelerators_give_the_cpus_keypoints_bit_for_bit(rendered, monkeypatch):
     ours = blocks_of(rendered, images_of(rendered))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert padding.largest_chunk() == 2048
+    assert device_images.largest_chunk() == 2048
     assert_same(blocks_of(rendered, images_of(rendered)), ours)
 
 
@@ -194,7 +193,7 @@ def test_calls_have_few_lengths_and_at_most_half_of_one_is_filling(
 ):
     monkeypatch.setattr(jax, "default_backend", lambda: platform)
     rows = np.arange(count) + 7
-    parts = list(padding.chunks(rows))
+    parts = list(device_images.chunks(rows))
     assert [(len(filled), counted) for filled, counted in parts] == lengths
     kept = [filled[:counted] for filled, counted in parts]
     np.testing.assert_array_equal(np.concatenate([*kept, rows[:0]]), rows)
@@ -231,7 +230,7 @@ def test_an_image_is_read_once_and_after_the_next_has_been_started(
         events.append("read")
         return get(jax.tree.map(lambda leaf: getattr(leaf, "outcome", leaf), x))
 
-    monkeypatch.setattr(padding, "CHUNK", 32)  # several calls for each image
+    monkeypatch.setattr(device_images, "CHUNK", 32)  # several calls for each image
     monkeypatch.setattr(images, "take", watched)
     monkeypatch.setattr(patch_alignment, "_align", unread)
     monkeypatch.setattr(jax, "device_get", read)
@@ -282,3 +281,29 @@ def test_templates_are_taken_as_they_were_stored():
     wanted = rng.integers(0, 300, 77)
     for x, y, found in zip(first, second, store.take(points[wanted]), strict=True):
         np.testing.assert_array_equal(np.concatenate([x, y[:44]])[wanted], found)
+
+
+def small_image() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0, 255, (9, 14)).astype(np.float32)
+
+
+def test_a_large_pixel_is_the_mean_of_those_it_covers():
+    whole = small_image()
+    np.testing.assert_allclose(block_means(whole, 4)[1, 2], whole[4:8, 8:12].mean(), rtol=1e-6)
+    assert block_means(whole, 4).shape == (2, 3) and block_means(whole, 1) is whole
+
+
+def test_unused_pixels_take_no_part_in_the_mean():
+    some = small_image()
+    some[4:6, 8:12] = np.nan  # half of a large pixel
+    means = block_means(some, 4)
+    np.testing.assert_allclose(means[1, 2], some[6:8, 8:12].mean(), rtol=1e-6)
+    np.testing.assert_allclose(np.delete(means, 5), np.delete(block_means(small_image(), 4), 5))
+    assert means.dtype == np.float32
+
+
+def test_a_large_pixel_of_which_less_than_half_is_used_is_not_used():
+    some = small_image()
+    some[4:6, 8:12] = some[6, 8] = np.nan
+    means = block_means(some, 4)
+    assert np.isnan(means[1, 2]) and np.isfinite(np.delete(means, 5)).all()

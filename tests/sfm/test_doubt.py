@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from jaxsfm.io.pairs import component_of, make_pair
 from jaxsfm.sfm.check.agreement import Agreement
-from jaxsfm.sfm.check.doubt import MAX_CONTRADICTED, DoubtCurve
-from jaxsfm.sfm.check.grouping import disagreement, group_views
+from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED, DoubtCurve, disagreement, group_views
 from jaxsfm.sfm.view_graph import bridges
 
 CURVE = DoubtCurve(half=0.05, power=2.5, most=0.2)

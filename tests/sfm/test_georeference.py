@@ -11,9 +11,13 @@ from scipy.spatial.transform import Rotation
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.io.position_tables import ControlPoint, Measurement, Position
 from jaxsfm.sfm.evaluation import umeyama
-from jaxsfm.sfm.georeference.control_points import triangulated, views_by_name
 from jaxsfm.sfm.georeference.coordinate_system import LOCAL
-from jaxsfm.sfm.georeference.georeference import MeasuredPositions, move_models
+from jaxsfm.sfm.georeference.georeference import (
+    MeasuredPositions,
+    move_models,
+    triangulated,
+    views_by_name,
+)
 from jaxsfm.sfm.georeference.placement import Placement
 from jaxsfm.sfm.georeference.robust_similarity import Anchors, robust_similarity
 

@@ -7,8 +7,7 @@ from room_scene import SIZE, noisy_model
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import CameraPose, model_poses
-from jaxsfm.sfm.given_refinement import _described_px
-from jaxsfm.sfm.old_frame import move_back
+from jaxsfm.sfm.given_refinement import _described_px, move_back
 
 
 class Photos:

@@ -17,11 +17,10 @@ from jaxsfm.colmap.model_images import registered
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Config, Refinement
 from jaxsfm.sfm import refined_models
-from jaxsfm.sfm.refine.held_parts import held_parts
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement, taken_out
-from jaxsfm.sfm.refined_models import Believed, refine_models
+from jaxsfm.sfm.refined_models import Believed, held_parts, refine_models
 
 VIEWS = 6
 

@@ -13,7 +13,7 @@ from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.sfm.register import grow as grow_module
 from jaxsfm.sfm.register import triangulate
 from jaxsfm.sfm.register.grow import grow
-from jaxsfm.sfm.register.place import UnregisteredView
+from jaxsfm.sfm.register.locate_view import UnregisteredView
 from jaxsfm.sfm.register.triangulate import matched_tracks, new_points, triangulated
 
 NEW = "3.png"

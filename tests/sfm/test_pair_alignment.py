@@ -13,7 +13,7 @@ from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.refine import padding
+from jaxsfm.sfm.refine import device_images
 from jaxsfm.sfm.refine.pair_alignment import align, align_matches, local_map
 
 SIDE = 320
@@ -107,7 +107,7 @@ def test_a_size_puts_each_image_on_the_device_once_and_reads_the_host_once(monke
         counts["reads"] += 1
         return get(x)
 
-    monkeypatch.setattr(padding, "CHUNK", 64)
+    monkeypatch.setattr(device_images, "CHUNK", 64)
     monkeypatch.setattr(jax, "device_put", counted)
     monkeypatch.setattr(jax, "device_get", read)
     assert result.num_inliers > 2 * 64

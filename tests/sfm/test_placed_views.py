@@ -13,11 +13,11 @@ from wall_scene import (
 )
 
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.check import placed_views
 from jaxsfm.sfm.check.other_places import Surface
-from jaxsfm.sfm.check.placed_views import Placed, doubts
 from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.refine.plane_geometry import normals
+from jaxsfm.sfm.register import grow
+from jaxsfm.sfm.register.grow import doubts
 
 NEW = 3
 NAMES = [f"{k}.png" for k in range(4)]
@@ -41,8 +41,8 @@ def placed_before(own: int, others: int) -> Scene:
 
 def doubted(seen: Scene, *pairs: PairResult, full_size: bool = True) -> dict[str, str]:
     matches = {each.pair: each for each in pairs}
-    placed = Placed({NAMES[NEW]: full_size}, matches.keys(), matches)
-    return doubts(seen.model, seen.images, REFINEMENT, placed)
+    details = {NAMES[NEW]: full_size}
+    return doubts(seen.model, seen.images, REFINEMENT, details, matches.keys(), matches)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_a_view_that_shows_something_else_is_doubted_by_its_numbers(wrong):
     (name,), (why,) = zip(*doubted(wrong).items(), strict=True)
     assert name == NAMES[NEW]
     surface = Surface(wrong.model, normals(wrong.model, neighbours=16))
-    tested, contradicted = placed_views.shown_by(surface.few(), wrong.images, REFINEMENT, NEW)
+    tested, contradicted = grow.shown_by(surface.few(), wrong.images, REFINEMENT, NEW)
     assert f"of {tested} points" in why and why.endswith(f"instead of {contradicted}")
     assert (
         REGISTER.least_contradicted <= contradicted
@@ -88,7 +88,7 @@ def test_a_view_that_shows_something_else_is_doubted_by_its_numbers(wrong):
 def test_few_contradictions_are_no_reason_to_doubt(
     right, monkeypatch, tested, contradicted, doubtful
 ):
-    monkeypatch.setattr(placed_views, "shown_by", lambda *_: (tested, contradicted))
+    monkeypatch.setattr(grow, "shown_by", lambda *_: (tested, contradicted))
     assert bool(doubted(right)) == doubtful
 
 

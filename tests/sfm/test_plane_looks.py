@@ -13,10 +13,10 @@ from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.two_photos import plane_looks
-from jaxsfm.sfm.two_photos.evidence import BY_CHANCE
-from jaxsfm.sfm.two_photos.look import Look
-from jaxsfm.sfm.two_photos.plane_looks import SIZES, as_one, looks_at_planes, one_match_each
+from jaxsfm.sfm.two_photos import further_looks
+from jaxsfm.sfm.two_photos.further_looks import SIZES, looks_at_planes
+from jaxsfm.sfm.two_photos.look import BY_CHANCE, Look
+from jaxsfm.sfm.two_photos.pair_looks import as_one, one_match_each
 
 IMAGES: Any = ("photo 0", "photo 1")
 
@@ -32,7 +32,7 @@ def looked_at(monkeypatch):
         value = seen.get((plane, size))
         return None if value is None else SimpleNamespace(evidence=value, at=(plane, size))
 
-    monkeypatch.setattr(plane_looks, "closer_look", closer)
+    monkeypatch.setattr(further_looks, "closer_look", closer)
 
     def looks(
         evidence: list[float], most: int = 4, whole: float = 1.0, **found: float
@@ -133,6 +133,6 @@ def test_a_plane_must_grow_by_what_is_due_to_chance(monkeypatch):
     photo = ImageFile(name="a", path=Path("a"), size=(400, 300), sha256="0")
     for evidence, counts in ((100.0 + BY_CHANCE, 1), (99.9 + BY_CHANCE, 0)):
         seen = Look(one, np.asarray([evidence]))
-        monkeypatch.setattr(plane_looks, "closer_look", lambda *_, seen=seen, **__: seen)
+        monkeypatch.setattr(further_looks, "closer_look", lambda *_, seen=seen, **__: seen)
         found = looks_at_planes(weights, (photo, photo), best, config=preset("default"), seed=0)
         assert len(found.confirmed) == counts and found.taken == 1 + counts

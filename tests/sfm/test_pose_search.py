@@ -14,8 +14,7 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.sfm.refine import octave_pose, plane_geometry, pose_search
-from jaxsfm.sfm.refine.evidence import NO_EVIDENCE
-from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
+from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.octave_pose import OctavePose, PoseHypothesis, follow, trusted
 from jaxsfm.sfm.refine.pose_search import MIN_PATCHES, search
 from jaxsfm.sfm.refine.weak_views import place_weak_views

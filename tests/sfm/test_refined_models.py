@@ -12,7 +12,7 @@ from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module
-from jaxsfm.sfm.refine.evidence import Evidence
+from jaxsfm.sfm.refine.fixed_structure import Evidence
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refined_models import Believed, RefinedModels, refine_models
 

@@ -18,7 +18,7 @@ from wall_scene import (
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.sfm.register import grow as module
 from jaxsfm.sfm.register.grow import ExtendedModels, grow
-from jaxsfm.sfm.register.place import UnregisteredView
+from jaxsfm.sfm.register.locate_view import UnregisteredView
 
 NEW = 5
 NAMES = [f"{k}.png" for k in range(NEW + 1)]
@@ -103,9 +103,9 @@ def test_a_view_is_asked_about_once_and_a_refused_one_leaves_the_model_as_it_was
     monkeypatch.setattr(module, "doubts", lambda *given: asked.append(given) or against)
     found = grown(seen)
     assert [*found.placed] == placed and found.rounds == 1 and len(asked) == 1
-    model, *_, about = asked[0]
-    assert [view.name for view in model.views] == NAMES and about.full_size == {NAMES[NEW]: True}
-    assert set(about.neighbours) == {(NAMES[NEW - 1], NAMES[NEW])}
+    model, _, _, details, following, _ = asked[0]
+    assert [view.name for view in model.views] == NAMES and details == {NAMES[NEW]: True}
+    assert set(following) == {(NAMES[NEW - 1], NAMES[NEW])}
     known = seen.model.part(set(NAMES[:NEW]))[0].tracks
     if not placed:
         np.testing.assert_array_equal(found.models[0].tracks.xy, known.xy)

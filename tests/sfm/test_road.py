@@ -30,7 +30,7 @@ from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refined_models import RefinedModels
 from jaxsfm.sfm.refined_stage import Reconstructed
 from jaxsfm.sfm.road import Watch, walk
-from jaxsfm.sfm.told_apart import Parts
+from jaxsfm.sfm.settled_stage import Parts
 
 PASS = PassFigures(
     accepted=True,

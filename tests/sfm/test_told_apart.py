@@ -9,9 +9,9 @@ from verdicts import outcome
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model_images import registered
-from jaxsfm.sfm import told_apart as module
+from jaxsfm.sfm import settled_stage as module
 from jaxsfm.sfm.check.check_model import Checked
-from jaxsfm.sfm.told_apart import told_apart
+from jaxsfm.sfm.settled_stage import told_apart
 
 NAMES = [f"{k}.png" for k in range(5)]
 OPTIONS = MapOptions(refine_intrinsics=False, threads=1)

@@ -21,8 +21,7 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photos import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
-from jaxsfm.sfm.two_photos import evidence, matched, pair_looks, plane_looks, scale_search
-from jaxsfm.sfm.two_photos.closer_look import MOST_PROPOSALS, proposals
+from jaxsfm.sfm.two_photos import further_looks, look, pair_looks
 from jaxsfm.sfm.two_photos.common_view import (
     Located,
     affine_between,
@@ -30,8 +29,9 @@ from jaxsfm.sfm.two_photos.common_view import (
     mapped,
     view_change,
 )
+from jaxsfm.sfm.two_photos.further_looks import MOST_PROPOSALS, proposals
 from jaxsfm.sfm.two_photos.look import Look, moved
-from jaxsfm.sfm.two_photos.matched import HALF_SURE, POWER, confidence, match_photos
+from jaxsfm.sfm.two_photos.pair_looks import HALF_SURE, POWER, confidence, match_photos
 
 
 def photo(size: tuple[int, int], orientation: int = 1) -> ImageFile:
@@ -56,28 +56,28 @@ def test_evidence_is_the_expected_number_of_such_planes_by_chance(members, candi
     """Counted with whole numbers: n C(n, k) C(k, 4) p^(k - 4)."""
     ways = candidates * math.comb(candidates, members) * math.comb(members, 4)
     expected = -(math.log10(ways) + (members - 4) * math.log10(chance))
-    assert evidence.evidence_of_plane(members, candidates, chance) == pytest.approx(expected)
+    assert look.evidence_of_plane(members, candidates, chance) == pytest.approx(expected)
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(20, 90), st.integers(200, 900), st.floats(1e-4, 1e-2))
 def test_evidence_grows_with_members_and_falls_with_what_was_tried(members, candidates, chance):
-    ours = evidence.evidence_of_plane(members, candidates, chance)
-    assert evidence.evidence_of_plane(members + 1, candidates, chance) > ours
-    assert evidence.evidence_of_plane(members, candidates, chance * 2) < ours
+    ours = look.evidence_of_plane(members, candidates, chance)
+    assert look.evidence_of_plane(members + 1, candidates, chance) > ours
+    assert look.evidence_of_plane(members, candidates, chance * 2) < ours
     if members < candidates / 2:
-        assert evidence.evidence_of_plane(members, 2 * candidates, chance) < ours
+        assert look.evidence_of_plane(members, 2 * candidates, chance) < ours
 
 
 def test_four_matches_are_no_evidence():
-    assert evidence.evidence_of_plane(4, 100, 1e-3) == -math.inf
-    assert evidence.total(np.asarray([-math.inf, evidence.BY_CHANCE, 0.0])) == 0
-    assert evidence.total(np.asarray([evidence.BY_CHANCE + 3, 2.0])) == 3
+    assert look.evidence_of_plane(4, 100, 1e-3) == -math.inf
+    assert look.total(np.asarray([-math.inf, look.BY_CHANCE, 0.0])) == 0
+    assert look.total(np.asarray([look.BY_CHANCE + 3, 2.0])) == 3
 
 
 def test_cells_of_an_enlarged_photo_are_counted_in_larger_cells():
     cells = np.arange(64)  # 8 x 8 fine cells are 4 x 4 coarse ones, and 2 x 2 of twice their size
-    assert [evidence._coarse_cells(cells, 8, times) for times in (1.0, 2.0)] == [16, 4]
+    assert [look._coarse_cells(cells, 8, times) for times in (1.0, 2.0)] == [16, 4]
 
 
 def test_confidence_grows_from_none_to_certainty():
@@ -201,7 +201,7 @@ def test_a_reduced_view_has_the_photos_means(pictures):
 
 @pytest.mark.parametrize("quarters", range(4))
 def test_a_turned_view_is_the_photo_after_quarter_turns(pictures, quarters):
-    view = scale_search.turned_view(pictures["whole"], quarters)
+    view = further_looks.turned_view(pictures["whole"], quarters)
     whole = read_image(pictures["whole"], max_size=4096).rgb
     np.testing.assert_array_equal(
         read_view(pictures["whole"], view).rgb, np.rot90(whole, -quarters)
@@ -260,7 +260,7 @@ def few_sizes(monkeypatch):
     """No enlarging and views of one size: each size of a picture is a program to compile."""
     monkeypatch.setattr(pair_looks, "MOST_ENLARGED", 1.0)
     monkeypatch.setattr(pair_looks, "SIZE", pair_looks.SMALL_SIZE)
-    monkeypatch.setattr(plane_looks, "SIZES", (pair_looks.SMALL_SIZE,))
+    monkeypatch.setattr(further_looks, "SIZES", (pair_looks.SMALL_SIZE,))
 
 
 @pytest.mark.slow
@@ -314,13 +314,13 @@ def test_if_a_pair_must_be_worth_it_closer_looks_follow_a_sign_at_some_scale(
     monkeypatch.setattr(pair_looks, "_look_closer", lambda *given, **__: [*given[2], asked])
     planes: list[float] = []
 
-    def looks_at_planes(_, __, best: Any, **___: object) -> plane_looks.PlaneLooks:
+    def looks_at_planes(_, __, best: Any, **___: object) -> further_looks.PlaneLooks:
         planes.append(best.evidence)
-        return plane_looks.PlaneLooks([], 0)
+        return further_looks.PlaneLooks([], 0)
 
     monkeypatch.setattr(pair_looks, "looks_at_planes", looks_at_planes)
     nothing = AlignedMatches(np.empty((0, 2)), np.empty(0, bool))
-    monkeypatch.setattr(matched, "_aligned", lambda *_: nothing)
+    monkeypatch.setattr(pair_looks, "_aligned", lambda *_: nothing)
     monkeypatch.setattr(pair_looks, "seen_alike", lambda *_: True)
     given: Any = (None, features, features)
     config = preset("default")

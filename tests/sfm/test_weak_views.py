@@ -28,8 +28,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import one_pass, passes, plane_geometry, weak_views
 from jaxsfm.sfm.refine.candidates import may_be_candidates
-from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence, matched_points
-from jaxsfm.sfm.refine.fixed_structure import FixedStructure
+from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, Evidence, FixedStructure, matched_points
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.one_pass import run_pass
 from jaxsfm.sfm.refine.passes import refine_model

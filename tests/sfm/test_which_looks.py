@@ -10,9 +10,9 @@ import pytest
 
 from jaxsfm.config import preset
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
-from jaxsfm.sfm.two_photos import matched, pair_looks
+from jaxsfm.sfm.two_photos import pair_looks
 from jaxsfm.sfm.two_photos.common_view import Located
-from jaxsfm.sfm.two_photos.plane_looks import PlaneLooks
+from jaxsfm.sfm.two_photos.further_looks import PlaneLooks
 
 
 def aligned(each: Any) -> AlignedMatches:
@@ -91,13 +91,13 @@ def test_a_strong_pair_is_looked_at_once_more_if_its_photos_show_it_differently(
     weights: Any = None
     monkeypatch.setattr(pair_looks, "look", lambda *_, **__: seen_as(matrix))
     monkeypatch.setattr(pair_looks, "closer_look", closer)
-    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
-    monkeypatch.setattr(matched, "as_one", lambda results: results)
-    found = matched.match_photos(weights, features, features, config=preset("default"))
+    monkeypatch.setattr(pair_looks, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(pair_looks, "as_one", lambda results: results)
+    found = pair_looks.match_photos(weights, features, features, config=preset("default"))
     assert asked == [pair_looks.SIZE] * unlike  # at most once, however much it brings
     assert found.evidence == (2000.0 if unlike else 1900.0)
     once = dataclasses.replace(preset("default"), closer_looks=0)
-    assert matched.match_photos(weights, features, features, config=once).looks == 1
+    assert pair_looks.match_photos(weights, features, features, config=once).looks == 1
 
 
 @pytest.mark.parametrize(("share", "counts"), [(0.51, True), (0.49, False)])
@@ -107,9 +107,9 @@ def test_a_view_from_one_place_counts_if_it_confirms_the_first_look(monkeypatch,
     seen = SimpleNamespace(evidence=share * 1900.0, result=None)
     monkeypatch.setattr(pair_looks, "look", lambda *_, **__: seen_as(turn(90)))
     monkeypatch.setattr(pair_looks, "closer_look", lambda *_, **__: seen)
-    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
-    monkeypatch.setattr(matched, "as_one", lambda results: results)
-    found = matched.match_photos(weights, features, features, config=preset("default"))
+    monkeypatch.setattr(pair_looks, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(pair_looks, "as_one", lambda results: results)
+    found = pair_looks.match_photos(weights, features, features, config=preset("default"))
     assert found.evidence == (seen.evidence if counts else 1900.0)
 
 
@@ -144,10 +144,10 @@ def test_the_planes_of_the_best_look_give_the_matches_if_they_are_confirmed(
     monkeypatch.setattr(pair_looks, "at_other_scales", lambda *_, **__: [])
     monkeypatch.setattr(pair_looks, "_look_closer", lambda *given, **__: [*given[2], fake(best)])
     monkeypatch.setattr(pair_looks, "looks_at_planes", looks_at_planes)
-    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
-    monkeypatch.setattr(matched, "as_one", lambda results: len(results))
+    monkeypatch.setattr(pair_looks, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(pair_looks, "as_one", lambda results: len(results))
     monkeypatch.setattr(pair_looks, "seen_alike", lambda *_: True)
-    found = matched.match_photos(weights, features, features, config=preset("default"))
+    found = pair_looks.match_photos(weights, features, features, config=preset("default"))
     evidence, looks, confirmed = expected
     assert (found.evidence, found.looks) == (evidence, looks)
     assert found.result == (len(planes) if confirmed else 1)
@@ -178,9 +178,9 @@ def test_photos_seen_differently_are_seen_from_one_place_if_no_plane_is_confirme
     monkeypatch.setattr(pair_looks, "look", lambda *_, **__: first)
     monkeypatch.setattr(pair_looks, "looks_at_planes", lambda *_, **__: found)
     monkeypatch.setattr(pair_looks, "closer_look", lambda *_, **__: fake(301.0))
-    monkeypatch.setattr(matched, "_aligned", lambda each, *_: aligned(each))
-    monkeypatch.setattr(matched, "as_one", lambda results: results)
-    pair = matched.match_photos(weights, features, features, config=preset("default"))
+    monkeypatch.setattr(pair_looks, "_aligned", lambda each, *_: aligned(each))
+    monkeypatch.setattr(pair_looks, "as_one", lambda results: results)
+    pair = pair_looks.match_photos(weights, features, features, config=preset("default"))
     assert (pair.evidence, pair.looks) == ((1400.0, 4) if planes else (301.0, 5))
 
 
@@ -241,8 +241,8 @@ def test_photos_are_turned_unless_a_look_is_sure(steps):
 
 
 def test_confidence_is_half_at_the_evidence_of_a_pair_that_may_be_right_or_wrong():
-    half, power = matched.HALF_SURE, matched.POWER
-    assert matched.confidence(half) == pytest.approx(0.5)
-    odds = [c / (1 - c) for c in map(matched.confidence, (half / 2, half, 3 * half))]
+    half, power = pair_looks.HALF_SURE, pair_looks.POWER
+    assert pair_looks.confidence(half) == pytest.approx(0.5)
+    odds = [c / (1 - c) for c in map(pair_looks.confidence, (half / 2, half, 3 * half))]
     assert odds == pytest.approx([0.5**power, 1.0, 3.0**power])
-    assert matched.confidence(0.0) == matched.confidence(1.0) < 1e-3
+    assert pair_looks.confidence(0.0) == pair_looks.confidence(1.0) < 1e-3

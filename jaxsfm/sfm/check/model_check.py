@@ -105,10 +105,10 @@ class ModelCheck:
     the same for all models of a run (`repeats`)."""
     shrunk: list[str] = dataclasses.field(default_factory=list)
     """Photos that see their points so much nearer than others that a part of the model has shrunk
-    (`jaxsfm.sfm.check.scale`). Sorted."""
+    (`jaxsfm.sfm.check.check_model.shrunk`). Sorted."""
     doubt: float = 0.0
     """How probable it is that the model is wrong, from how far its photos contradict each other
-    (`jaxsfm.sfm.check.doubt`). Nothing else that speaks against a model is part of it."""
+    (`jaxsfm.sfm.check.grouping`). Nothing else that speaks against a model is part of it."""
     unconfirmed: bool = False
     """Whether the model was not refined, because too few of its points were found in the photos
     that should show them."""

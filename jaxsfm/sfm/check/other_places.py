@@ -5,7 +5,7 @@ they would put it. If it shows the same, nothing tells the two places apart, and
 explains the photos as well.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +16,14 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import agreement
-from jaxsfm.sfm.check.doubt import MAX_CONTRADICTED
+from jaxsfm.sfm.check.check_model import VerifiedMatches, thinned, thinned_points
+from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import OtherPlace
-from jaxsfm.sfm.check.thinning import thinned_points
 from jaxsfm.sfm.limits import SECOND_PLACES
+from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import may_show
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.refine.fixed_structure import MATCH_ERROR_PX, matched_points
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 
@@ -164,3 +165,25 @@ def other_places(
     ]
     places = [place for place in found if place is not None]
     return sorted(places, key=lambda place: place.image)
+
+
+def second_places(
+    model: Model,
+    images: DeviceImages,
+    given: VerifiedMatches,
+    refinement: Refinement,
+    against: Collection[Pair],
+) -> list[OtherPlace]:
+    """The second places of the photos of a model that has been checked.
+
+    Args:
+      images, given, refinement: as in `check_model`.
+      against: the pairs that do not agree with the model.
+
+    Raises:
+      ImageError: an image of the model cannot be read any more.
+    """
+    model = thinned(model)
+    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
+    refused = Refused({pair: given.matches[pair] for pair in sorted(against)}, given.seed)
+    return other_places(Surface(model, normal), images, refinement, refused)

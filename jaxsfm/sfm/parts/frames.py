@@ -16,8 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from jaxsfm.sfm.evaluation import Similarity
 
-SAMPLE = 60
-"""So many points that two models share say how these lie to each other."""
 IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 

@@ -19,7 +19,6 @@ from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
 from jaxsfm.sfm.evaluation import Similarity, umeyama
-from jaxsfm.sfm.model_join import MIN_SHARED
 from jaxsfm.sfm.parts.frames import SharedPoints, common_frames
 from jaxsfm.sfm.parts.partition import Graph, overlapping_parts
 
@@ -33,6 +32,9 @@ LONG = 20
 8 and one of 1000 has 86; 500 frames of *kitchen* have 8, *statue* 5, *cup* 3."""
 PART, OVERLAP = 30, 20
 """Photos of a part, and photos that two parts share: parts of 80 are still bent after 50 steps."""
+MIN_SHARED = 3
+"""The least number of photos that say how two parts lie to each other. Two share a pair, which may
+be false in both."""
 TIED, KEPT = 10, 0.5
 """Two parts with so many common right points stay tied if this share of them stays right: where a
 row comes back to its start, its ends must not be torn apart."""

@@ -14,6 +14,8 @@ from jaxsfm.sfm.refine.plane_geometry import ReferencePatches, Visibility, seen_
 SLACK = 0.25
 """Share of a view's sides, beyond its borders. Points outside are left out early; they may still
 move along their reference rays before they are aligned, by at most 5 % of their depth."""
+STEP = 2.0
+"""The differences that give the derivatives of a patch are taken over so many pixels."""
 
 
 class Candidates(NamedTuple):
@@ -132,12 +134,10 @@ def _drawn(point: np.ndarray, view: np.ndarray) -> np.ndarray:
     return mixed
 
 
-def plane_affines(
-    views: Sequence[View], patches: ReferencePatches, view: np.ndarray, *, step: float = 2.0
-) -> np.ndarray:
+def plane_affines(views: Sequence[View], patches: ReferencePatches, view: np.ndarray) -> np.ndarray:
     """Derivatives (m, 2, 2) of pixels in `view` by pixels in the reference view, via the plane.
 
-    They are central differences over `step` pixels, which serves any camera model.
+    They are central differences, which serve any camera model.
 
     Args:
       view: int (m,), for each patch the index of the other view.
@@ -160,7 +160,7 @@ def plane_affines(
         return at
 
     columns = [
-        (through(plus) - through(minus)) / (2 * step)
-        for plus, minus in (((step, 0.0), (-step, 0.0)), ((0.0, step), (0.0, -step)))
+        (through(plus) - through(minus)) / (2 * STEP)
+        for plus, minus in (((STEP, 0.0), (-STEP, 0.0)), ((0.0, STEP), (0.0, -STEP)))
     ]
     return np.stack(columns, axis=2)

@@ -16,7 +16,7 @@ from jaxsfm.io.images import ImageFile, read_image
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photos import intensities
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.sfm.refine.padding import block_means, chunks, padded
+from jaxsfm.sfm.refine.device_images import block_means, chunks, padded
 from jaxsfm.sfm.refine.patch_alignment import (
     AlignmentLimits,
     align_patches,

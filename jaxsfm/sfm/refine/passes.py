@@ -22,7 +22,7 @@ from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.colmap.triangulation import MIN_POINTS
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.evidence import NO_EVIDENCE, Evidence
+from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, Evidence
 from jaxsfm.sfm.refine.one_pass import (
     PassFigures,
     PassSettings,
@@ -48,7 +48,7 @@ class RefinementFigures:
     """The camera that the photos speak for, if it is not the one that was held."""
     holds: bool = True
     """Whether confirmed points hold three views together or more
-    (`jaxsfm.sfm.refine.held_parts`)."""
+    (`jaxsfm.sfm.refined_models.held_parts`)."""
 
     @property
     def confirmed(self) -> bool:

@@ -14,6 +14,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.core import align as align_core
 from jaxsfm.core.align import Aligned, Patch, Templates
 from jaxsfm.io.traced_programs import Traced
+from jaxsfm.sfm.refine.device_images import PaddedImage
 
 _make_templates = Traced(align_core.make_templates, Patch, Templates)
 _align = Traced(align_core.align, Patch, Templates, Aligned)
@@ -50,15 +51,6 @@ class AlignmentLimits(NamedTuple):
         )
 
 
-class PaddedImage(NamedTuple):
-    """An image on the device, in one of the few shapes that the alignment is compiled for."""
-
-    map: jax.Array
-    """float32 (h, w, 1), zero beyond the image."""
-    size: jax.Array
-    """int32 (2,): height and width of the image."""
-
-
 def make_templates(image: PaddedImage, xy: np.ndarray, patch: Patch) -> Templates:
     """Reference patches around keypoints (n, 2) of an image; on the device, without waiting."""
     return _make_templates(*image, jax.device_put(np.float32(xy)), patch)
@@ -88,8 +80,8 @@ def to_host(calls: Sequence[tuple[int, Aligned]]) -> Aligned:
     """Wait for the outcomes of calls, and join them as arrays of the host.
 
     Args:
-      calls: for each call, how many of its rows count (`jaxsfm.sfm.refine.padding.chunks`), and
-        its outcome.
+      calls: for each call, how many of its rows count (`jaxsfm.sfm.refine.device_images.chunks`),
+        and its outcome.
     """
     counts = [count for count, _ in calls]
     found = jax.device_get([outcome for _, outcome in calls])

@@ -22,9 +22,7 @@ from jaxsfm.sfm.refine.candidates import (
     may_be_candidates,
     may_show,
 )
-from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.device_templates import DeviceTemplates
-from jaxsfm.sfm.refine.padding import chunks
+from jaxsfm.sfm.refine.device_images import DeviceImages, DeviceTemplates, chunks
 from jaxsfm.sfm.refine.patch_alignment import (
     AlignmentLimits,
     align_patches,

@@ -17,8 +17,12 @@ from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.evidence import MATCH_ERROR_PX, Evidence, matched_points
-from jaxsfm.sfm.refine.fixed_structure import FixedStructure
+from jaxsfm.sfm.refine.fixed_structure import (
+    MATCH_ERROR_PX,
+    Evidence,
+    FixedStructure,
+    matched_points,
+)
 from jaxsfm.sfm.refine.octave_pose import (
     OctavePose,
     PoseHypothesis,
@@ -46,7 +50,7 @@ class Placement:
     """Median distance of where they agree from where the pose puts them, working pixels."""
     held: int | None = None
     """A number: it was in the model before, had so many observations, and was taken out because
-    they do not hold it there (`jaxsfm.sfm.refine.held_parts`). None: it was not."""
+    they do not hold it there (`jaxsfm.sfm.refined_models.held_parts`). None: it was not."""
     doubt: str = ""
     """Why an image without a place was not registered (`jaxsfm.sfm.register.lost`), in words. Empty
     if it was."""

@@ -1,25 +1,34 @@
 """Registration of new views in finished models, whose poses and points stay as they are.
 
 It works in rounds. In a round, each view is looked for in every model that has views like it, and
-gets its place in the model of which it shows most points (`jaxsfm.sfm.register.place`).
-Places that the view itself or its neighbours contradict are given up
-(`jaxsfm.sfm.check.placed_views`). What it shows beyond the model's points becomes new points
+gets its place in the model of which it shows most points (`jaxsfm.sfm.register.locate_view`). A
+place that too few points hold, or that the view itself or its neighbours contradict, is given up
+(`doubts`). What it shows beyond the model's points becomes new points
 (`jaxsfm.sfm.register.triangulate`), in which the next round locates further views.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
+from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.sfm.check.placed_views import Placed, doubts
+from jaxsfm.sfm.check.check_model import pair_fits
+from jaxsfm.sfm.check.other_places import Surface, shown_by
+from jaxsfm.sfm.limits import CHECK, REGISTER
 from jaxsfm.sfm.photo_order import neighbours
+from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
-from jaxsfm.sfm.register.locate_view import Localization
-from jaxsfm.sfm.register.place import Place, UnregisteredView, best_place, place_in
+from jaxsfm.sfm.register.locate_view import (
+    Localization,
+    Place,
+    UnregisteredView,
+    best_place,
+    place_in,
+)
 from jaxsfm.sfm.register.triangulate import new_points
 
 
@@ -87,7 +96,14 @@ def grow(
         stay = dict[str, Place]()
         for k in sorted({place.model for place in fresh.values()}):
             own = {name: place for name, place in fresh.items() if place.model == k}
-            against = _against(_with_placed(models[k], own), own, matches, images, refinement)
+            against = doubts(
+                _with_placed(models[k], own),
+                images,
+                refinement or Refinement(),
+                {name: place.found.rests_on_details for name, place in own.items()},
+                neighbours(matches.keys()),
+                matches,
+            )
             for name, why in against.items():
                 place = own.pop(name)
                 tried[name][k] = place._replace(found=place.found.refused(why))
@@ -118,17 +134,47 @@ def _held(located: Localization) -> Localization:
     )
 
 
-def _against(
+def doubts(
     model: Model,
-    own: Mapping[str, Place],
-    matches: Mapping[Pair, PairResult],
     images: DeviceImages,
-    refinement: Refinement | None,
+    refinement: Refinement,
+    details: Mapping[str, bool],
+    following: Collection[Pair],
+    matches: Mapping[Pair, PairResult],
 ) -> dict[str, str]:
-    """What speaks against the places of new views in a model, in words, by name."""
-    details = {name: place.found.rests_on_details for name, place in own.items()}
-    placed = Placed(details, neighbours(matches.keys()), matches)
-    return doubts(model, images, refinement or Refinement(), placed)
+    """What speaks against the places of new views in a model, in words, by the name of the view.
+
+    Where a photo shows a copy of what the model shows, alignment confirms a wrong place. The check
+    of the mapper's model has not seen this photo. All points of a placed view come from other
+    views. So it can only contradict them, and they cannot contradict it.
+
+    Args:
+      model: with the placed views.
+      images: those of the views, in the model's pixels.
+      refinement: how patches are aligned, and when they agree.
+      details: by the name of each placed view, whether its place rests on details at full size. If
+        not, noise hides them there, and what the view does not show says nothing.
+      following: pairs of photos that follow each other and that COLMAP verified.
+      matches: of these pairs at least, original pixels.
+    """
+    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
+    pairs = [pair for pair in following if details.keys() & set(pair)]
+    fits = pair_fits(model, normal, matches, pairs)
+    few, found = Surface(model, normal).few(), {}
+    for pair in sorted(pair for pair, fit in fits.items() if fit < CHECK.fit):
+        for name in details.keys() & set(pair):
+            (other,) = set(pair) - {name}
+            found[name] = f"its matches with its neighbour {shown_name(other)} do not agree with it"
+    for k, view in enumerate(model.views):
+        if view.name in found or not details.get(view.name):
+            continue
+        tested, contradicted = shown_by(few, images, refinement, k)
+        if contradicted >= max(REGISTER.least_contradicted, REGISTER.contradicted_share * tested):
+            found[view.name] = (
+                f"of {tested} points that it should show there, it shows something else instead of "
+                f"{contradicted}"
+            )
+    return found
 
 
 def _with_placed(model: Model, fresh: Mapping[str, Place]) -> Model:

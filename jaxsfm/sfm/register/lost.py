@@ -37,8 +37,7 @@ from jaxsfm.sfm.refined_stage import (
     write_refined,
 )
 from jaxsfm.sfm.register.grow import grow
-from jaxsfm.sfm.register.locate_view import Localization
-from jaxsfm.sfm.register.place import UnregisteredView
+from jaxsfm.sfm.register.locate_view import Localization, UnregisteredView
 from jaxsfm.sfm.settled_stage import SettledModels
 
 if TYPE_CHECKING:

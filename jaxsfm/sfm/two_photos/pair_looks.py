@@ -1,4 +1,4 @@
-"""Which looks two photos need, and whose matches count.
+"""Two photos, matched with as many looks as they need: which ones, and whose matches count.
 
 Most pairs are matched at the first look. A strong pair whose photos show the same differently is
 looked at once more, as seen from one place. A weak pair is looked at again at other scales, then
@@ -7,18 +7,29 @@ hopeless, the planes of its strongest look are then looked at one by one.
 """
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 from jaxsfm.config import Config
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
+from jaxsfm.io.pairs import PairResult, united
+from jaxsfm.io.photos import intensities, read_view
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import image_features
-from jaxsfm.sfm.two_photos.closer_look import closer_look, proposals
-from jaxsfm.sfm.two_photos.common_view import SIZE, SMALL_SIZE, affine_between, view_change
-from jaxsfm.sfm.two_photos.look import Look, look
-from jaxsfm.sfm.two_photos.plane_looks import looks_at_planes
-from jaxsfm.sfm.two_photos.scale_search import at_other_scales, turned
+from jaxsfm.sfm.refine.pair_alignment import AlignedMatches, align, align_matches
+from jaxsfm.sfm.two_photos.common_view import SIZE, SMALL_SIZE, affine_between, mapped, view_change
+from jaxsfm.sfm.two_photos.further_looks import (
+    at_other_scales,
+    closer_look,
+    looks_at_planes,
+    proposals,
+    turned,
+)
+from jaxsfm.sfm.two_photos.look import Look, look, moved, to_stored
 
 ENOUGH = 400.0
 """After a first look with so much evidence, no other one is searched for
@@ -44,6 +55,86 @@ a greater factor, in any direction, or turned by more degrees (docs/decisions/ha
 CONFIRMED = 0.5
 """It counts if it has so large a share of the evidence of the first one: matches of photos that are
 seen alike are nearer, even if the view has fewer cells than the photos."""
+HALF_SURE, POWER = 233.0, 2.2
+"""A pair with the evidence `HALF_SURE` is as probably right as wrong, and the odds grow with this
+power of the evidence. Fitted to drawn pairs with known poses (docs/decisions/hard-pairs.md)."""
+
+
+class TwoPhotos(NamedTuple):
+    """The matches of two photos, and how sure they are."""
+
+    result: PairResult
+    """In pixels of the stored photos, as they were verified."""
+    aligned: AlignedMatches
+    """The same matches, moved to a fraction of a pixel where the photos allow it."""
+    evidence: float
+    """That of the strongest look (`jaxsfm.sfm.two_photos.look.plane_evidence`)."""
+    looks: int
+    """How many looks were taken, the first one included."""
+
+    @property
+    def confidence(self) -> float:
+        """The probability that the photos show the same and that most matches are right."""
+        return confidence(self.evidence)
+
+
+def confidence(evidence: float) -> float:
+    """The probability that a pair with this evidence is right."""
+    return 1 / (1 + (HALF_SURE / max(evidence, 1.0)) ** POWER)
+
+
+def match_photos(
+    weights: Weights,
+    features0: ImageFeatures,
+    features1: ImageFeatures,
+    *,
+    config: Config,
+    seed: int = 0,
+    worth_closer: float = 0.0,
+) -> TwoPhotos:
+    """Match two photos with as many looks as they need (`Config.closer_looks`).
+
+    Args:
+      features0, features1: the features of both photos, made with the same config.
+      worth_closer: the evidence that the search for the scale must find, or no further look
+        follows. The strongest photos of different places have 33 (docs/decisions/hard-pairs.md).
+
+    Raises:
+      ImageError: a photo cannot be decoded again.
+    """
+    images = (features0.image, features1.image)
+    looks = looks_at_pair(
+        weights, (features0, features1), config=config, seed=seed, worth_closer=worth_closer
+    )
+    aligned = [_aligned(each, images, config) for each in looks.chosen]
+    return TwoPhotos(
+        as_one([each.result for each in looks.chosen]),
+        AlignedMatches(*map(np.concatenate, zip(*aligned, strict=True))),
+        looks.evidence,
+        looks.taken,
+    )
+
+
+def _aligned(best: Look, images: tuple[ImageFile, ImageFile], config: Config) -> AlignedMatches:
+    """The matches of a look, aligned where they were seen alike."""
+    if None in best.views or not config.aligned_octaves or not best.result.num_inliers:
+        return align(best.result, *images, config=config)
+    gray0, gray1 = (
+        intensities(read_view(image, view))
+        for image, view in zip(images, best.views, strict=True)
+        if view is not None
+    )
+    back = to_stored(best.views, images)
+    found = align_matches(
+        moved(best.result, np.linalg.inv(back[0]), np.linalg.inv(back[1])),
+        gray0,
+        gray1,
+        (1.0, 1.0),
+        (1.0, 1.0),
+        octaves=config.aligned_octaves,
+        max_error_px=config.threshold_px,
+    )
+    return found._replace(keypoints1=mapped(back[1], found.keypoints1))
 
 
 class PairLooks(NamedTuple):
@@ -158,3 +249,32 @@ def seen_alike(first: Look, images: tuple[ImageFile, ImageFile]) -> bool:
 def _best(looks: list[Look]) -> Look:
     """The look with the most evidence; the earliest of equal ones."""
     return max(looks, key=lambda each: each.evidence)
+
+
+def as_one(results: Sequence[PairResult]) -> PairResult:
+    """The matches of several looks, one after the other.
+
+    Each look has cells of its own, so their indices are made to differ. A point that several looks
+    saw has several matches (`one_match_each`).
+    """
+
+    def both(before: PairResult, result: PairResult) -> PairResult:
+        first = int(before.cells.max(initial=-1)) + 1
+        return united(before, dataclasses.replace(result, cells=result.cells + np.int32(first)))
+
+    return functools.reduce(both, results)
+
+
+def one_match_each(result: PairResult, spacing: tuple[float, float]) -> PairResult:
+    """At most one match in each square of either photo, the first one: a count of points.
+
+    Args:
+      result: the matches of several looks, the strongest look first.
+      spacing: the side of a square in the first and in the second photo, pixels.
+    """
+    keep = np.arange(result.num_inliers)
+    for keypoints, side in zip((result.keypoints0, result.keypoints1), spacing, strict=True):
+        squares = np.floor(keypoints[keep] / side)
+        keep = keep[np.sort(np.unique(squares, axis=0, return_index=True)[1])]
+    rows = ("cells", "keypoints0", "keypoints1", "plane")
+    return dataclasses.replace(result, **{name: getattr(result, name)[keep] for name in rows})

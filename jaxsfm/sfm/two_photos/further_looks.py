@@ -1,0 +1,209 @@
+"""Further looks at two photos: at other scales, turned, as seen from one place, and at each plane.
+
+The network knows neither scale nor rotation. Features are made at several sizes of a photo anyway,
+so a photo that shows things twice as large is matched at half its size, without describing anything
+again. Turned photos have to be described again; half the size is enough to see whether they match.
+
+For a closer look both photos are described again as seen from one place. A weak look may have a
+true plane among false ones, or two looks may have different ones. So each plane is a proposal of
+its own, and a look at a small common view tells which of them is true: under a true geometry the
+photos look alike and the evidence grows, under a false one it goes.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxsfm.config import Config
+from jaxsfm.core.octaves import smaller
+from jaxsfm.io.features import ImageFeatures
+from jaxsfm.io.images import ImageFile
+from jaxsfm.io.photos import PhotoView, read_view
+from jaxsfm.io.weights import Weights
+from jaxsfm.matching.extraction import describe_pixels
+from jaxsfm.sfm.two_photos.common_view import (
+    SMALL_SIZE,
+    Located,
+    affine_between,
+    common_views,
+    mapped,
+)
+from jaxsfm.sfm.two_photos.look import BY_CHANCE, Look, look
+
+MOST_PROPOSALS = 5
+"""So many proposals are looked at, the strongest first."""
+SAME = 0.1
+"""Two affine maps that put the points of one of them closer than this share of their extent are one
+proposal."""
+SIZES = (SMALL_SIZE, 1000)
+"""The longer side of the views of a plane, pixels. A large photo shows more in the larger view, and
+a small one is seen better in the smaller view (docs/decisions/hard-pairs.md)."""
+OCTAVES = ((0, 1), (1, 0), (0, 2), (2, 0), (1, 2), (2, 1))
+"""The octaves of the first and of the second photo that are matched: relative scales of 2, 1/2, 4
+and 1/4, and 2 and 1/2 once more at half the size, where noise and another sensor disturb less."""
+LEAST_CELLS = 3
+"""Coarse cells along the shorter side: one window of the coarse-to-fine step."""
+TURNED_SIZE = 800
+"""The longer side of a turned photo, pixels."""
+TURNED_OCTAVES = (0, 1, 2)
+"""The octaves of the first photo that a turned second photo is matched with."""
+
+
+def at_octave(features: ImageFeatures, octave: int, *, config: Config) -> ImageFeatures:
+    """The features of a photo whose working image is 1 / 2^`octave` times as large."""
+    x, y = features.scale
+    return features._replace(
+        scale=(x * 2**octave, y * 2**octave),
+        dense=smaller(features.dense, octave, fine_stride=config.fine_stride),
+    )
+
+
+def at_other_scales(
+    features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int
+) -> Iterator[Look]:
+    """Looks at two photos at other relative scales; none if the features have a single octave."""
+    images = (features0.image, features1.image)
+    for octave0, octave1 in OCTAVES:
+        if max(octave0, octave1) >= config.octaves:
+            continue
+        side0 = at_octave(features0, octave0, config=config)
+        side1 = at_octave(features1, octave1, config=config)
+        if all(min(side.dense.coarse_grid) >= LEAST_CELLS for side in (side0, side1)):
+            yield look(side0, side1, images, config=config, seed=seed)
+
+
+def turned_view(image: ImageFile, quarters: int) -> PhotoView:
+    """The whole upright photo after quarter turns clockwise, of at most `TURNED_SIZE`."""
+    width, height = image.upright_size
+    factor = min(TURNED_SIZE / max(width, height), 1.0)
+    turns = np.eye(3)
+    for _ in range(quarters % 4):  # (x, y) of a photo of `height` rows becomes (height - 1 - y, x)
+        turns = np.asarray([[0, -1, height - 1], [1, 0, 0], [0, 0, 1.0]]) @ turns
+        width, height = height, width
+    shift = 0.5 * factor - 0.5
+    zoom = np.asarray([[factor, 0, shift], [0, factor, shift], [0, 0, 1.0]])
+    return PhotoView(zoom @ turns, (round(width * factor), round(height * factor)))
+
+
+def turned(
+    weights: Weights, features0: ImageFeatures, image1: ImageFile, *, config: Config, seed: int
+) -> Iterator[Look]:
+    """Looks at two photos, the second one turned by one, two and three quarter turns."""
+    for quarters in (1, 2, 3):
+        view = turned_view(image1, quarters)
+        seen = describe_view(weights, image1, view, config=config)
+        for octave in TURNED_OCTAVES[: config.octaves]:
+            side = at_octave(features0, octave, config=config)
+            if min(side.dense.coarse_grid) >= LEAST_CELLS:
+                images = (features0.image, image1)
+                yield look(side, seen, images, views=(None, view), config=config, seed=seed)
+
+
+def describe_view(
+    weights: Weights, image: ImageFile, view: PhotoView, *, config: Config
+) -> ImageFeatures:
+    """The features of a view; coordinates are those of the view."""
+    return describe_pixels(weights, view.as_photo(image), read_view(image, view), config=config)
+
+
+def closer_look(
+    weights: Weights,
+    images: tuple[ImageFile, ImageFile],
+    matches: Located,
+    *,
+    size: int,
+    config: Config,
+    seed: int,
+) -> Look | None:
+    """A look at both photos as seen from one place; None if the matches determine no place.
+
+    Args:
+      size: the longer side of the common view, pixels.
+    """
+    views = common_views(matches, *images, size=size)
+    if views is None:
+        return None
+    seen0, seen1 = (
+        describe_view(weights, image, view, config=config)
+        for image, view in zip(images, views, strict=True)
+    )
+    return look(seen0, seen1, images, views=views, config=config, seed=seed)
+
+
+def proposals(looks: Sequence[Look], images: tuple[ImageFile, ImageFile]) -> list[Located]:
+    """The matches that may show the true geometry: of whole looks and of single planes.
+
+    They are ordered by their evidence, and those that lead to the same view are left out.
+    """
+    found: list[tuple[float, Located]] = []
+    for each in looks:
+        found.append((each.evidence, each.located(*images)))
+        found += [
+            (float(evidence), each.on_planes(np.asarray([plane]), *images))
+            for plane, evidence in enumerate(each.plane_evidence)
+        ]
+    chosen: list[tuple[Located, np.ndarray]] = []
+    for _, matches in sorted(found, key=lambda item: -item[0]):
+        affine = affine_between(matches)
+        if affine is None or any(_same(matches, affine, other) for _, other in chosen):
+            continue
+        chosen.append((matches, affine))
+        if len(chosen) == MOST_PROPOSALS:
+            break
+    return [matches for matches, _ in chosen]
+
+
+def _same(matches: Located, affine: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two affine maps lead to nearly the same view of the matches."""
+    ours, theirs = mapped(affine, matches.xy0), mapped(other, matches.xy0)
+    extent = float(np.ptp(ours, axis=0).max())
+    return float(np.median(np.linalg.norm(ours - theirs, axis=1))) < SAME * extent
+
+
+class PlaneLooks(NamedTuple):
+    """Looks at the planes of a pair."""
+
+    confirmed: list[Look]
+    """Those that count, the strongest first."""
+    taken: int
+    """How many were taken, those included that do not count."""
+
+
+def looks_at_planes(
+    weights: Weights, images: tuple[ImageFile, ImageFile], best: Look, *, config: Config, seed: int
+) -> PlaneLooks:
+    """A look at each of the strongest planes of a look, as seen from one place.
+
+    A common view of the whole scene fits one plane at best: other surfaces are shifted, stretched
+    and slanted in it. In a view that fits their own plane they look alike in both photos, and their
+    matches are more and nearer. The epipolar geometry of a pair depends on matches of several
+    planes.
+
+    A look counts if what its planes have beyond chance is as much as the plane that led to it had
+    with chance, so it must grow a little: what is seen alike is confirmed, and a false plane goes.
+    Such a plane is seen once more, larger, and the stronger look counts. The looks find other
+    planes nearby, too.
+
+    None counts if none is as strong as the look that led to them: under a true geometry at least
+    one is (docs/decisions/hard-pairs.md).
+
+    Args:
+      best: the look whose planes are looked at, as many as `config.closer_looks` says.
+    """
+    strongest = np.argsort(-best.plane_evidence, kind="stable")[: config.closer_looks]
+    found, taken = [], 0
+    for plane in strongest[best.plane_evidence[strongest] > BY_CHANCE]:
+        place = best.on_planes(np.asarray([plane]), *images)
+        confirmed = []
+        for size in SIZES:
+            nearer = closer_look(weights, images, place, size=size, config=config, seed=seed)
+            taken += nearer is not None
+            if nearer is None or nearer.evidence < best.plane_evidence[plane]:
+                break
+            confirmed.append(nearer)
+        if confirmed:
+            found.append(max(confirmed, key=lambda each: each.evidence))
+    found.sort(key=lambda each: -each.evidence)
+    counts = bool(found) and found[0].evidence >= best.evidence
+    return PlaneLooks(found if counts else [], taken)
