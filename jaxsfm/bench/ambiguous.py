@@ -14,7 +14,7 @@ from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.inputs import StrechaSet, choose_sets, find_sets, read_set
 from jaxsfm.bench.judges import OUTCOMES, Outcome, doubt, judge
 from jaxsfm.bench.methods import AMBIGUOUS_METHODS, MAPPERS
-from jaxsfm.bench.options import AmbiguousOptions
+from jaxsfm.bench.model_options import AmbiguousOptions
 from jaxsfm.bench.repeated import SCENES, write_repeated
 from jaxsfm.bench.strecha import ModelRow, camera_errors, not_evaluated_lines
 from jaxsfm.bench.strecha_models import MethodRun, set_models, take_matches

@@ -17,8 +17,8 @@ from jaxsfm.bench import scenes
 from jaxsfm.bench.aachen import PAIRS, aachen_scene, write_submission
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, table
 from jaxsfm.bench.methods import METHODS, NAIVE
+from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night_protocol import LIMITS, SubsetRow, Summary, judge, limit_name, summary
-from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Scene
 from jaxsfm.bench.subset_models import dense_models, naive_models, rootsift_models
 from jaxsfm.errors import UserError

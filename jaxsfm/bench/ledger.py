@@ -36,7 +36,7 @@ from jaxsfm.bench.ledger_table import (
     counts,
     markdown,
 )
-from jaxsfm.bench.options import LedgerOptions
+from jaxsfm.bench.model_options import LedgerOptions
 from jaxsfm.bench.strecha import camera_errors
 from jaxsfm.colmap.poses import Poses, model_poses, read_model
 from jaxsfm.errors import UserError

@@ -19,8 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsfm.bench.methods import ROOTSIFT
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import KeypointMatches, write_keypoint_matches
+from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, verify
 from jaxsfm.config import Config
 from jaxsfm.core.naive import match_naively
@@ -34,6 +36,7 @@ from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.matching.pair_matching import thresholds, to_original_pixels
+from jaxsfm.matching.pipeline import open_images
 from jaxsfm.runs.job import timed
 
 HELD = 4
@@ -159,3 +162,28 @@ def write_lightglue_database(
     with timed(seconds, "matching"):  # RootSIFT's has the verification, too
         write_keypoint_matches(database, images, found, cameras)
         verify(database, options)
+
+
+def write_other_matches(
+    database: Path, folder: Path, method: str, pairs: Iterable[Pair], cameras: Cameras
+) -> dict[str, float]:
+    """Describe the photos of a folder with the features of a method, match and verify the pairs.
+
+    Args:
+      database: is written anew; its folder is made.
+      method: `rootsift` or `aliked+lightglue`.
+
+    Returns:
+      The seconds of the stages.
+    """
+    database.parent.mkdir(parents=True, exist_ok=True)
+    images, _ = open_images(folder)
+    verification, chosen, seconds = VerificationOptions(), sorted(pairs), dict[str, float]()
+    if method == ROOTSIFT:
+        with timed(seconds, "matching"):
+            write_rootsift_database(database, folder, images, cameras, verification, pairs=chosen)
+    else:
+        write_lightglue_database(
+            database, images, cameras, verification, pairs=chosen, seconds=seconds
+        )
+    return seconds

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxsfm.bench.inputs import check_root, choose_sets, strecha_intrinsics, usable_image
+from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night import synthetic_night
-from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.synthetic import write_photo
 from jaxsfm.colmap.given_cameras import parse_cameras, parse_intrinsics
 from jaxsfm.colmap.intrinsics import MODELS, KnownCameras, check_fits

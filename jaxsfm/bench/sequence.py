@@ -8,7 +8,7 @@ and the last tenth of the frames (drift).
 
 import dataclasses
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,8 +17,9 @@ import numpy as np
 from jaxsfm.bench.figures import write_json
 from jaxsfm.bench.inputs import Frames, chosen_frames, linked
 from jaxsfm.bench.methods import LIGHTGLUE, ROOTSIFT
-from jaxsfm.bench.options import BenchOptions, CameraUse, SequenceOptions, whole_numbers
-from jaxsfm.bench.other_methods import trained_networks, write_lightglue_database
+from jaxsfm.bench.model_options import CameraUse, SequenceOptions
+from jaxsfm.bench.options import BenchOptions, whole_numbers
+from jaxsfm.bench.other_methods import trained_networks, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.given_cameras import parse_cameras
@@ -27,8 +28,6 @@ from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import run_mapper
 from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
 from jaxsfm.colmap.resection import find_view
-from jaxsfm.colmap.rootsift import write_rootsift_database
-from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.colmap.view import View
 from jaxsfm.config import PRESETS, preset
 from jaxsfm.errors import UserError
@@ -36,7 +35,6 @@ from jaxsfm.io.atomic import Json
 from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.pixels import Pixels
-from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import Mapper
 from jaxsfm.runs.job import timed
 from jaxsfm.runs.localize import localize_photos
@@ -157,31 +155,6 @@ def with_jaxsfm(given: FrameSequence, name: str) -> tuple[dict[str, Json], set[P
         row["localized"] = _summary(placed, len(found), seconds)
         row["trusted"] = sum(each.status == "localized" for each in found)
     return row, pairs
-
-
-def write_other_matches(
-    database: Path, folder: Path, method: str, pairs: Iterable[Pair], cameras: Cameras
-) -> dict[str, float]:
-    """Describe the photos of a folder with the features of a method, match and verify the pairs.
-
-    Args:
-      database: is written anew; its folder is made.
-      method: one of `OTHERS`.
-
-    Returns:
-      The seconds of the stages.
-    """
-    database.parent.mkdir(parents=True, exist_ok=True)
-    images, _ = open_images(folder)
-    verification, chosen, seconds = VerificationOptions(), sorted(pairs), dict[str, float]()
-    if method == ROOTSIFT:
-        with timed(seconds, "matching"):
-            write_rootsift_database(database, folder, images, cameras, verification, pairs=chosen)
-    else:
-        write_lightglue_database(
-            database, images, cameras, verification, pairs=chosen, seconds=seconds
-        )
-    return seconds
 
 
 def with_other_features(given: FrameSequence, method: str, pairs: set[Pair]) -> dict[str, Json]:

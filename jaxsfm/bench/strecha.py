@@ -10,7 +10,7 @@ import numpy as np
 from jaxsfm.bench.figures import BenchFigures, Cells, collect, forget_peak, peak_bytes, table
 from jaxsfm.bench.inputs import StrechaSet, read_sets
 from jaxsfm.bench.methods import SET_METHODS
-from jaxsfm.bench.options import StrechaOptions
+from jaxsfm.bench.model_options import StrechaOptions
 from jaxsfm.bench.strecha_models import MethodRun, SetModels, set_models
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.errors import UserError

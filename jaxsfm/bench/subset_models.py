@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsfm.bench.inputs import linked
 from jaxsfm.bench.methods import NAIVE, method_config
-from jaxsfm.bench.options import DayNightOptions
+from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.other_methods import match_pairs_naively
 from jaxsfm.bench.scenes import Scene, Subset
 from jaxsfm.colmap.cameras import Cameras

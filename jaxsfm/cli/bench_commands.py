@@ -6,15 +6,14 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from jaxsfm.bench.options import (
+from jaxsfm.bench.model_options import (
     AmbiguousOptions,
-    BenchOptions,
     DayNightOptions,
     LedgerOptions,
     SequenceOptions,
     StrechaOptions,
-    WxbsOptions,
 )
+from jaxsfm.bench.options import BenchOptions, WxbsOptions
 from jaxsfm.cli.run_commands import Positional, check_writable
 from jaxsfm.cli.subcommands import one_of
 from jaxsfm.io.libraries import limit_threads

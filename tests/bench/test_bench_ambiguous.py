@@ -10,7 +10,7 @@ import pytest
 from jaxsfm.bench.ambiguous import cells, counts, table_lines
 from jaxsfm.bench.judges import OUTCOMES
 from jaxsfm.bench.methods import AMBIGUOUS_METHODS, METHODS, method_config
-from jaxsfm.bench.options import AmbiguousOptions
+from jaxsfm.bench.model_options import AmbiguousOptions
 from jaxsfm.bench.strecha_models import take_matches
 from jaxsfm.cli.main import main
 from jaxsfm.config import preset

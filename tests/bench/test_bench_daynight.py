@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxsfm.bench import scenes
 from jaxsfm.bench.daynight import PUBLISHED, cumulative, table_lines
+from jaxsfm.bench.model_options import DayNightOptions
 from jaxsfm.bench.night_protocol import LIMITS, judge, summary
-from jaxsfm.bench.options import DayNightOptions
 from jaxsfm.bench.scenes import Subset
 from jaxsfm.bench.subset_models import (
     NightMatches,

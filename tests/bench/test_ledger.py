@@ -29,7 +29,7 @@ from jaxsfm.bench.ledger_table import (
     set_cells,
     table_lines,
 )
-from jaxsfm.bench.options import LedgerOptions
+from jaxsfm.bench.model_options import LedgerOptions
 from jaxsfm.bench.synthetic import camera_text, write_photo
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.model_folders import write_models

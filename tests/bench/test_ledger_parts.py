@@ -9,7 +9,7 @@ from jaxsfm.bench import ledger_runs
 from jaxsfm.bench.ledger import bench_ledger
 from jaxsfm.bench.ledger_runs import LEAST, MOST, NOTHING_AFTER, part_of
 from jaxsfm.bench.ledger_sets import SetPhotos
-from jaxsfm.bench.options import LedgerOptions
+from jaxsfm.bench.model_options import LedgerOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.photo_folder import find_images
 

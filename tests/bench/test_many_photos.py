@@ -12,7 +12,7 @@ from jaxsfm.bench import driver, sequence
 from jaxsfm.bench.driver import NOISE_PX, REACH, SimulatedStreet
 from jaxsfm.bench.inputs import chosen_frames, linked
 from jaxsfm.bench.long_street import SIZE, walk, write_street
-from jaxsfm.bench.options import SequenceOptions
+from jaxsfm.bench.model_options import SequenceOptions
 from jaxsfm.bench.synthetic import camera_matrix
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.poses import read_poses
