@@ -603,7 +603,8 @@ def test_another_model_is_written_beside_the_result_and_goes_when_there_is_none(
     assert "alternative/0 is another mapping, which follows the order" in capsys.readouterr().out
     assert (out / "alternative" / "0" / "images.bin").is_file()
     page = (out / "report.html").read_text()
-    assert "<b>Another model</b> of these photos" in page and "Photos that fit" not in page
+    assert "<h3>Other model</h3>" in page and "alternative/0 is another mapping" in page
+    assert "<h3>Second place</h3>" not in page
     (check,) = json.loads((out / "report.json").read_text())["checks"]
     assert check["alternative"]["elsewhere"] == ["view2.png"]
     monkeypatch.undo()
