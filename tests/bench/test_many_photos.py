@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxsfm.bench import driver, sequence
+from jaxsfm.bench import driver, other_methods, sequence
 from jaxsfm.bench.driver import NOISE_PX, REACH, SimulatedStreet
 from jaxsfm.bench.inputs import chosen_frames, linked
 from jaxsfm.bench.long_street import SIZE, walk, write_street
@@ -156,7 +156,7 @@ def test_trained_networks_get_the_pairs_of_the_preset_beside_them(
 
     monkeypatch.setattr(sequence, "trained_networks", lambda: None)
     monkeypatch.setattr(sequence, "with_jaxsfm", lambda given, name: ({}, chosen))
-    monkeypatch.setattr(sequence, "write_lightglue_database", write_lightglue_database)
+    monkeypatch.setattr(other_methods, "write_lightglue_database", write_lightglue_database)
     options = SequenceOptions(
         root=street_sequence, every=("2",), methods=("default,aliked+lightglue",), out=tmp_path
     )
