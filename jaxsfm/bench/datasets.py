@@ -5,6 +5,7 @@ import json
 import os
 from pathlib import Path, PurePosixPath
 
+import msgspec
 import platformdirs
 
 from jaxsfm.errors import UserError
@@ -207,11 +208,10 @@ def _text(fetched: dict[str, str]) -> bytes:
 
 def _read_fetched(path: Path) -> dict[str, str] | None:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        return msgspec.json.decode(path.read_bytes(), type=dict[str, str])
     except FileNotFoundError:
         return None
+    except msgspec.ValidationError as error:
+        raise UserError(f"{path}: not a list of hashes; remove it to fetch anew") from error
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: not readable ({error}); remove it to fetch anew") from error
-    if not isinstance(found, dict):
-        raise UserError(f"{path}: not a list of hashes; remove it to fetch anew")
-    return found

@@ -11,7 +11,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jaxsfm
 from jaxsfm.bench.figures import Cells, collect
@@ -40,9 +40,10 @@ from jaxsfm.bench.model_options import LedgerOptions
 from jaxsfm.bench.strecha import camera_errors
 from jaxsfm.colmap.poses import Poses, model_poses, read_model
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import read_json, write_atomic
+from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.pair_selection import FEW
 from jaxsfm.io.photo_folder import find_images
+from jaxsfm.io.typed_files import read_json
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.runs.run_options import RunOptions, check_options
 
@@ -139,8 +140,8 @@ def judged_row(
 
 def rootsift_figures(each: LedgerSet, given: SetPhotos, folder: Path) -> RootsiftFigures | None:
     """The figures of RootSIFT's run in a folder; None if it did not come to its end."""
-    seconds: Any = read_json(folder / SECONDS)
-    if not isinstance(seconds, dict):
+    seconds = read_json(folder / SECONDS, dict[str, float])
+    if seconds is None:
         return None
     models = _models(folder / "sparse")
     errors = _errors(each, given, models)

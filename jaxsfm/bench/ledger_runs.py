@@ -30,10 +30,10 @@ from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.io.atomic import read_json
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.store import FAILED
+from jaxsfm.io.typed_files import read_json
 from jaxsfm.options import Step
 from jaxsfm.report.run_report import FILE, RunReport, read_report
 from jaxsfm.runs.reconstruct import reconstruct_folder
@@ -145,8 +145,7 @@ def kept_run(folder: Path) -> RunReport | str | None:
             return read_report(at)
         except UserError as error:
             return str(error)
-    told = read_json(folder.parent / ERROR)
-    return str(told["error"]) if isinstance(told, dict) and "error" in told else None
+    return (read_json(folder.parent / ERROR, dict[str, str]) or {}).get("error")
 
 
 def run_rootsift(run: LedgerRun, folder: Path, pairs: list[Pair] | None) -> None:

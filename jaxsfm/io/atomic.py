@@ -6,7 +6,6 @@ same files, and digests say what is in them.
 
 import contextlib
 import hashlib
-import json
 import os
 import shutil
 import sqlite3
@@ -99,14 +98,6 @@ def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
         found = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), found)
         found = zlib.crc32(array.reshape(-1).view(np.uint8).data, found)
     return found
-
-
-def read_json(path: Path) -> Json:
-    """The content of a JSON file, or None if it cannot be read as JSON."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return None
 
 
 def check_disk_space(folder: Path, needed: int) -> None:

@@ -16,11 +16,12 @@ from jaxtyping import Array
 from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, read_json, save_arrays, write_atomic
+from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, save_arrays, write_atomic
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import DamagedImage, ImageError, ImageFile, content
 from jaxsfm.io.orientation import checked
 from jaxsfm.io.pairs import LazyMatches, Pair, PairResult, describe
+from jaxsfm.io.typed_files import read_json
 
 Identity = Mapping[str, Json]
 """What the matches of a run depend on: `version` of jaxsfm, `weights` and `relocalizer` (SHA-256),
@@ -133,14 +134,12 @@ class Store:
 
     # -- photos that could not be decoded --------------------------------------------------------
 
-    def _unusable(self) -> dict[str, Json]:
-        record = read_json(self.path / "unusable.json")
-        return record if isinstance(record, dict) else {}
+    def _unusable(self) -> dict[str, str]:
+        return read_json(self.path / "unusable.json", dict[str, str]) or {}
 
     def why_unusable(self, image: ImageFile) -> str | None:
         """The reason why an earlier run could not decode the photo; None if there is none."""
-        reason = self._unusable().get(digest(self.identity.get("version"), image.sha256))
-        return reason if isinstance(reason, str) else None
+        return self._unusable().get(digest(self.identity.get("version"), image.sha256))
 
     def record_failure(self, image: ImageFile, error: ImageError) -> None:
         """Remember a photo that is damaged, so that later runs skip it.

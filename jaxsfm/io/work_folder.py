@@ -5,12 +5,16 @@ computed once, and its files are kept under a key made of all that they depend o
 """
 
 import contextlib
+import dataclasses
 import json
 import logging
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import (
@@ -18,12 +22,12 @@ from jaxsfm.io.atomic import (
     Json,
     atomic_folder,
     only_process,
-    read_json,
     rows_sha256,
     sha256_of,
     write_atomic,
 )
 from jaxsfm.io.store import FAILED, Identity, Store, digest
+from jaxsfm.io.typed_files import read_json
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +41,23 @@ PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")
 _MOVES, _LOCK, _KEY = "moves.json", ".lock", "key"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Moves:
+    """New results that are complete and have not all been moved into place."""
+
+    failed: bool = False
+    """Whether they are put into the folder `failed`."""
+    names: list[str]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Photos:
+    """The photos in the identity of a run."""
+
+    images: dict[str, str]
+    """Their SHA-256, by name."""
 
 
 class WorkFolder(Store):
@@ -95,16 +116,15 @@ class WorkFolder(Store):
     def finish_publishing(self) -> None:
         """Move those of the complete results that have not been moved yet."""
         made = self.path / "publishing"
-        moves = read_json(made / _MOVES)
-        names = moves.get("names") if isinstance(moves, dict) else None
-        if not isinstance(moves, dict) or not isinstance(names, list):
+        moves = read_json(made / _MOVES, _Moves)
+        if moves is None:
             _remove(made)
             return
-        target = self.path / FAILED if moves.get("failed") else self.path
+        target = self.path / FAILED if moves.failed else self.path
         target.mkdir(exist_ok=True)
         # The report is removed first and moved last, so that it never describes other files.
         for name in RESULTS:
-            if name not in names or (made / name).exists():
+            if name not in moves.names or (made / name).exists():
                 _remove(target / name)
         for name in reversed(RESULTS):
             if (made / name).exists():
@@ -209,8 +229,8 @@ def _former(path: Path) -> Identity | None:
     record = path / RECORD
     if not record.exists():
         return None
-    old = read_json(record)
-    if not isinstance(old, dict) or not isinstance(old.get("images"), dict):
+    old = read_json(record, dict[str, Any])
+    if old is None or read_json(record, _Photos) is None:
         raise UserError(
             f"--out {path}: the folder holds a run whose {RECORD} is damaged; "
             "choose another folder or delete this one"
@@ -224,19 +244,15 @@ def _check_photos(path: Path, old: Identity, new: Identity) -> None:
     Otherwise the results of that run would be replaced.
     """
     before, now = _images(old), _images(new)
-    hashes = set(map(str, before.values()))
-    if hashes and not hashes & set(map(str, now.values())):
+    if before and not {*before.values()} & {*now.values()}:
         raise UserError(
             f"--out {path}: the folder holds a run of other photos (first {min(before)!r}); "
             "choose another folder or delete this one"
         )
 
 
-def _images(identity: Identity) -> Mapping[str, Json]:
-    images = identity["images"]
-    if not isinstance(images, dict):
-        raise ValueError(f"identity['images'] must map names to hashes; got {images!r}")
-    return images
+def _images(identity: Identity) -> dict[str, str]:
+    return msgspec.convert(identity, _Photos).images
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import msgspec
 import numpy as np
 
 from jaxsfm.colmap.model import Model, Sizes, point_colours
@@ -29,7 +30,7 @@ from jaxsfm.io.work_folder import RECORD
 from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
 from jaxsfm.report.run_results import EvaluationReport
-from jaxsfm.report.typed_json import from_json, to_json
+from jaxsfm.report.typed_json import to_json
 from jaxsfm.sfm.evaluation import Similarity, common_alignment, evaluate, of_photos
 
 if TYPE_CHECKING:
@@ -145,13 +146,24 @@ class FinishedRun:
     @property
     def config(self) -> Config:
         """The config of the run; UserError if it has fields that this version does not know."""
+        recorded = self.report.options["config"]
         try:
-            return from_json(Config, to_json(self.report.options.config), exact=True)
+            found = msgspec.convert(recorded, Config)
+            if not _has_keys(to_json(found), recorded):
+                raise ValueError("an option is not known")
         except ValueError as error:
             raise UserError(
                 f"{self.folder}: was made by jaxsfm {self.report.version}, whose options "
                 "this version does not know; run reconstruct again"
             ) from error
+        return found
+
+
+def _has_keys(known: object, recorded: object) -> bool:
+    """Whether all keys of nested dictionaries are known."""
+    if not isinstance(known, dict) or not isinstance(recorded, dict):
+        return True
+    return all(key in known and _has_keys(known[key], recorded[key]) for key in recorded)
 
 
 def sizes_within(reconstruction: "pycolmap.Reconstruction", max_size: int, enlarge: float) -> Sizes:
@@ -172,7 +184,7 @@ def _with_reference(
       given: reference poses that the user named. They must be readable. Those that the run was
         given may be gone, which is only a warning.
     """
-    recorded = report.options.reference
+    recorded = report.known_options.reference
     path = given or (None if recorded is None else Path(recorded))
     if path is None:
         return report, None
@@ -193,12 +205,13 @@ def evaluation_report(
     poses: Poses, reference: Poses, *, align_on: Collection[str] | None = None
 ) -> EvaluationReport:
     """The errors of a model's poses. Arguments and errors are those of `evaluate`."""
-    return from_json(EvaluationReport, evaluate(poses, reference, align_on=align_on).as_dict())
+    found = evaluate(poses, reference, align_on=align_on)
+    return msgspec.convert(found.as_dict(), EvaluationReport)
 
 
 def masks_folder(report: RunReport) -> Path | None:
     """The folder of the run's masks."""
-    folder = report.options.others.get("masks")
+    folder = report.options.get("masks")
     return Path(folder) if isinstance(folder, str) else None
 
 
@@ -242,7 +255,9 @@ def read_run(
     return FinishedRun(
         folder=folder,
         report=report,
-        photos=RecordedPhotos(where, report.identity, report.options.config, masks_folder(report)),
+        photos=RecordedPhotos(
+            where, report.identity, report.known_options.config, masks_folder(report)
+        ),
         model=model,
         colours=colours,
         reference=known,

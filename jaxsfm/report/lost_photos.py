@@ -14,7 +14,6 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 from jaxsfm.config import Config
-from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, describe
 from jaxsfm.report.advice import LEAST_ANGLE_DEG, towards_others, without_pose
 from jaxsfm.report.pair_outcomes import (
@@ -25,7 +24,7 @@ from jaxsfm.report.pair_outcomes import (
     view_graph_report,
 )
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, Stage
+from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, PairStatus, Stage
 
 
 class _Refused(NamedTuple):
@@ -56,8 +55,8 @@ def explained(
         angles=angles,
         sizes=sizes,
         config=config,
-        selection=report.options.pairs,
-        known_camera=report.options.intrinsics is not None,
+        selection=report.known_options.pairs,
+        known_camera=report.known_options.intrinsics is not None,
     )
     models = [model.images for model in report.models]
     groups = photo_groups(sizes, pairs.rows)
@@ -174,9 +173,9 @@ def _stage(own: Sequence[PairRow], connected: bool) -> tuple[Stage, str]:
     if not own:
         return "pairs", "it is in no pair that was tried"
     tentative = max(row.tentative for row in own)
-    if all(row.status == Status.TOO_FEW_MATCHES for row in own):
+    if all(row.status == PairStatus.TOO_FEW_MATCHES for row in own):
         return "too few matches", f"at most {tentative} tentative matches in a pair"
-    if not any(row.status == Status.VERIFIED for row in own):
+    if not any(row.status == PairStatus.VERIFIED for row in own):
         return "no plane", (
             f"{tentative} tentative matches, but no homography agrees with enough of them"
         )

@@ -5,9 +5,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from jaxsfm.config import Config
-from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, components
-from jaxsfm.report.run_results import ClosestPair, Component, PairRow, ViewGraph
+from jaxsfm.report.run_results import ClosestPair, Component, PairRow, PairStatus, ViewGraph
 from jaxsfm.sfm.limits import TRUST
 
 COLMAP_MIN_INLIERS = 15
@@ -62,7 +61,7 @@ class PairOutcomes(NamedTuple):
         if row.inliers:
             return f"{row.inliers} matches on planes, but --best-pairs left it out"
         needed = self.config.min_inliers
-        if row.status == Status.TOO_FEW_MATCHES:
+        if row.status == PairStatus.TOO_FEW_MATCHES:
             return f"{row.tentative} tentative matches, {needed} are needed"
         return f"{row.tentative} tentative matches, but no homography agrees with {needed} of them"
 

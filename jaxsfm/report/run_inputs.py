@@ -5,9 +5,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import field
 from typing import Annotated, TypeVar
 
+from msgspec import Meta
+
 from jaxsfm.io.images import ImageFile, orientations
 from jaxsfm.io.photo_folder import masks_of
-from jaxsfm.report.typed_json import OMITTED, OTHERS, Count, Range
+from jaxsfm.report.typed_json import OMITTED, Count
 
 T = TypeVar("T")
 
@@ -62,17 +64,15 @@ class UsedWeights:
 class RecordedConfig:
     """The fields of a run's `Config` that readers of reports of any version need."""
 
-    max_size: Annotated[int, Range(1, 2**31)]
+    max_size: Annotated[int, Meta(ge=1, lt=2**31)]
     """Longer side of a working image, pixels."""
-    enlarge: Annotated[float, Range(1, 2**31)]
+    enlarge: Annotated[float, Meta(ge=1, lt=2**31)]
     """The largest factor by which a smaller photo was enlarged."""
-    others: dict[str, object] = field(default_factory=dict, metadata=OTHERS)
-    """All other fields, which may be unknown to this version."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordedOptions:
-    """The options of a run."""
+    """The options of a run that readers of reports of any version need."""
 
     config: RecordedConfig
     pairs: str
@@ -80,12 +80,10 @@ class RecordedOptions:
     intrinsics: str | None
     """The value of `--intrinsics`; None if the focal lengths were estimated."""
     seed: Count
-    threads: Annotated[int, Range(-1, 2**31)]
+    threads: Annotated[int, Meta(ge=-1, lt=2**31)]
     """The number of threads; -1 stands for all."""
     reference: str | None = None
     """The path of the reference poses."""
-    others: dict[str, object] = field(default_factory=dict, metadata=OTHERS)
-    """All other options, which may be unknown to this version."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

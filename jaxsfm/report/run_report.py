@@ -5,14 +5,19 @@ missing in the report of an earlier version.
 """
 
 import dataclasses
+import functools
 import json
 from dataclasses import field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
+
+import msgspec
+from msgspec import Meta
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json, read_json, write_atomic
+from jaxsfm.io.atomic import Json, write_atomic
+from jaxsfm.io.typed_files import read_json
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     RecordedOptions,
@@ -28,7 +33,7 @@ from jaxsfm.report.run_results import (
     TriedPairs,
     ViewGraph,
 )
-from jaxsfm.report.typed_json import OMITTED, Count, Misfit, Number, Range, T, from_json, to_json
+from jaxsfm.report.typed_json import OMITTED, Count, Number, to_json
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck, VerdictColour
 from jaxsfm.sfm.georeference.georeference import Georeference
 from jaxsfm.sfm.refine.passes import RefinementFigures
@@ -36,6 +41,7 @@ from jaxsfm.sfm.refine.passes import RefinementFigures
 FILE = "report.json"
 FORMAT = 2
 """The version of the format. Reports of format 1 have no key `format`."""
+T = TypeVar("T")
 _WORST_FIRST: tuple[VerdictColour, ...] = ("red", "amber", "green")
 
 
@@ -57,10 +63,17 @@ class Extension:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class _Options:
+    """The options, as a part of the report: an error says so of its place."""
+
+    options: RecordedOptions
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RunReport:
     """Everything that is told about a run, except its model and its matches."""
 
-    format: Annotated[int, Range(1, FORMAT + 1)] = 1
+    format: Annotated[int, Meta(ge=1, le=FORMAT)] = 1
     version: str
     """The version of jaxsfm."""
     versions: dict[str, str] = field(default_factory=dict)
@@ -69,13 +82,16 @@ class RunReport:
     """Date and time, UTC."""
     identity: RunIdentity
     weights: UsedWeights
-    options: RecordedOptions
+    options: dict[str, object]
+    """All options, some of which may be unknown to this version (`known_options`)."""
     images: FoundPhotos
     pairs: TriedPairs
     given: UsedExternalMatches | None = None
     looks: UsedLooks | None = field(default=None, metadata=OMITTED)
     """None: all photos were described at the size of the config."""
-    turned: dict[str, Annotated[int, Range(1, 360)]] = field(default_factory=dict, metadata=OMITTED)
+    turned: dict[str, Annotated[int, Meta(ge=1, lt=360)]] = field(
+        default_factory=dict, metadata=OMITTED
+    )
     """By how many degrees photos are turned clockwise to be upright, by name: those that the run
     found to be stored sideways without a note in EXIF."""
     models: list[ModelRow]
@@ -103,6 +119,14 @@ class RunReport:
     """Why the model could not be compared with the reference poses."""
     extended: list[Extension] | None = field(default=None, metadata=OMITTED)
     """Calls of `jaxsfm extend` since the run."""
+
+    def __post_init__(self) -> None:
+        _ = self.known_options  # raises msgspec.ValidationError if they cannot be read
+
+    @functools.cached_property
+    def known_options(self) -> RecordedOptions:
+        """Those of the options that readers need."""
+        return msgspec.convert({"options": self.options}, _Options).options
 
     def photos(self) -> set[str]:
         """The names of all photos that the run was given, those that it could not use included."""
@@ -139,8 +163,8 @@ class RunReport:
 
     @classmethod
     def from_json(cls, value: object) -> "RunReport":
-        """A report from plain JSON; Misfit if this version cannot read it."""
-        return from_json(cls, value)
+        """A report from plain JSON; msgspec.ValidationError if this version cannot read it."""
+        return msgspec.convert(value, cls)
 
 
 def write_report(folder: Path, report: RunReport) -> None:
@@ -159,16 +183,16 @@ def read_part(folder: Path, kind: type[T], *keys: str) -> T:
     Raises:
       UserError: there is no report, or the part is damaged or of another version.
     """
-    value = read_json(folder / FILE)
+    value = read_json(folder / FILE, object)
     if value is None:
         raise UserError(f"{folder}: no finished run here ({FILE} is missing or damaged)")
     try:
         for key in keys:
             if not isinstance(value, dict) or key not in value:
-                raise Misfit(f"an object with the key {key!r}", value)
+                raise ValueError(f"the key {key!r} is missing")
             value = value[key]
-        return from_json(kind, value)
-    except Misfit as misfit:
+        return msgspec.convert(value, kind)
+    except ValueError as error:
         raise UserError(
-            f"{folder}: {FILE} is damaged, or of another version of jaxsfm ({misfit})"
-        ) from misfit
+            f"{folder}: {FILE} is damaged, or of another version of jaxsfm ({error})"
+        ) from error

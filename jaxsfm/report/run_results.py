@@ -1,10 +1,10 @@
 """The part of a run's report that says what came of its photos, pairs and models."""
 
 import dataclasses
+import enum
 from dataclasses import field
 from typing import Literal
 
-from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair
 from jaxsfm.report.typed_json import OMITTED, Count, Number
 from jaxsfm.sfm.evaluation import PoseError
@@ -22,13 +22,20 @@ Stage = Literal[
 """The stage at which a photo was lost (`jaxsfm.report.lost_photos` explains each)."""
 
 
+class PairStatus(enum.StrEnum):
+    """How the matching of a pair ended: the names of `jaxsfm.core.types.Status`."""
+
+    VERIFIED = enum.auto()
+    TOO_FEW_MATCHES = enum.auto()
+    NO_PLANE = enum.auto()
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PairRow:
     """The numbers of one pair of photos."""
 
     pair: Pair
-    status: Status
-    """How the matching of the pair ended."""
+    status: PairStatus
     tentative: Count
     """Tentative matches."""
     inliers: Count

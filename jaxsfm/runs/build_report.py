@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import msgspec
+
 from jaxsfm.colmap.external_matches import ExternalMatches
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.config import Config
@@ -27,8 +29,7 @@ from jaxsfm.report.run_inputs import (
     UsedWeights,
 )
 from jaxsfm.report.run_report import FORMAT, Extension, RunReport
-from jaxsfm.report.run_results import ModelRow, PairRow, TriedPairs
-from jaxsfm.report.typed_json import from_json
+from jaxsfm.report.run_results import ModelRow, PairRow, PairStatus, TriedPairs
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.runs.working_model import CameraPrior
 from jaxsfm.sfm.evaluation import of_photos
@@ -104,7 +105,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
             overflowed=sum(r.num_dropped > 0 for r in results.values()),
             each=_pair_rows(counts, stages.handed_on, verified, verdicts),
         ),
-        given=None if about is None else from_json(UsedExternalMatches, about),
+        given=None if about is None else msgspec.convert(about, UsedExternalMatches),
         looks=stages.looks,
         turned=_turned(stages.usable, stages.identity.orientations),
         models=[_model_row(model) for model in made.models],
@@ -195,7 +196,7 @@ def extended_report(
     report = dataclasses.replace(report, lost=lost)
     if run.reference is not None:
         return evaluated(report, model_poses(models[0]), run.reference.poses)
-    if old.options.reference is not None:
+    if old.known_options.reference is not None:
         failed = "the run's reference poses cannot be used any more"
         return dataclasses.replace(report, evaluation_failed=failed)
     return report
@@ -226,13 +227,17 @@ def _now() -> str:
     return f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
 
 
-def _recorded_options(config: Config, options: RunOptions) -> RecordedOptions:
-    plain = dataclasses.asdict(options) | {"config": dataclasses.asdict(config)}
+def _recorded_options(config: Config, options: RunOptions) -> dict[str, object]:
+    """All options as plain JSON. Those that readers need come first."""
+    recorded = dataclasses.asdict(config) | {"enlarge": float(config.enlarge)}
+    plain = dataclasses.asdict(options) | {"config": recorded}
     del plain["progress"]
     for name in ("reference", "masks"):  # to be found from any working directory
         path = getattr(options, name)
         plain[name] = path and path.absolute()
-    return from_json(RecordedOptions, json.loads(json.dumps(plain, default=str)))
+    needed = [field.name for field in dataclasses.fields(RecordedOptions)]
+    plain = {name: plain[name] for name in [*needed, *plain]}
+    return json.loads(json.dumps(plain, default=str))
 
 
 def _pair_rows(
@@ -245,7 +250,7 @@ def _pair_rows(
     return [
         PairRow(
             pair=pair,
-            status=each.status,
+            status=PairStatus[each.status.name],
             tentative=each.num_tentative,
             inliers=each.num_inliers,
             planes=each.num_planes,

@@ -110,7 +110,7 @@ def _extend(
         config=finished.config,
         engine=engine,
         execution=options.execution,
-        seed=finished.report.options.seed,
+        seed=finished.report.known_options.seed,
         progress=options.progress,
     )
     shortlist = shortlist or similar_photos(
@@ -221,7 +221,7 @@ def write_extension(
     copy_database(run.folder / "database.db", database, count)
     # A camera of the run has the same number in all models, and a new one has none yet.
     added = add_images(database, {n: (i, new.cameras[n][0].camera) for n, i in new.images.items()})
-    seed, config = run.report.options.seed, run.config
+    seed, config = run.report.known_options.seed, run.config
     verification = VerificationOptions(
         seed=seed, threads=options.threads, scale=photos.median_scale()
     )

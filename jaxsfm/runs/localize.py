@@ -135,7 +135,7 @@ def localize_photos(
             config=finished.config,
             engine=engine,
             execution=options.execution,
-            seed=finished.report.options.seed,
+            seed=finished.report.known_options.seed,
             progress=options.progress,
         )
         if lost := job.extract_missing(files.values()):

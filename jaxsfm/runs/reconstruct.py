@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
 from tqdm import tqdm
 
 from jaxsfm.colmap.cameras import Cameras
@@ -31,7 +32,7 @@ from jaxsfm.options import Retrieval
 from jaxsfm.report.page import page_after_run
 from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
-from jaxsfm.report.typed_json import from_json, to_json
+from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.runs.job import Job, pairs_without, timed
@@ -169,7 +170,7 @@ def reconstruct_folder(
                     external=external,
                     reconstructed=made,
                     georeference=moved,
-                    weights=from_json(UsedWeights, weights.described(config)),
+                    weights=msgspec.convert(weights.described(config), UsedWeights),
                     looks=looks,
                     seconds=seconds,
                 ),

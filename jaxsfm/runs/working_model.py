@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import msgspec
 import numpy as np
 
 from jaxsfm.colmap.cameras import Cameras, estimated_camera
@@ -29,7 +30,6 @@ from jaxsfm.matching.retrieval import describe_photos
 from jaxsfm.options import WeightsChoice
 from jaxsfm.report.finished_run import FinishedRun, sizes_within
 from jaxsfm.report.run_inputs import UsedWeights
-from jaxsfm.report.typed_json import from_json
 
 if TYPE_CHECKING:
     import pycolmap
@@ -73,7 +73,7 @@ def read_working_model(folder: Path, config: Config, *, seed: int = 0) -> Workin
 
 def read_working_models(run: FinishedRun) -> list[WorkingModel]:
     """All models of a run, the first one first; UserError if one is missing or cannot be read."""
-    config, seed = run.config, run.report.options.seed
+    config, seed = run.config, run.report.known_options.seed
     return [
         read_working_model(run.folder / "sparse" / str(k), config, seed=seed)
         for k in range(len(run.report.models))
@@ -143,7 +143,7 @@ def weights_of_run(run: FinishedRun, choice: WeightsChoice) -> Weights:
     """Load the weights that a run was made with; UserError if `choice` names others."""
     config = run.config
     weights = chosen_weights(choice, config.backbone)
-    made_with, now = run.report.weights, from_json(UsedWeights, weights.described(config))
+    made_with, now = run.report.weights, msgspec.convert(weights.described(config), UsedWeights)
     for used, here, option in (
         (made_with.sha256, now.sha256, "--weights"),
         (made_with.relocalizer_sha256, now.relocalizer_sha256, "--relocalizer"),

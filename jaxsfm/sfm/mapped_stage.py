@@ -21,14 +21,18 @@ from jaxsfm.io.libraries import package_versions
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
+from jaxsfm.io.typed_files import read_figures, write_figures
 from jaxsfm.io.work_folder import WorkFolder
-from jaxsfm.sfm import stage_files
-from jaxsfm.sfm.check.check_model import CHECKED_BY
+from jaxsfm.sfm.check.check_model import CHECKED_BY, Checked
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
-from jaxsfm.sfm.stage_files import VerificationFigures, read_outcomes, write_outcomes
 
-DATABASE, SPARSE, ALTERNATIVE, OUTCOMES = "database.db", "sparse", "alternative", "outcomes.json"
+DATABASE, SPARSE, ALTERNATIVE = "database.db", "sparse", "alternative"
+FIGURES = "figures.msgpack"
+"""What a stage leaves beside its models."""
+FORMAT = 23
+"""The version of what the stages leave. It is part of their keys, so that stages of another version
+are not used."""
 
 
 class StageCache(NamedTuple):
@@ -64,6 +68,16 @@ class MatchedPhotos:
     def unrefined(self) -> "MatchedPhotos":
         """The same photos, whose models are not refined."""
         return dataclasses.replace(self, config=dataclasses.replace(self.config, refinement=None))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VerificationFigures:
+    """The results of verification."""
+
+    verified: dict[Pair, int]
+    """Number of two-view inliers, by pair that has any."""
+    angles: dict[Pair, float]
+    """Degrees at which the rays of a verified pair's points meet (median); 0: unknown."""
 
 
 class VerifiedStage(NamedTuple):
@@ -120,19 +134,17 @@ def verify_matches(given: MatchedPhotos, kept: StageCache) -> VerifiedStage:
             verified={pair: view.geometry.num_inliers for pair, view in views.items()},
             angles={pair: view.tri_angle_deg for pair, view in views.items()},
         )
-        stage_files.write_verification(folder, figures)
+        write_figures(folder / FIGURES, figures)
 
     by_image = [[image.name, image.content, image.size] for image in given.images]
     camera = given.cameras.plain()
     settings = [options.seed, options.threads, options.scale, config.view_graph]
-    key = digest(
-        kept.matches_key, stage_files.FORMAT, by_image, camera, settings, package_versions()
-    )
+    key = digest(kept.matches_key, FORMAT, by_image, camera, settings, package_versions())
     folder = kept.folder.stage("verified", key, compute)
     views = read_two_views(folder / DATABASE)
     photos = Photos(given.images, given.described)
     pairs = VerifiedPairs(folder / DATABASE, views, given.matches, photos)
-    return VerifiedStage(stage_files.read_verification(folder), pairs, key)
+    return VerifiedStage(read_figures(folder / FIGURES, VerificationFigures), pairs, key)
 
 
 def map_trusted(
@@ -157,7 +169,7 @@ def map_trusted(
     def compute(folder: Path) -> None:
         made = mapper.map(trust, folder / DATABASE)
         write_models(made.models, folder / SPARSE)
-        write_outcomes(folder / OUTCOMES, made.checks)
+        write_figures(folder / FIGURES, made.checks)
 
     key = digest(verified.key, *mapping_settings(given), _plain(trust))
     folder = kept.folder.stage(name, key, compute)
@@ -165,7 +177,7 @@ def map_trusted(
         trust=trust,
         database=folder / DATABASE,
         models=read_models(folder / SPARSE, folder / DATABASE),
-        checks=read_outcomes(folder / OUTCOMES),
+        checks=read_figures(folder / FIGURES, list[Checked | None]),
     )
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.model_folders import read_models, write_models
 from jaxsfm.config import Config
@@ -12,20 +12,21 @@ from jaxsfm.io.atomic import Json
 from jaxsfm.io.pairs import ChosenMatches, Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
-from jaxsfm.sfm import stage_files
+from jaxsfm.io.typed_files import read_figures, write_figures
 from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.mapped_stage import (
     ALTERNATIVE,
+    FIGURES,
     SPARSE,
     MatchedPhotos,
     StageCache,
+    VerificationFigures,
     VerifiedStage,
 )
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refined_models import Believed, RefinedModels, refine_models
 from jaxsfm.sfm.settled_stage import SettledModels
-from jaxsfm.sfm.stage_files import VerificationFigures
 
 if TYPE_CHECKING:
     import pycolmap
@@ -43,6 +44,15 @@ class Reconstructed:
     """Models that join the photos in another way, not refined; empty if there is no other way."""
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
+
+
+class RefinedFigures(NamedTuple):
+    """What a stage leaves beside refined models."""
+
+    models: list[RefinementFigures | None]
+    """For each model; None: it was not refined."""
+    order: list[int]
+    """For each model, its index among the models that the stage was given."""
 
 
 def check_refined(check: ModelCheck | None, done: RefinementFigures | None) -> ModelCheck | None:
@@ -81,7 +91,7 @@ def refine_settled(
     key = digest(settled.key, *refinement_settings(config))
     refined = kept.folder.stage("refined", key, refine)
     shutil.copyfile(settled.database, database)
-    refinement, order = stage_files.read_refinement(refined)
+    refinement, order = read_figures(refined / FIGURES, RefinedFigures)
     models = read_models(refined / SPARSE, database)
     if config.refinement is not None and None in refinement:
         kept.folder.forget_stage("refined")  # a photo could not be read; perhaps it can next time
@@ -107,7 +117,7 @@ def believed_matches(given: MatchedPhotos, settled: SettledModels) -> Mapping[Pa
 def write_refined(folder: Path, after: RefinedModels) -> None:
     """Write refined models into the folder of a stage."""
     write_models(after.models, folder / SPARSE)
-    stage_files.write_refinement(folder, after.figures, after.order)
+    write_figures(folder / FIGURES, RefinedFigures(after.figures, after.order))
 
 
 def refinement_settings(config: Config) -> list[Json]:

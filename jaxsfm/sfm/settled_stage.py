@@ -17,8 +17,8 @@ from jaxsfm.colmap.model_images import fingerprint, part_of
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.errors import remark
 from jaxsfm.io.store import digest
+from jaxsfm.io.typed_files import read_figures, write_figures
 from jaxsfm.options import Step
-from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.check.common_places import SAME_SHARE, groups
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Alternative, ModelCheck, repeats
@@ -26,6 +26,7 @@ from jaxsfm.sfm.checker import CheckedModel, Checker
 from jaxsfm.sfm.mapped_stage import (
     ALTERNATIVE,
     DATABASE,
+    FIGURES,
     SPARSE,
     MatchedPhotos,
     StageCache,
@@ -105,12 +106,12 @@ def settle(
         )
         write_models(found.models, folder / SPARSE)
         write_models(found.alternative, folder / ALTERNATIVE)
-        stage_files.write_mapping(folder, figures)
+        write_figures(folder / FIGURES, figures)
 
     models = [fingerprint(model) for each in made if each is not None for model in each.models]
     key = digest(verified.key, *mapping_settings(given), models, sorted(without))
     folder = kept.folder.stage("settled", key, compute)
-    return SettledModels(stage_files.read_mapping(folder), folder, key)
+    return SettledModels(read_figures(folder / FIGURES, MappingFigures), folder, key)
 
 
 def _settled(

@@ -54,7 +54,6 @@ FILES = (
     "jaxsfm/sfm/register",
     "jaxsfm/sfm/road.py",
     "jaxsfm/sfm/settled_stage.py",
-    "jaxsfm/sfm/stage_files.py",
     "jaxsfm/sfm/view_graph.py",
 )
 ALIGN = ("tests/core/test_align.py", "tests/core/test_alignment_noise.py")

@@ -15,7 +15,7 @@ from jaxsfm.io.pairs import PairCounts, component_of, exhaustive_pairs
 from jaxsfm.report.lost_photos import explained as explained_report
 from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, photo_groups
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.report.run_results import ModelRow, PairRow
+from jaxsfm.report.run_results import ModelRow, PairRow, PairStatus
 from jaxsfm.report.summary import component_lines, help_lines
 from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.limits import TRUST
@@ -57,7 +57,7 @@ def pair_rows(results, handed_on, verified, verdicts) -> list[PairRow]:
     return [
         PairRow(
             pair=pair,
-            status=each.status,
+            status=PairStatus[each.status.name],
             tentative=each.num_tentative,
             inliers=each.num_inliers,
             planes=each.num_planes,
@@ -92,7 +92,7 @@ def explanation(
     report = replace(
         REPORT,
         pairs=replace(REPORT.pairs, each=pair_rows(results, handed_on, verified, verdicts or {})),
-        options=replace(REPORT.options, pairs=pairs, intrinsics=intrinsics),
+        options=REPORT.options | {"pairs": pairs, "intrinsics": intrinsics},
         models=[
             ModelRow(
                 registered=len(images),

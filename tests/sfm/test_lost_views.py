@@ -19,7 +19,7 @@ from jaxsfm.colmap.poses import model_poses
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm.limits import RegisterLimits
-from jaxsfm.sfm.mapped_stage import MatchedPhotos, StageCache
+from jaxsfm.sfm.mapped_stage import MatchedPhotos, StageCache, VerificationFigures
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
@@ -29,7 +29,6 @@ from jaxsfm.sfm.register.grow import ExtendedModels
 from jaxsfm.sfm.register.locate_view import Localization
 from jaxsfm.sfm.register.lost import MatchLost, register_lost
 from jaxsfm.sfm.settled_stage import SettledModels
-from jaxsfm.sfm.stage_files import VerificationFigures
 from jaxsfm.sfm.view_graph import Verdict
 
 LOST = NAMES[3]

@@ -1,7 +1,10 @@
 """Laws of the figures that stages leave: what is written is read again."""
 
 import dataclasses
+from pathlib import Path
+from typing import TypeVar
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -9,21 +12,17 @@ from verdicts import OTHER, check_of
 
 from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.colmap.other_camera import OtherCamera
+from jaxsfm.io.typed_files import read_figures, write_figures
+from jaxsfm.sfm.check.check_model import Checked
+from jaxsfm.sfm.mapped_stage import VerificationFigures
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.one_pass import PassFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
-from jaxsfm.sfm.stage_files import (
-    VerificationFigures,
-    read_mapping,
-    read_refinement,
-    read_verification,
-    write_mapping,
-    write_refinement,
-    write_verification,
-)
+from jaxsfm.sfm.refined_stage import RefinedFigures
 from jaxsfm.sfm.view_graph import Verdict
 
+T = TypeVar("T")
 NAMES = ["a b.jpg", "sub/ü.png", '"c".jpg']
 PAIRS = [("a b.jpg", "sub/ü.png"), ("a b.jpg", '"c".jpg'), ("sub/ü.png", '"c".jpg')]
 
@@ -60,18 +59,37 @@ mappings = st.builds(
 )
 
 
+def written_and_read(folder: Path, value: object, kind: type[T]) -> T:
+    write_figures(folder / "figures", value)
+    return read_figures(folder / "figures", kind)
+
+
 @settings(max_examples=30, deadline=None)
 @given(mappings)
 def test_figures_of_mapping_survive_a_file(tmp_path_factory, figures):
     folder = tmp_path_factory.mktemp("mapped")
-    write_mapping(folder, figures)
-    assert read_mapping(folder) == figures
+    assert written_and_read(folder, figures, MappingFigures) == figures
+
+
+def test_checks_of_a_mapping_survive_a_file(tmp_path):
+    refuted = dict(zip(PAIRS, check_of("red").contradictions, strict=False))
+    found = Checked(
+        check=check_of("red"),
+        refuted=refuted,
+        suspected={},
+        explained={PAIRS[1]},
+        against={PAIRS[2], PAIRS[0]},
+        parts=[NAMES[:2], NAMES[2:]],
+    )
+    assert refuted
+    assert written_and_read(tmp_path, [found, None], list[Checked | None]) == [found, None]
 
 
 def test_a_check_that_was_read_has_the_verdict_that_was_written(tmp_path):
     written = [check_of("green"), None, check_of("red"), check_of("amber")]
-    write_mapping(tmp_path, MappingFigures(verdicts={}, attempts=[], checks=written))
-    colours = [check and check.verdict for check in read_mapping(tmp_path).checks]
+    figures = MappingFigures(verdicts={}, attempts=[], checks=written)
+    found = written_and_read(tmp_path, figures, MappingFigures)
+    colours = [check and check.verdict for check in found.checks]
     assert colours == ["green", None, "red", "amber"]
 
 
@@ -98,10 +116,8 @@ def test_figures_of_refinement_survive_a_file_with_the_order_of_the_models(tmp_p
             camera=OtherCamera(model="PINHOLE", params=[9.0] * 4, distance_px=4.5, halves_px=0.5),
         ),
     ]
-    write_refinement(tmp_path, models, [2, 0, 1])
-    assert read_refinement(tmp_path) == (models, [2, 0, 1])
-    write_refinement(tmp_path, [], [])
-    assert read_refinement(tmp_path) == ([], [])
+    for figures in (RefinedFigures(models, [2, 0, 1]), RefinedFigures([], [])):
+        assert written_and_read(tmp_path, figures, RefinedFigures) == figures
 
 
 def test_figures_of_verification_survive_a_file(tmp_path):
@@ -109,12 +125,25 @@ def test_figures_of_verification_survive_a_file(tmp_path):
         verified=dict(zip(PAIRS, (30, 15, 99), strict=True)),
         angles=dict(zip(PAIRS, (0.0, 1.25, 44.5), strict=True)),
     )
-    write_verification(tmp_path, figures)
-    assert read_verification(tmp_path) == figures
+    assert written_and_read(tmp_path, figures, VerificationFigures) == figures
+
+
+def test_a_number_of_numpy_is_written_as_a_number_and_other_things_are_not(tmp_path):
+    assert written_and_read(tmp_path, [np.float64(0.1), np.inf], list[float]) == [0.1, np.inf]
+    with pytest.raises(TypeError, match="must be plain; got ndarray"):
+        write_figures(tmp_path / "figures", [np.zeros(3)])
+
+
+@pytest.mark.parametrize(
+    "value, place",
+    [({"verified": {}}, "angles"), ({"verified": {}, "angles": [1]}, r"\$.angles")],
+)
+def test_figures_of_another_kind_are_refused(tmp_path, value, place):
+    with pytest.raises(ValueError, match=place):
+        written_and_read(tmp_path, value, VerificationFigures)
 
 
 @pytest.mark.parametrize("initial", [None, PAIRS[0]])
 def test_the_first_pair_of_a_mapper_is_a_pair_again(tmp_path, initial):
     attempt = Attempt(mapper="incremental", initial_pair=initial, registered=[3, 2])
-    write_mapping(tmp_path, MappingFigures(verdicts={}, attempts=[attempt], checks=[]))
-    assert read_mapping(tmp_path).attempts == [attempt]
+    assert written_and_read(tmp_path, [attempt], list[Attempt]) == [attempt]

@@ -48,7 +48,7 @@ def test_each_model_of_a_run_has_the_check_that_follows_from_its_own_refinement(
     """The refinement changes the order of the models if another one has most photos then."""
     whole, part = check_of("green"), dataclasses.replace(check_of("green"), apart=[["a", "b"]])
     done = [refined(True), refined(False)]
-    monkeypatch.setattr(refined_stage.stage_files, "read_refinement", lambda _: (done, [1, 0]))
+    monkeypatch.setattr(refined_stage, "read_figures", lambda *_: (done, [1, 0]))
     monkeypatch.setattr(refined_stage, "read_models", lambda *_: ["part", "whole"])
     (tmp_path / "settled.db").touch()
     settled: Any = SimpleNamespace(

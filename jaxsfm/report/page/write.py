@@ -20,7 +20,6 @@ from jaxsfm.report.page.pairs import pair_pictures, pair_table
 from jaxsfm.report.page.photos import photo_table
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.summary import component_lines
-from jaxsfm.report.typed_json import to_json
 from jaxsfm.report.verdict import model_verdicts
 from jaxsfm.sfm.georeference.placement import AnchorRow
 
@@ -108,7 +107,7 @@ def page(run: FinishedRun) -> str:
         pairs=pair_table(report.pairs.each),
         groups=[words_of(line) for line in component_lines(report.view_graph)],
         table=photo_table(run),
-        options=_options(to_json(report.options)),
+        options=_options(report.options),
         out=str(run.folder.absolute()),
         images=images and str(images.absolute()),
     )

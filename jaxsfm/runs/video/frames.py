@@ -4,15 +4,17 @@ import dataclasses
 import json
 import logging
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
+import msgspec
 import numpy as np
 from tqdm import tqdm
 
 from jaxsfm.errors import UserError, writing
-from jaxsfm.io.atomic import Json, atomic_folder, read_json, sha256_of
+from jaxsfm.io.atomic import Json, atomic_folder, sha256_of
 from jaxsfm.io.images import shown_name
+from jaxsfm.io.typed_files import read_json
 from jaxsfm.io.video import Video, open_video
 from jaxsfm.io.work_folder import FRAMES_RECORD
 from jaxsfm.runs.video.choice import ChosenFrame, choose_frames
@@ -53,6 +55,18 @@ class FramesFolder(NamedTuple):
     """The median part that neighbouring frames have in common; 0 if no neighbours do."""
     there: bool
     """Whether the frames had been chosen before."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Record:
+    """What frames were made from, and which there are: the content of `frames.json`."""
+
+    video: str
+    sha256: str
+    overlap: float
+    most: int | None
+    frames: dict[str, Annotated[float, msgspec.Meta(ge=0, le=1)] | None]
+    """The part that each frame has in common with the frame before it, by name."""
 
 
 class _Written(NamedTuple):
@@ -111,27 +125,22 @@ def _finished(
         inside = sorted(path.name for path in folder.iterdir())
     if not inside:
         return None
-    record = read_json(folder / FRAMES_RECORD)
-    frames = record.get("frames") if isinstance(record, dict) else None
-    if not isinstance(record, dict) or not isinstance(frames, dict):
+    record = read_json(folder / FRAMES_RECORD, _Record)
+    if record is None:
         raise UserError(
             f"{shown}: the folder is not empty (it holds {inside[0]!r}); choose an empty or new "
             "folder"
         )
     asked = {"sha256": source["sha256"]} | (dataclasses.asdict(options) if options else {})
-    if changed := [name for name, value in asked.items() if record.get(name) != value]:
+    if changed := [name for name, value in asked.items() if getattr(record, name) != value]:
         what = "of another video" if changed[0] == "sha256" else f"with another --{changed[0]}"
         raise UserError(
             f"{shown}: the folder holds frames that were chosen {what}; choose another folder or "
             "delete this one"
         )
     # Frames that the user has deleted since then stay away.
-    left = {name: _part(frames[name]) for name in inside if name in frames}
+    left = {name: record.frames[name] for name in inside if name in record.frames}
     return _as_found(left, there=True)
-
-
-def _part(value: Json) -> float | None:
-    return value if isinstance(value, float) and 0 <= value <= 1 else None
 
 
 def _as_found(frames: dict[str, float | None], *, there: bool) -> FramesFolder:

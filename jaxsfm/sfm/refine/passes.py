@@ -15,7 +15,7 @@ the points of the matches that the mapper was given. Then all others return.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.colmap.other_camera import OtherCamera
@@ -61,16 +61,6 @@ class RefinementFigures:
         no octave has given them a pose. What looks alike has given the mapper's poses to them."""
         weak = {name for done in _accepted(self.passes)[-1:] for name in done.weak_views}
         return {each.name for each in self.placed if each.octave_px is None and each.name in weak}
-
-
-def figures_from_json(row: dict[str, Any]) -> RefinementFigures:
-    """The figures that are given as plain data (`dataclasses.asdict`)."""
-    return RefinementFigures(
-        passes=[PassFigures(**each) for each in row["passes"]],
-        placed=[Placement(**each) for each in row["placed"]],
-        camera=OtherCamera(**row["camera"]) if row.get("camera") else None,
-        holds=row.get("holds", True),
-    )
 
 
 def _as_arrays(reconstruction: "pycolmap.Reconstruction", sizes: Sizes) -> Refined:

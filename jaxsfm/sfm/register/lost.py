@@ -22,16 +22,17 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.pixels import Pixels
 from jaxsfm.io.store import digest
-from jaxsfm.sfm import stage_files
+from jaxsfm.io.typed_files import read_figures
 from jaxsfm.sfm.checker import opened
 from jaxsfm.sfm.limits import REGISTER
-from jaxsfm.sfm.mapped_stage import SPARSE, MatchedPhotos, StageCache
+from jaxsfm.sfm.mapped_stage import FIGURES, SPARSE, MatchedPhotos, StageCache
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import Placement
 from jaxsfm.sfm.refined_models import RefinedModels
 from jaxsfm.sfm.refined_stage import (
     Reconstructed,
+    RefinedFigures,
     believed_matches,
     refinement_settings,
     write_refined,
@@ -105,7 +106,7 @@ def register_lost(
     except ImageError as error:  # a photo of a model is gone; perhaps it is back next time
         logger.warning("no photos were registered: %s", error)
         return made
-    refinement, order = stage_files.read_refinement(folder)
+    refinement, order = read_figures(folder / FIGURES, RefinedFigures)
     checks = [made.mapping.checks[k] for k in order]
     return dataclasses.replace(
         made,
