@@ -224,7 +224,8 @@ def evaluate(
       json: File.json to write, with all errors.
     """
     check_writable(json, "--json", (".json",))
-    from jaxsfm.colmap.poses import find_model, model_poses, read_model, read_poses
+    from jaxsfm.colmap.model_files import find_model, read_model
+    from jaxsfm.colmap.poses import model_poses, read_poses
     from jaxsfm.io.atomic import write_atomic
     from jaxsfm.report.finished_run import evaluation_report
     from jaxsfm.report.summary import evaluation_lines

@@ -14,7 +14,7 @@ import numpy as np
 from jaxsfm.colmap.cameras import Cameras, estimated_camera
 from jaxsfm.colmap.intrinsics import KnownCameras
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.poses import read_model
+from jaxsfm.colmap.model_files import read_model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
 from jaxsfm.core.partners import TIE

@@ -22,8 +22,8 @@ from room_scene import (
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, room
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.model_images import part_of, registered
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import part_of, registered
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
 from jaxsfm.io.pixels import Pixels

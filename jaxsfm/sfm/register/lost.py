@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.model_folders import colour_points, read_models
-from jaxsfm.colmap.model_images import fingerprint, registered_in_any
+from jaxsfm.colmap.model_files import read_models
+from jaxsfm.colmap.reconstruction import colour_points, fingerprint, registered_in_any
 from jaxsfm.colmap.view import View
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
