@@ -35,7 +35,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair, make_pair
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.options import Mapper
 from jaxsfm.runs.job import timed
 from jaxsfm.runs.localize import localize_photos

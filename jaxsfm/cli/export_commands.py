@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, assert_never
 
 import tyro
 
-from jaxsfm.cli.run_commands import check_writable
+from jaxsfm.cli.arguments import check_writable
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 

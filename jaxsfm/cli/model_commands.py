@@ -9,8 +9,7 @@ from json import dumps
 from pathlib import Path
 from typing import Literal
 
-from jaxsfm.cli.run_commands import Positional, check_writable
-from jaxsfm.cli.subcommands import named_options
+from jaxsfm.cli.arguments import Positional, check_writable, named_options
 from jaxsfm.errors import UserError
 from jaxsfm.io.libraries import limit_threads
 from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice, check_threads

@@ -26,7 +26,7 @@ from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.reconstruction import part_of, registered
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import passes, plane_geometry
 from jaxsfm.sfm.refine.candidates import plane_affines

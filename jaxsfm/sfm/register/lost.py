@@ -19,8 +19,7 @@ from jaxsfm.colmap.reconstruction import colour_points, fingerprint, registered_
 from jaxsfm.colmap.view import View
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.io.photos import Photos
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Photos, Pixels
 from jaxsfm.io.store import digest
 from jaxsfm.sfm import stage_files
 from jaxsfm.sfm.checker import opened
