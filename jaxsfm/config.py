@@ -8,9 +8,8 @@ not recompile a program. This module imports neither jax nor cv2.
 import dataclasses
 from typing import Literal, get_args
 
-from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS, Layers
+from jaxsfm.core.pair_shape import FINE_STRIDES, PAPER_LAYERS, Layers, Products
 from jaxsfm.core.pair_shape import PairShape as PairShape
-from jaxsfm.core.pair_shape import Products
 
 Keypoints = Literal["relocalized", "learned", "grid"]
 Convolutions = Literal["float32", "bfloat16"]
@@ -127,7 +126,7 @@ class Config:
     centred: bool = False
     """Whether the mean descriptor of an image is subtracted from its descriptors."""
     backbone: BackboneName = "vgg16"
-    """The network (`jaxsfm.core.backbones`)."""
+    """The network (`jaxsfm.core.features`)."""
     convolutions: Convolutions = "float32"
     """Type of the operands of the network's convolutions. Sums are float32 and are then rounded to
     this type. bfloat16 is meant for accelerators (an H100 describes 13 times as many photos a

@@ -25,7 +25,7 @@ are registered. register: photos without a place are registered in the refined m
 CameraSharing = Literal["auto", "single", "folder", "photo"]
 """Which photos share one camera (`jaxsfm.colmap.cameras`)."""
 Retrieval = Literal["gem", "vlad", "netvlad"]
-"""How a photo is described as a whole (`jaxsfm.core.pooling`)."""
+"""How a photo is described as a whole (`jaxsfm.core.retrieval`)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -33,23 +33,21 @@ from jaxsfm.core import (
     numerics,
     octaves,
     pair,
-    partners,
     planes,
-    pooling,
     ransac,
     relocalize,
+    retrieval,
     scores,
     sharded,
     soft_matching,
     vgg,
     views,
-    vocabulary,
     winograd,
 )
 from jaxsfm.core import coarse_to_fine as c2f
 from jaxsfm.core import features as dense
 from jaxsfm.core import homography as hg
-from jaxsfm.core.backbones import BACKBONES
+from jaxsfm.core.features import BACKBONES
 from jaxsfm.core.types import (
     Correspondences,
     DenseFeatures,
@@ -252,8 +250,8 @@ def _head() -> scores.Head:
     return scores.Head(_floats(0, 4, 3), _floats(1, 3), _floats(2, 3), _floats(3, 8, 8))
 
 
-def _vocabulary() -> vocabulary.Vocabulary:
-    return vocabulary.Vocabulary(_floats(0, 6), _floats(1, 6, 4), _floats(2, 3, 4))
+def _vocabulary() -> retrieval.Vocabulary:
+    return retrieval.Vocabulary(_floats(0, 6), _floats(1, 6, 4), _floats(2, 3, 4))
 
 
 def _rows(seed: int, n: int = 40, c: int = 6) -> np.ndarray:
@@ -554,8 +552,8 @@ def calls() -> dict[str, Call]:
             (1, 2),
             slow=True,
         ),
-        "partners.partners": Call(
-            _bind(partners.partners, k=3, candidates=9, block=16), (_rows(0),)
+        "retrieval.partners": Call(
+            _bind(retrieval.partners, k=3, candidates=9, block=16), (_rows(0),)
         ),
         "planes.nearest_plane": Call(
             planes.nearest_plane,
@@ -566,13 +564,13 @@ def calls() -> dict[str, Call]:
             (hs, n([20, 12]), Correspondences(xy0, xy1, xy0[:, 0] > -1), np.float32(0.5), n(4)),
             (0,),
         ),
-        "pooling.gem": Call(pooling.gem, (_rows(0),)),
-        "pooling.vlad": Call(pooling.vlad, (_rows(0), _vocabulary())),
-        "pooling.netvlad": Call(
-            pooling.netvlad,
+        "retrieval.gem": Call(retrieval.gem, (_rows(0),)),
+        "retrieval.vlad": Call(retrieval.vlad, (_rows(0), _vocabulary())),
+        "retrieval.netvlad": Call(
+            retrieval.netvlad,
             (
                 _rows(0),
-                pooling.NetVLADHead(
+                retrieval.NetVLADHead(
                     _floats(0, 6, 3), _floats(1, 6, 3), _floats(2, 18, 5), _floats(3, 5)
                 ),
             ),
@@ -684,14 +682,14 @@ def calls() -> dict[str, Call]:
         "views.sample_view": Call(_bind(views.sample_view, size=24), (photo, H)),
         "views.change_light": Call(views.change_light, (KEY, photo, one)),
         "views.view_pair": Call(_bind(views.view_pair, size=32), (KEY, photo), (2,), slow=True),
-        "vocabulary.seen": Call(vocabulary.seen, (_rows(0),)),
-        "vocabulary.whitened": Call(vocabulary.whitened, (_rows(0), _vocabulary())),
-        "vocabulary.nearest_centre": Call(
-            vocabulary.nearest_centre, (_rows(0, 40, 4), _vocabulary().centres)
+        "retrieval.seen": Call(retrieval.seen, (_rows(0),)),
+        "retrieval.whitened": Call(retrieval.whitened, (_rows(0), _vocabulary())),
+        "retrieval.nearest_centre": Call(
+            retrieval.nearest_centre, (_rows(0, 40, 4), _vocabulary().centres)
         ),
-        "vocabulary.lloyd": Call(vocabulary.lloyd, (_rows(0, 40, 4), _vocabulary().centres)),
-        "vocabulary.fit_vocabulary": Call(
-            _bind(vocabulary.fit_vocabulary, words=4, directions=3), (KEY, _rows(0))
+        "retrieval.lloyd": Call(retrieval.lloyd, (_rows(0, 40, 4), _vocabulary().centres)),
+        "retrieval.fit_vocabulary": Call(
+            _bind(retrieval.fit_vocabulary, words=4, directions=3), (KEY, _rows(0))
         ),
         "winograd.conv3x3": Call(
             _bind(winograd.conv3x3, tiles=40), (photo[..., :3] / 255, _floats(0, 3, 3, 3, 5))

@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import move_model
 from jaxsfm.sfm.evaluation import Similarity, umeyama
 from jaxsfm.sfm.georeference.georeference import views_by_name
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.model_images import part_of, registered
-from jaxsfm.colmap.poses import read_model
+from jaxsfm.colmap.model_files import read_model, write_models
+from jaxsfm.colmap.reconstruction import part_of, registered
 
 HOSTILE = "<img src=x onerror=document.title='owned'><b>&amp;.png"
 """A file name that would do harm or look wrong if it were not escaped."""

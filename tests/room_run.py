@@ -12,7 +12,7 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.model_images import part_of
+from jaxsfm.colmap.reconstruction import part_of
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import inspect_image
 from jaxsfm.io.pairs import Pair, PairResult

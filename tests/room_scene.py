@@ -12,7 +12,7 @@ from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.one_pass import PassSettings

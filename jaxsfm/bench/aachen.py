@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 from jaxsfm.bench.scenes import PHOTOS, Scene, Subset, check_cameras, inspected, reference_of
 from jaxsfm.colmap.given_cameras import read_camera_list
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import CameraPose, Poses, model_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.images import ImageFile

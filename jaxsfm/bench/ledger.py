@@ -38,7 +38,8 @@ from jaxsfm.bench.ledger_table import (
 )
 from jaxsfm.bench.model_options import LedgerOptions
 from jaxsfm.bench.strecha import camera_errors
-from jaxsfm.colmap.poses import Poses, model_poses, read_model
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
 from jaxsfm.io.pair_selection import FEW

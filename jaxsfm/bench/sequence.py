@@ -23,18 +23,19 @@ from jaxsfm.bench.other_methods import trained_networks, write_other_matches
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.given_cameras import parse_cameras
-from jaxsfm.colmap.inliers import read_inliers
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import run_mapper
-from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import Poses, model_poses, read_poses
 from jaxsfm.colmap.resection import find_view
+from jaxsfm.colmap.two_views import read_inliers
 from jaxsfm.colmap.view import View
 from jaxsfm.config import PRESETS, preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pair_selection import natural
 from jaxsfm.io.pairs import Pair, make_pair
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.options import Mapper
 from jaxsfm.runs.job import timed
 from jaxsfm.runs.localize import localize_photos

@@ -22,8 +22,7 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.given_cameras import parse_intrinsics
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import build_models
-from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.poses import read_model
+from jaxsfm.colmap.model_files import read_model, write_models
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.errors import writing

@@ -18,7 +18,8 @@ from jaxsfm.colmap.given_cameras import write_camera_list
 from jaxsfm.colmap.intrinsics import camera_of
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import build_models
-from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import CameraPose, Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, rays_of, read_two_views
 from jaxsfm.errors import UserError

@@ -14,8 +14,7 @@ from jaxsfm.bench.model_options import (
     StrechaOptions,
 )
 from jaxsfm.bench.options import BenchOptions, WxbsOptions
-from jaxsfm.cli.run_commands import Positional, check_writable
-from jaxsfm.cli.subcommands import one_of
+from jaxsfm.cli.arguments import Positional, check_writable, one_of
 from jaxsfm.io.libraries import limit_threads
 
 Options = TypeVar("Options", bound=BenchOptions)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, assert_never
 
 import tyro
 
-from jaxsfm.cli.run_commands import check_writable
+from jaxsfm.cli.arguments import check_writable
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 
@@ -132,7 +132,7 @@ def _recorded_photos(run: Path) -> Path | None:
 
 
 def _model(run: Path) -> "pycolmap.Reconstruction":
-    from jaxsfm.colmap.poses import find_model, read_model
+    from jaxsfm.colmap.model_files import find_model, read_model
 
     return read_model(find_model(run))
 
@@ -140,7 +140,7 @@ def _model(run: Path) -> "pycolmap.Reconstruction":
 def _write_model(
     fresh: Path, model: "pycolmap.Reconstruction", to: Literal["ply", "colmap", "colmap-text"]
 ) -> None:
-    from jaxsfm.colmap.formats.image_names import check_no_blanks
+    from jaxsfm.colmap.formats.tables import check_no_blanks
 
     if to == "ply":
         model.export_PLY(fresh)
@@ -195,8 +195,8 @@ def _write_hloc(folder: Path, run: Path, matches: Literal["all", "verified"]) ->
 def _write_nerfstudio(
     folder: Path, model: "pycolmap.Reconstruction", images: Path | None, copy_images: bool
 ) -> None:
-    from jaxsfm.colmap.formats.image_names import registered_images
     from jaxsfm.colmap.formats.nerfstudio import IMAGES, write_nerfstudio
+    from jaxsfm.colmap.formats.tables import registered_images
 
     write_nerfstudio(folder, model, None if copy_images or images is None else images.absolute())
     if not copy_images or images is None:
@@ -211,7 +211,7 @@ def _write_nerfstudio(
 
 def _write_undistorted(folder: Path, run: Path, images: Path | None, max_size: int | None) -> None:
     from jaxsfm.colmap.formats.undistorted import write_undistorted
-    from jaxsfm.colmap.poses import find_model, read_model
+    from jaxsfm.colmap.model_files import find_model, read_model
 
     if images is None:
         raise ValueError("undistorted images are made from photos, whose folder is not given")

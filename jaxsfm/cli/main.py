@@ -8,12 +8,12 @@ import threading
 
 import tyro
 
+from jaxsfm.cli.arguments import unwrapped
 from jaxsfm.cli.bench_commands import bench, data
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.model_commands import evaluate, extend, localize, merge, refine, report, view
 from jaxsfm.cli.network_commands import train, weights, with_action
 from jaxsfm.cli.run_commands import demo, frames, match, pairs, reconstruct
-from jaxsfm.cli.subcommands import unwrapped
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.libraries import keep_compiled, package_versions

@@ -9,8 +9,7 @@ from json import dumps
 from pathlib import Path
 from typing import Literal
 
-from jaxsfm.cli.run_commands import Positional, check_writable
-from jaxsfm.cli.subcommands import named_options
+from jaxsfm.cli.arguments import Positional, check_writable, named_options
 from jaxsfm.errors import UserError
 from jaxsfm.io.libraries import limit_threads
 from jaxsfm.options import EngineChoice, NewPhotosChoice, WeightsChoice, check_threads
@@ -224,7 +223,8 @@ def evaluate(
       json: File.json to write, with all errors.
     """
     check_writable(json, "--json", (".json",))
-    from jaxsfm.colmap.poses import find_model, model_poses, read_model, read_poses
+    from jaxsfm.colmap.model_files import find_model, read_model
+    from jaxsfm.colmap.poses import model_poses, read_poses
     from jaxsfm.io.atomic import write_atomic
     from jaxsfm.report.finished_run import evaluation_report
     from jaxsfm.report.summary import evaluation_lines

@@ -4,8 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from jaxsfm.cli.run_commands import Positional, check_writable
-from jaxsfm.cli.subcommands import named_options, one_of
+from jaxsfm.cli.arguments import Positional, check_writable, named_options, one_of
 from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
 from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
@@ -203,7 +202,7 @@ def train(what: Positional[Literal["relocalizer"]], *, training: Training) -> in
     from jaxsfm.io.weights import load_weights
     from jaxsfm.matching.pipeline import open_images
     from jaxsfm.training.objective import Objective
-    from jaxsfm.training.posed_pairs import posed_pairs
+    from jaxsfm.training.photos import posed_pairs
     from jaxsfm.training.relocalizer import TrainOptions, train_relocalizer
 
     with named_options():

@@ -4,14 +4,16 @@ Heavy modules are imported inside the commands, so that --help is quick.
 """
 
 import dataclasses
-import os
 import sys
 from pathlib import Path
 
-import tyro
-
-from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
-from jaxsfm.cli.subcommands import named_options
+from jaxsfm.cli.arguments import (
+    MatchingChoice,
+    ModelChoice,
+    Positional,
+    check_writable,
+    named_options,
+)
 from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
 from jaxsfm.io.libraries import limit_threads
@@ -24,28 +26,8 @@ from jaxsfm.options import (
     check_seed,
 )
 
-Positional = tyro.conf.Positional
 DOUBTFUL = 3
 """The exit status for a model that may be wrong."""
-
-
-def check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
-    """Check that a file can be written, before the work is done and not after it. None passes.
-
-    Raises:
-      UserError: the name ends in none of the suffixes, or the place cannot be written to. The
-        message starts with the option.
-    """
-    if path is None:
-        return
-    if path.suffix.lower() not in suffixes:
-        raise UserError(f"{option} {path}: the name must end in {' or '.join(suffixes)}")
-    try:
-        writable = not path.is_dir() and path.parent.is_dir() and os.access(path.parent, os.W_OK)
-    except OSError:
-        writable = False
-    if not writable:
-        raise UserError(f"{option} {path}: cannot be written there")
 
 
 def reconstruct(

@@ -2,13 +2,22 @@
 
 The intrinsics of a shared camera are estimated from all of its photos together. That is more
 accurate than a camera for each photo, if the photos were in fact taken with one camera.
+
+COLMAP guesses a focal length from EXIF and from its list of sensor widths. It needs the size of the
+photo and a few EXIF tags but not the pixels. COLMAP 4.2 reads neither HEIC nor camera RAW: of such
+photos it gets a file that stands in for theirs.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import PurePosixPath
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
+import cv2
+import numpy as np
 import pycolmap
+from PIL import ExifTags, Image
 
 from jaxsfm.colmap.intrinsics import (
     MODELS,
@@ -20,15 +29,24 @@ from jaxsfm.colmap.intrinsics import (
     is_turned,
     sizes_of,
 )
-from jaxsfm.colmap.stand_in import readable_by_colmap
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.images import ImageFile, shown_name
+from jaxsfm.io.decoders import BRANDS_END, open_header, special_format
+from jaxsfm.io.images import ImageFile, image_bytes, shown_name
 from jaxsfm.io.orientation import QUARTERS
 from jaxsfm.options import CameraSharing
 
 GUESSED_FOCAL = 1.2
 """COLMAP's guess of an unknown focal length, in units of the longer side of the photo."""
+Tag = ExifTags.Base
+CAMERA = (Tag.Make, Tag.Model)
+LENS = (
+    Tag.FocalLength,
+    Tag.FocalLengthIn35mmFilm,
+    Tag.FocalPlaneXResolution,
+    Tag.FocalPlaneYResolution,
+    Tag.FocalPlaneResolutionUnit,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -162,3 +180,41 @@ def accepted(camera: pycolmap.Camera, image: ImageFile) -> pycolmap.Camera:
             f"{camera.params}"
         )
     return camera
+
+
+@contextlib.contextmanager
+def readable_by_colmap(image: ImageFile) -> Iterator[Path]:
+    """The file of a photo, or a grey JPEG with its size and its camera's EXIF tags.
+
+    Raises OSError or ImageError if the file has changed or cannot be read.
+    """
+    with image.path.open("rb") as file:
+        if special_format(file.read(BRANDS_END), image.path.suffix) is None:
+            yield image.path
+            return
+    data = image_bytes(image)
+    with open_header(data, image.path.suffix) as header:
+        exif = _of_camera(header.getexif())
+    width, height = image.size
+    _, grey = cv2.imencode(".jpg", np.zeros((height, width), np.uint8))
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        path = Path(scratch) / "camera.jpg"
+        path.write_bytes(_with_exif(grey.tobytes(), exif))
+        yield path
+
+
+def _of_camera(exif: Image.Exif) -> Image.Exif:
+    """The tags that say what the camera and its lens are."""
+    kept = Image.Exif()
+    for tag in CAMERA:
+        if tag in exif:
+            kept[tag] = exif[tag]
+    lens = exif.get_ifd(ExifTags.IFD.Exif)
+    kept.get_ifd(ExifTags.IFD.Exif).update({tag: lens[tag] for tag in LENS if tag in lens})
+    return kept
+
+
+def _with_exif(jpeg: bytes, exif: Image.Exif) -> bytes:
+    """A JPEG with EXIF data: its segment APP1 follows the start marker (ITU-T T.81, B.1)."""
+    content = exif.tobytes()
+    return jpeg[:2] + b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content + jpeg[2:]

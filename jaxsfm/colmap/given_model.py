@@ -1,11 +1,14 @@
-"""A COLMAP model that another tool has made: whether it can be refined, and its figures."""
+"""A COLMAP model that another tool has made: whether it can be refined, its figures, a copy with
+what a refinement found, and the cameras of its photos when it is joined to another model."""
 
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.poses import find_model, read_model
+from jaxsfm.colmap.model import Model
+from jaxsfm.colmap.model_files import find_model, read_model
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 
@@ -95,3 +98,82 @@ def shares_cameras(model: pycolmap.Reconstruction) -> bool:
 def _used_cameras(model: pycolmap.Reconstruction) -> list[pycolmap.Camera]:
     used = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
     return [model.camera(camera_id) for camera_id in sorted(used)]
+
+
+def updated(
+    original: pycolmap.Reconstruction, refined: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction:
+    """A copy of a model, with the poses, cameras, points and observations of a refined one.
+
+    Ids and names of images and cameras, rigs and frames are those of the original. An image that
+    the refinement took out keeps no pose. The images of a frame of a rig with several cameras move
+    together: the frame gets the pose that the refinement gave to one of them, the reference camera
+    if it can. The caller adjusts such a model (`has_rigs`).
+
+    Args:
+      original: not changed.
+      refined: its images are among the original's.
+    """
+    model = pycolmap.Reconstruction(original)
+    model.delete_all_points2D_and_points3D()
+    for image_id, image in model.images.items():
+        # An image that was taken out is emptied too, so that COLMAP counts its points anew.
+        there = refined.exists_image(image_id)
+        pixels = [point.xy for point in refined.image(image_id).points2D] if there else []
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels])
+    for camera_id in model.cameras:
+        if refined.exists_camera(camera_id):
+            model.camera(camera_id).params = refined.camera(camera_id).params.tolist()
+    left = set(refined.reg_image_ids())
+    for frame_id in sorted(model.reg_frame_ids()):
+        frame = model.frame(frame_id)
+        there = [model.image(i.id) for i in frame.image_ids if i.id in left]
+        if not there:
+            model.deregister_frame(frame_id)
+            continue
+        chosen = min(there, key=lambda image: (not image.is_ref_in_frame(), image.image_id))
+        pose = refined.image(chosen.image_id).cam_from_world()
+        frame.set_cam_from_world(chosen.camera_id, pose)
+    for point_id in sorted(refined.point3D_ids()):
+        point = refined.point3D(point_id)
+        model.add_point3D(point.xyz, point.track, point.color)
+    model.update_point_3d_errors()
+    return model
+
+
+def has_rigs(model: pycolmap.Reconstruction) -> bool:
+    """Whether the model has a rig of more than one camera."""
+    return any(rig.num_sensors() > 1 for rig in model.rigs.values())
+
+
+def joined_cameras(
+    first: Model, second: Model, shared: Collection[str]
+) -> dict[int, pycolmap.Camera]:
+    """The camera that stands for each camera of the second model's views, by its id.
+
+    If shared photos were taken with it, and all of these have one and the same camera in the first
+    model, of the same kind and size, it is that camera. Otherwise it gets a new id.
+    """
+    own = {view.name: view.camera for view in first.views}
+    used: dict[int, set[int]] = {}
+    for view in second.views:
+        partners = used.setdefault(view.camera.camera_id, set())
+        if view.name in shared:
+            partners.add(own[view.name].camera_id)
+    cameras = {camera.camera_id: camera for camera in own.values()}
+    theirs = {view.camera.camera_id: view.camera for view in second.views}
+    fresh = max([*cameras, *first.cameras]) + 1
+    joined = {}
+    for camera_id in sorted(used):
+        camera, partners = theirs[camera_id], used[camera_id]
+        partner = cameras[min(partners)] if len(partners) == 1 else None
+        if partner is not None and _alike(camera, partner):
+            joined[camera_id] = partner
+        else:
+            joined[camera_id] = pycolmap.Camera({**camera.todict(), "camera_id": fresh})
+            fresh += 1
+    return joined
+
+
+def _alike(a: pycolmap.Camera, b: pycolmap.Camera) -> bool:
+    return (a.model, a.width, a.height) == (b.model, b.width, b.height)

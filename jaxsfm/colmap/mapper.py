@@ -1,4 +1,4 @@
-"""COLMAP's mappers: from verified pairs to models.
+"""COLMAP's mappers: from verified pairs to models, and from known poses to all points.
 
 Every model that the mapper makes is kept. The one with most images is the best; the others are
 parts of the scene that nothing connects to it.
@@ -18,8 +18,8 @@ from jaxsfm.colmap.map_options import (
     incremental_options,
     narrowest_angle_deg,
 )
-from jaxsfm.colmap.model_images import ordered, registered
 from jaxsfm.colmap.native import native
+from jaxsfm.colmap.reconstruction import ordered, registered
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.io.pairs import Pair, component_of
 from jaxsfm.options import Mapper
@@ -38,6 +38,8 @@ halves twice by itself), the mapper starts with these. Of the first 50 frames of
 all are with these, their rotations right within 1.1 deg (median) before the refinement."""
 MAX_RETRIES = 2
 """Number of further initial pairs that are tried if the mapper's own choice leaves out images."""
+MIN_POINTS = 10
+"""A model with fewer points is not refined."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,3 +193,41 @@ def attempt_of(
 ) -> Attempt:
     """What a run of a mapper has made."""
     return Attempt(mapper, start, [model.num_reg_images() for model in models])
+
+
+def with_all_points(
+    model: pycolmap.Reconstruction, database: Path, options: MapOptions
+) -> pycolmap.Reconstruction:
+    """A copy of a model with the points of all verified matches of its images.
+
+    COLMAP triangulates the points, joins them to tracks, adjusts them, and drops observations that
+    are too far off. Poses and cameras stay.
+
+    If COLMAP finds fewer than `MIN_POINTS`, the model keeps those that it has. This happens to
+    models of two to four photos with a wrong camera: a model of *statue*, in which one of three
+    photos had a focal length of a million pixels, came back without its 839 points. Then nothing
+    could speak against it.
+
+    Args:
+      database: with the images and keypoints of the model.
+
+    Raises:
+      UserError: COLMAP failed.
+    """
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
+        whole = native(
+            lambda token: pycolmap.triangulate_points(
+                pycolmap.Reconstruction(model),  # it is changed in place
+                database,
+                scratch,
+                scratch,
+                clear_points=True,
+                options=incremental_options(options),
+                refine_intrinsics=False,
+                cancellation_token=token,
+            ),
+            database,
+        )
+    if whole.num_points3D() < min(MIN_POINTS, model.num_points3D()):
+        return pycolmap.Reconstruction(model)
+    return whole

@@ -9,7 +9,7 @@ import pycolmap
 
 from jaxsfm.colmap.tracks import Tracks, grouped
 from jaxsfm.colmap.view import View
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 
 MIN_TRI_ANGLE_DEG = 1.5
 """The least angle between two rays of a point: that of COLMAP's mapper."""

@@ -1,14 +1,16 @@
-"""A check of COLMAP's model files, for what COLMAP's own readers do not notice.
+"""COLMAP's model files: found, checked, read and written.
 
-These readers trust every count of a binary file and do not look at the file's end. So a file that
-was cut off is read as if it were whole, or fills the memory, or is read for ever. COLMAP reads
-numbers that are not finite, and rotations of length zero, too. In a text file, it ends a name at a
-blank. Wrong ids and indices, and camera models that do not exist, are COLMAP's to refuse.
+The check is for what COLMAP's own readers do not notice. They trust every count of a binary file
+and do not look at the file's end. So a file that was cut off is read as if it were whole, or fills
+the memory, or is read for ever. COLMAP reads numbers that are not finite, and rotations of length
+zero, too. In a text file, it ends a name at a blank. Wrong ids and indices, and camera models that
+do not exist, are COLMAP's to refuse.
 `tests/colmap/test_model_files.py` shows what COLMAP does with each kind of damage.
 
 Layout: COLMAP 4, src/colmap/scene/reconstruction_io.cc; all little-endian.
 """
 
+import shutil
 import struct
 import tempfile
 from collections.abc import Callable
@@ -17,14 +19,100 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from jaxsfm.errors import UserError
+from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import shown_name
 
 ABSURD = 1e100
 """Larger numbers are refused. Squares of smaller ones are finite."""
+_MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "sfm")
+"""Where models lie in a folder: COLMAP's and ours, nerfstudio's, hloc's."""
+_FILES = ("cameras", "images", "points3D")
 
 
 class DamagedModelError(ValueError):
     """A model file is damaged. The message says what is wrong, and in which file."""
+
+
+def has_model(path: Path) -> bool:
+    """Whether a COLMAP model (binary or text) is in this folder itself."""
+    return (path / "images.bin").is_file() or (path / "images.txt").is_file()
+
+
+def find_model(path: Path) -> Path:
+    """The model's folder: this one, or one in the results of a run, of nerfstudio or of hloc.
+
+    Raises:
+      UserError: there is none.
+    """
+    for sub in _MODELS:
+        if has_model(path / sub):
+            return path / sub
+    raise UserError(f"{path}: no COLMAP model here (looked for sparse/0/images.bin)")
+
+
+def read_model(path: Path) -> pycolmap.Reconstruction:
+    """Read the COLMAP model (binary or text) in a folder.
+
+    Raises:
+      UserError: there is none, or it is damaged.
+    """
+    suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
+    if path.is_dir():
+        for name in _FILES:
+            if not (path / (name + suffix)).is_file():
+                raise UserError(f"{path}: not a readable COLMAP model ({name}{suffix} is missing)")
+    try:
+        if suffix == ".bin":
+            check_binary(path)
+        model = pycolmap.Reconstruction(path)
+        if suffix == ".txt":
+            check_text(path, model)
+        _ = [image.name for image in model.images.values()]  # Python decodes them when asked
+        if not model.is_valid():
+            raise DamagedModelError("its files do not fit together")
+        return model
+    except DamagedModelError as error:
+        raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
+    except UnicodeDecodeError as error:
+        raise UserError(
+            f"{path}: not a readable COLMAP model (images{suffix}: a name that is not UTF-8)"
+        ) from error
+    except Exception as error:  # native errors of several kinds, whose texts are long
+        raise UserError(f"{path}: not a readable COLMAP model") from error
+
+
+def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
+    """Read what `write_models` wrote. Files are checked before COLMAP reads them.
+
+    Args:
+      database: of the same cameras. It says which focal lengths were known before mapping, which
+        COLMAP's model files do not.
+
+    Raises:
+      UserError: a model is damaged.
+    """
+    with pycolmap.Database.open(database) as db:
+        known = {c.camera_id: c.has_prior_focal_length for c in db.read_all_cameras()}
+    models = []
+    while (path := folder / str(len(models))).is_dir():
+        model = read_model(path)
+        for camera_id, camera in model.cameras.items():
+            camera.has_prior_focal_length = known[camera_id]
+        models.append(model)
+    return models
+
+
+def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
+    """Write models into `folder`/0 (the best one), 1, 2, ... The folder is replaced."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for index, model in enumerate(models):
+        target = folder / str(index)
+        target.mkdir(parents=True)
+        points2d = sum(image.num_points2D() for image in model.images.values())
+        rows = 24 * points2d + 8 * model.compute_num_observations() + 51 * model.num_points3D()
+        check_disk_space(target, SPARE_BYTES + rows)
+        model.write_binary(target)
 
 
 class _Reader:

@@ -7,7 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.model_files import DamagedModelError, check_binary, check_text
+from jaxsfm.colmap.model_files import (
+    has_model,
+    read_model,
+)
 from jaxsfm.errors import UserError
 from jaxsfm.io.photo_folder import find_images
 
@@ -23,9 +26,6 @@ class CameraPose(NamedTuple):
 
 Poses = dict[str, CameraPose]
 _SUBFOLDERS = ("", "gt_dense_cameras", "sparse/0", "sparse")
-_MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "sfm")
-"""Where models lie in a folder: COLMAP's and ours, nerfstudio's, hloc's."""
-_FILES = ("cameras", "images", "points3D")
 LLFF = "poses_bounds.npy"
 """The file of LLFF and of many radiance fields: a row of 17 numbers for each photo, in the order of
 the photos' names. The first 15 are a matrix 3 x 5: the axes of the camera (down, right, backwards)
@@ -103,53 +103,6 @@ def _read_llff(path: Path) -> Poses:
     return poses
 
 
-def read_model(path: Path) -> pycolmap.Reconstruction:
-    """Read the COLMAP model (binary or text) in a folder.
-
-    Raises:
-      UserError: there is none, or it is damaged.
-    """
-    suffix = ".bin" if (path / "images.bin").is_file() else ".txt"
-    if path.is_dir():
-        for name in _FILES:
-            if not (path / (name + suffix)).is_file():
-                raise UserError(f"{path}: not a readable COLMAP model ({name}{suffix} is missing)")
-    try:
-        if suffix == ".bin":
-            check_binary(path)
-        model = pycolmap.Reconstruction(path)
-        if suffix == ".txt":
-            check_text(path, model)
-        _ = [image.name for image in model.images.values()]  # Python decodes them when asked
-        if not model.is_valid():
-            raise DamagedModelError("its files do not fit together")
-        return model
-    except DamagedModelError as error:
-        raise UserError(f"{path}: not a readable COLMAP model ({error})") from error
-    except UnicodeDecodeError as error:
-        raise UserError(
-            f"{path}: not a readable COLMAP model (images{suffix}: a name that is not UTF-8)"
-        ) from error
-    except Exception as error:  # native errors of several kinds, whose texts are long
-        raise UserError(f"{path}: not a readable COLMAP model") from error
-
-
-def _has_model(path: Path) -> bool:
-    return (path / "images.bin").is_file() or (path / "images.txt").is_file()
-
-
-def find_model(path: Path) -> Path:
-    """The model's folder: this one, or one in the results of a run, of nerfstudio or of hloc.
-
-    Raises:
-      UserError: there is none.
-    """
-    for sub in _MODELS:
-        if _has_model(path / sub):
-            return path / sub
-    raise UserError(f"{path}: no COLMAP model here (looked for sparse/0/images.bin)")
-
-
 def read_poses(path: Path, *, option: str = "--reference") -> Poses:
     """Read reference poses, in the folder or below it: Strecha's `.camera` files, the `.pose.txt`
     files of 7-Scenes, LLFF's `poses_bounds.npy`, or a COLMAP model.
@@ -168,7 +121,7 @@ def read_poses(path: Path, *, option: str = "--reference") -> Poses:
             return {file.name.removesuffix(".camera"): _read_strecha(file) for file in cameras}
         if matrices := sorted(folder.glob("*.pose.txt")):
             return {_photo_of(file): _read_matrix(file) for file in matrices}
-        if _has_model(folder):
+        if has_model(folder):
             return model_poses(read_model(folder))
     if (path / LLFF).is_file():  # last: a model beside it has the photos' names
         return _read_llff(path / LLFF)

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.poses import CameraPose
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

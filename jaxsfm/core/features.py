@@ -1,25 +1,67 @@
-"""The features of one image: descriptors of two layers, and a keypoint for every fine cell."""
+"""The features of one image: descriptors of two layers, and a keypoint for every fine cell.
+
+They are made of the maps of a backbone: a flax module with a method `levels(images, size, heads)`
+that returns `Levels`: score maps of strides 1, 2 and 4, which keypoints walk down, and descriptors
+of strides 8 and 16. Later stages do not depend on which network it was (docs/guide/backbones.md).
+"""
 
 import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
-from jaxsfm.core.backbones import BACKBONES
+from jaxsfm.core import alexnet
 from jaxsfm.core.grid import FINE_STRIDE, cell_rows_cols, cell_to_px
-from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS, Layers
 from jaxsfm.core.numerics import squared_norm, unit
 from jaxsfm.core.octaves import halve, octave_capacity
+from jaxsfm.core.pair_shape import FINE_STRIDES, PAPER_LAYERS, Layers
 from jaxsfm.core.relocalize import relocalize
 from jaxsfm.core.scores import heads_of
 from jaxsfm.core.types import DenseFeatures, Levels
-from jaxsfm.core.vgg import Preprocessing, preprocess
+from jaxsfm.core.vgg import (
+    BLOCKS,
+    BLOCKS_19,
+    VGG16,
+    VGG19,
+    Blocks,
+    Preprocessing,
+    layers_of,
+    preprocess,
+)
 
 LEAST_DIFFERENCE = 1e-3
 """Smallest distance between a unit descriptor and the mean of its image for it to count."""
+
+
+class Backbone(NamedTuple):
+    """A network and its shapes."""
+
+    module: type[nn.Module]
+    """The flax module; its constructor takes `bfloat16`."""
+    kernels: dict[str, tuple[int, int, int, int]]
+    """Layer name -> HWIO shape of its kernel. The parameters of a layer are `kernel` and `bias`."""
+    fine: int
+    """Number of channels of the descriptors of stride 8."""
+    coarse: int
+    """Number of channels of the descriptors of stride 16."""
+    learned: bool
+    """Whether relocalizers can be learned for its maps."""
+
+
+def _vgg(module: type[nn.Module], blocks: Blocks, *, learned: bool) -> Backbone:
+    kernels = {name: (3, 3, *channels) for name, channels in layers_of(blocks).items()}
+    return Backbone(module, kernels, fine=blocks[2][-1], coarse=blocks[3][-1], learned=learned)
+
+
+BACKBONES: dict[str, Backbone] = {
+    "vgg16": _vgg(VGG16, BLOCKS, learned=True),
+    "vgg19": _vgg(VGG19, BLOCKS_19, learned=False),
+    "alexnet": Backbone(alexnet.AlexNet, alexnet.KERNELS, fine=192, coarse=256, learned=False),
+}
 
 
 class Walk(NamedTuple):
@@ -43,7 +85,7 @@ class Extraction(NamedTuple):
     num_coarse: int
     """Capacity for coarse cells of the first octave; that for fine cells is four times as large."""
     backbone: str = "vgg16"
-    """One of `jaxsfm.core.backbones.BACKBONES`."""
+    """One of `jaxsfm.core.features.BACKBONES`."""
     layers: Layers = PAPER_LAYERS
     walk: Walk = TO_PIXELS
     octaves: int = 1

@@ -1,4 +1,4 @@
-"""A synthetic night for training: the light, blur and photons of `jaxsfm.bench.night`, in JAX.
+"""A synthetic night for training: the light, blur and photons of `jaxsfm.bench.scenes`, in JAX.
 
 Denoising and JPEG compression, which cameras apply afterwards, are left out. The model does not
 replace photos taken at night.

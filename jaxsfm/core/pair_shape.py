@@ -1,4 +1,7 @@
-"""The static settings of the pair program. This module imports neither jax nor numpy."""
+"""The static settings of the pair program, and the pairs of layers whose maps are the descriptors.
+
+This module imports neither jax nor numpy.
+"""
 
 import dataclasses
 from typing import Literal
@@ -6,7 +9,6 @@ from typing import Literal
 OneToOne = Literal["first", "similarity"]
 Products = Literal["float32", "bfloat16", "float16"]
 """Types of the descriptors that are multiplied. Their products are summed in float32."""
-
 ACCELERATOR_FACTORS = {"steps_at_once": 8, "score_chunk": 8, "fine_chunk": 8}
 """How many times as much an accelerator computes at once. The sizes in `PairShape` are those of a
 CPU, whose caches they fill. An accelerator has thousands of lanes to fill, and every turn of a loop
@@ -15,6 +17,11 @@ may take (`jaxsfm.matching.execution`). Of 400 x 300 pairs, an H200 matches 18 %
 two steps at once than with eight, and 3 % fewer with 32. The others have not been measured. None of
 them changes a result. The tile of coarse products stays as it is: a larger one has a smaller share
 of margins, but leaves room for fewer pairs side by side (docs/decisions/accelerators.md)."""
+Layers = Literal["pool4/pool3", "conv4_3/conv3_3", "pool5/conv5_3"]
+"""The coarse and the fine layer."""
+PAPER_LAYERS: Layers = "pool4/pool3"
+FINE_STRIDES: dict[Layers, int] = {"pool4/pool3": 8, "conv4_3/conv3_3": 4, "pool5/conv5_3": 16}
+"""Side of a cell of the fine map, pixels. A cell of the coarse map is twice as long."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,7 @@ class Levels(NamedTuple):
     squared norms of the cells of conv1_2, pool1 and pool2, or learned scores."""
     pool3: Float[Array, "b h8 w8 d"]
     """Fine descriptors, not normalised. Other backbones than VGG give their map of this stride,
-    other pairs of layers (`jaxsfm.core.layers`) their fine map."""
+    other pairs of layers (`jaxsfm.core.pair_shape`) their fine map."""
     pool4: Float[Array, "b h16 w16 c"]
     """Coarse descriptors, not normalised."""
 

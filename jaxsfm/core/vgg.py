@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxsfm.core.blocks import Layer, clear_padding, convolve, pool, scores_and_pool
-from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS, Layers
+from jaxsfm.core.pair_shape import FINE_STRIDES, PAPER_LAYERS, Layers
 from jaxsfm.core.scores import Head, score
 from jaxsfm.core.types import Levels, Pyramid
 

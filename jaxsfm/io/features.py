@@ -22,7 +22,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, shown_name, working_size
 from jaxsfm.io.masks import used_cells
 from jaxsfm.io.orientation import to_stored
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 
 SIDE_BUCKET = 32
 """Pixels. Photos with 800 pixels on the longer side get 2 % more pixels on average. With 128 they

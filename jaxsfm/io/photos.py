@@ -1,6 +1,10 @@
-"""The photos of a run at working size, and views of a photo.
+"""The photos of a run at working size, views of a photo, and how their pixels lie on each other.
 
 A view is a part of a photo, seen at another size, turned or slanted.
+
+A photo is worked on at several sizes: as it is stored (the original), at working size, and at
+octaves of it. In all of them the centre of the top-left pixel is (0, 0), so coordinates are scaled
+about the corner of that pixel, which is (-0.5, -0.5). COLMAP puts the corner at (0, 0) instead.
 """
 
 import dataclasses
@@ -14,7 +18,6 @@ import numpy as np
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile, WorkingImage, read_image, size_and_scale, working_size
 from jaxsfm.io.orientation import UPRIGHT, to_stored
-from jaxsfm.io.pixels import Pixels
 
 Reader = Callable[[str], tuple[np.ndarray, tuple[float, float]]]
 """A photo's name -> the pixels of its working image, and original pixels per working pixel."""
@@ -24,6 +27,40 @@ LUMA = np.asarray([0.299, 0.587, 0.114], np.float32)
 """The weights of red, green and blue in the intensity of a pixel (ITU-R BT.601)."""
 MIN_VIEWED = 64
 """Pixels: the shorter side of a photo is not reduced below it, whatever the view is."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pixels:
+    """The pixels of a reduced (or enlarged) image, measured in pixels of the original."""
+
+    scale: tuple[float, float]
+    """Original pixels per pixel of the image, (x, y)."""
+
+    @classmethod
+    def octave(cls, px: float) -> "Pixels":
+        """The pixels of an octave: each covers px x px pixels of the image it was made of."""
+        return cls((px, px))
+
+    def from_original(self, xy: np.ndarray) -> np.ndarray:
+        """Points (..., 2) of the original, in pixels of the image."""
+        return (xy + 0.5) / np.asarray(self.scale) - 0.5
+
+    def to_original(self, xy: np.ndarray) -> np.ndarray:
+        """Points (..., 2) of the image, in pixels of the original."""
+        return (xy + 0.5) * np.asarray(self.scale) - 0.5
+
+    def from_colmap(self, xy: np.ndarray) -> np.ndarray:
+        """Points (..., 2) of the original as COLMAP counts its pixels, in pixels of the image."""
+        return xy / np.asarray(self.scale) - 0.5
+
+    def to_colmap(self, xy: np.ndarray) -> np.ndarray:
+        """Points (..., 2) of the image, in pixels of the original as COLMAP counts them."""
+        return (xy + 0.5) * np.asarray(self.scale)
+
+    def matrix(self) -> np.ndarray:
+        """`to_original` as a float64 matrix (3, 3) on homogeneous points (x, y, 1)."""
+        sx, sy = self.scale
+        return np.asarray([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1.0]])
 
 
 def intensities(image: WorkingImage) -> np.ndarray:

@@ -19,7 +19,7 @@ from typing import cast
 import numpy as np
 
 from jaxsfm.config import BackboneName, Config
-from jaxsfm.core.backbones import BACKBONES
+from jaxsfm.core.features import BACKBONES
 from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json

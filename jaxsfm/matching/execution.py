@@ -17,7 +17,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxsfm.config import Config
-from jaxsfm.core.backbones import BACKBONES
+from jaxsfm.core.features import BACKBONES
 from jaxsfm.core.octaves import join_octaves, octave_capacity
 from jaxsfm.core.sharded import device_mesh
 from jaxsfm.core.types import DenseFeatures

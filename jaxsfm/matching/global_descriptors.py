@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsfm.config import MIN_SIDE, Config
-from jaxsfm.core.pooling import NetVLADHead, gem, netvlad, vlad
+from jaxsfm.core.retrieval import NetVLADHead, Vocabulary, fit_vocabulary, gem, netvlad, vlad
 from jaxsfm.core.vgg import VGG16, Preprocessing, preprocess
-from jaxsfm.core.vocabulary import Vocabulary, fit_vocabulary
 from jaxsfm.io import interrupt
 from jaxsfm.io.features import padded_cells, padded_size
 from jaxsfm.io.images import ImageError, ImageFile, read_image

@@ -30,7 +30,7 @@ from jaxsfm.core.types import (
 from jaxsfm.io.features import FeatureCapacity, ImageFeatures, pad_features
 from jaxsfm.io.orientation import stored_points
 from jaxsfm.io.pairs import Name, PairResult, make_pair
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.io.traced_programs import Traced
 from jaxsfm.matching.execution import (
     ONE_AT_A_TIME,

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsfm.core.partners import partners
+from jaxsfm.core.retrieval import partners
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.pairs import Pair, make_pair
@@ -114,8 +114,8 @@ def describe_photos(
 def partner_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
     """Pairs of each name with `k` partners, each pair once, in order of names.
 
-    Partners are similar to it, and differ from each other (`jaxsfm.core.partners`). With fewer than
-    `k` other names, all of them are partners. Equally similar ones are taken by name.
+    Partners are similar to it, and differ from each other (`jaxsfm.core.retrieval`). With fewer
+    than `k` other names, all of them are partners. Equally similar ones are taken by name.
 
     Args:
       vectors: global descriptors of unit length, float32 (c,).

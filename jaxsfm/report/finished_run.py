@@ -11,7 +11,8 @@ import msgspec
 import numpy as np
 
 from jaxsfm.colmap.model import Model, Sizes, point_colours
-from jaxsfm.colmap.poses import Poses, model_poses, read_model, read_poses
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import Poses, model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io import orientation

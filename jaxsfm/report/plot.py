@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 
 COLOURS = ("#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#42d4f4", "#f032e6", "#bfef45")
 MAX_LINES = 60

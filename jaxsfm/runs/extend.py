@@ -15,7 +15,8 @@ from tqdm import tqdm
 
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
 from jaxsfm.colmap.given_cameras import parse_cameras
-from jaxsfm.colmap.model_folders import colour_points, read_models, write_models
+from jaxsfm.colmap.model_files import read_models, write_models
+from jaxsfm.colmap.reconstruction import colour_points
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile

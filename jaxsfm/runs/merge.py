@@ -6,11 +6,17 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.given_model import ModelFigures, figures_of, looks_calibrated, read_given_model
-from jaxsfm.colmap.join_cameras import coloured, joined_cameras
+from jaxsfm.colmap.given_model import (
+    ModelFigures,
+    figures_of,
+    has_rigs,
+    joined_cameras,
+    looks_calibrated,
+    read_given_model,
+)
 from jaxsfm.colmap.model import Model, point_colours, stored_sizes
 from jaxsfm.colmap.poses import CameraPose, model_poses
-from jaxsfm.colmap.updated_model import has_rigs
+from jaxsfm.colmap.reconstruction import coloured
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import named
 from jaxsfm.io.libraries import versions
@@ -64,7 +70,7 @@ def merge_folders(
     """Join two COLMAP models that share photos, and write the result into a new folder.
 
     Args:
-      first, second: folders of models, or folders that hold one (`jaxsfm.colmap.poses.find_model`).
+      first, second: folders of models, or folders that hold one (`find_model`).
         The result lies where the first model does.
       out: a new or empty folder.
       refine_intrinsics: whether focal lengths and distortion are adjusted. auto: unless the cameras

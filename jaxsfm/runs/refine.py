@@ -87,7 +87,7 @@ def refine_folder(
     Nothing is written, and the result is None, if too little of the model agrees with the photos.
 
     Args:
-      path: the folder of a model, or one that holds a model (`jaxsfm.colmap.poses.find_model`).
+      path: the folder of a model, or one that holds a model (`find_model`).
       images: the folder of the photos.
       out: a new or empty folder.
 

@@ -11,8 +11,8 @@ from tqdm import tqdm
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.external_matches import ExternalMatches, JoinedMatches
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_folders import write_models
-from jaxsfm.colmap.pose_priors import write_pose_priors
+from jaxsfm.colmap.measured_positions import write_pose_priors
+from jaxsfm.colmap.model_files import write_models
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair

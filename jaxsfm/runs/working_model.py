@@ -15,13 +15,13 @@ import numpy as np
 from jaxsfm.colmap.cameras import Cameras, estimated_camera
 from jaxsfm.colmap.intrinsics import KnownCameras
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.poses import read_model
+from jaxsfm.colmap.model_files import read_model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Config
-from jaxsfm.core.partners import TIE
+from jaxsfm.core.retrieval import TIE
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, shown_name, size_and_scale
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.io.store import Store
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.execution import Execution

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.reconstruction import registered
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.given_model import has_rigs, updated
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.model_folders import colour_points
-from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.poses import Poses, model_poses
-from jaxsfm.colmap.updated_model import has_rigs, updated
+from jaxsfm.colmap.reconstruction import colour_points, move_model
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import (
@@ -31,7 +30,7 @@ from jaxsfm.io.images import (
 from jaxsfm.io.photos import GRAYS, Photos, intensities
 from jaxsfm.sfm.evaluation import align
 from jaxsfm.sfm.refine.one_pass import PassSettings
-from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model
+from jaxsfm.sfm.refine.passes import RefinementFigures, refine_model, working_sizes
 
 if TYPE_CHECKING:
     import pycolmap
@@ -182,12 +181,7 @@ def _described_px(given: "pycolmap.Reconstruction", photos: ModelPhotos) -> int:
     It is about the median error of the observations, so that the model puts points within the
     reach of the alignment.
     """
-    sizes = {}
-    for image_id in given.reg_image_ids():
-        name = given.image(image_id).name
-        gray, scale = photos.gray(name)
-        sizes[name] = (gray.shape[1], gray.shape[0]), scale
-    errors = Model.from_colmap(given, sizes).errors_px()
+    errors = Model.from_colmap(given, working_sizes(given, photos.gray)).errors_px()
     octave = round(math.log2(max(1.0, float(np.median(errors)) / GOOD_ERROR_PX)))
     return 2 ** min(octave, MAX_OCTAVE)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_folders import read_models, write_models
+from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.atomic import Json

@@ -2,7 +2,7 @@
 
 Dense features give thousands of matches for a pair, and poses need a few hundred. The mapper's time
 grows with the number of matches, so it gets a part of them, and all others become points when the
-model is there (`jaxsfm.colmap.triangulation`). Pairs with few matches keep all of them.
+model is there (`jaxsfm.colmap.mapper`). Pairs with few matches keep all of them.
 
 A pair's matches are taken from all parts of both images, the best ones first. A match is good if
 other images confirm it: if both keypoints are matched with the same keypoint of a third image.
@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 from scipy.sparse import csr_array
 
-from jaxsfm.colmap.inliers import ImageKeypoints, Inliers
+from jaxsfm.colmap.two_views import ImageKeypoints, Inliers
 from jaxsfm.io.pairs import Pair
 
 PER_PAIR, LEAST_PER_PAIR = 400, 100

@@ -18,12 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsfm.colmap.database import drop_pairs
-from jaxsfm.colmap.inliers import keep_inliers, read_inliers
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import Attempt, complete, run_mapper
-from jaxsfm.colmap.model_images import registered
-from jaxsfm.colmap.triangulation import with_all_points
-from jaxsfm.colmap.two_views import PairGeometry
+from jaxsfm.colmap.mapper import Attempt, complete, run_mapper, with_all_points
+from jaxsfm.colmap.reconstruction import registered
+from jaxsfm.colmap.two_views import PairGeometry, keep_inliers, read_inliers
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.check_model import Checked

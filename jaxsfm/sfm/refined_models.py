@@ -11,14 +11,13 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from jaxsfm.colmap.bundle_adjustment import adjust_as_one, shares_one_camera
 from jaxsfm.colmap.cameras import pixels_were_turned
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_folders import colour_points
-from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.mapper import with_all_points
 from jaxsfm.colmap.other_camera import other_camera
+from jaxsfm.colmap.reconstruction import colour_points, registered
 from jaxsfm.colmap.tracks import Tracks
-from jaxsfm.colmap.triangulation import with_all_points
-from jaxsfm.colmap.turned_camera import adjust_as_one, shares_one_camera
 from jaxsfm.config import WORTH, Config
 from jaxsfm.errors import UserError, remark
 from jaxsfm.io.images import ImageError

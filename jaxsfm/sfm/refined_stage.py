@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.model_folders import read_models, write_models
+from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.config import Config
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.pairs import ChosenMatches, Pair, PairResult

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import attempt_of
-from jaxsfm.colmap.model_folders import read_models, write_models
-from jaxsfm.colmap.model_images import fingerprint, part_of
+from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import fingerprint, part_of
 from jaxsfm.errors import remark
 from jaxsfm.io.store import digest
 from jaxsfm.io.typed_files import read_figures, write_figures

@@ -37,8 +37,7 @@ from jaxsfm.training.objective import (
     shares,
     warped_examples,
 )
-from jaxsfm.training.photos import Crops, split
-from jaxsfm.training.posed_pairs import PosedPairs
+from jaxsfm.training.photos import Crops, PosedPairs, split
 
 EVALUATION_BATCHES = 8
 """The number of batches of held-out views on which the progress is measured."""

@@ -32,7 +32,7 @@ from jaxsfm.bench.ledger_table import (
 from jaxsfm.bench.model_options import LedgerOptions
 from jaxsfm.bench.synthetic import camera_text, write_photo
 from jaxsfm.cli.main import main
-from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.colmap.model_files import write_models
 from jaxsfm.errors import UserError
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.run_options import RunOptions

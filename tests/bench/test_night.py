@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxsfm.bench.night import synthetic_night
+from jaxsfm.bench.scenes import synthetic_night
 
 
 @pytest.fixture(scope="module")

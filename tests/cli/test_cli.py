@@ -14,8 +14,8 @@ import pytest
 from verdicts import with_verdicts
 
 from jaxsfm import options
+from jaxsfm.cli.arguments import MatchingChoice, ModelChoice
 from jaxsfm.cli.bench_commands import BENCHMARKS
-from jaxsfm.cli.config_options import MatchingChoice, ModelChoice
 from jaxsfm.cli.main import COMMANDS, main
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.verdict import MEANING

@@ -1,13 +1,16 @@
 """Which photos share a camera, and with which camera the mapping starts."""
 
+import io
+import math
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
+from moving_views import HEIGHT, WIDTH, views
+from PIL import ExifTags, Image
 
-from jaxsfm.colmap.cameras import GUESSED_FOCAL, Cameras
+from jaxsfm.colmap.cameras import GUESSED_FOCAL, Cameras, estimated_camera
 from jaxsfm.colmap.database import read_images, write_database
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.errors import UserError
@@ -17,6 +20,8 @@ from jaxsfm.io.images import ImageFile, inspect_image
 SIZE = (96, 64)
 PHONE = {0x010F: "Apple", 0x0110: "iPhone 4S"}
 """Make and model of a camera that COLMAP knows the sensor of."""
+FOCAL_35 = 50
+Base = ExifTags.Base
 
 
 def photo(path: Path, exif: dict | None = None, size=SIZE, **lens) -> ImageFile:
@@ -128,8 +133,6 @@ def test_the_database_has_the_shared_cameras(tmp_path, four):
     assert found["a.jpg"] == found["b.jpg"] == found["c.jpg"] != found["sub/d.jpg"]
 
 
-# -- known cameras of photos that are stored turned ------------------------------------------------
-
 TANGENTIAL = Intrinsics(model="OPENCV", params=(90.0, 80.0, 40.0, 30.0, 0.1, -0.02, 0.01, -0.03))
 
 
@@ -203,3 +206,51 @@ def test_every_model_of_colmap_is_turned_or_refused():
         except UserError:
             continue
         assert turned.camera(SIZE[::-1]).verify_params()
+
+
+def exif(orientation: int, focal: int | None) -> bytes:
+    tags = Image.Exif()
+    tags[Base.Make], tags[Base.Model], tags[Base.Orientation] = "Maker", "Model", orientation
+    if focal is not None:
+        tags.get_ifd(ExifTags.IFD.Exif)[Base.FocalLengthIn35mmFilm] = focal
+    return tags.tobytes()
+
+
+def written(path, focal, orientation=1):
+    pillow_heif = pytest.importorskip("pillow_heif")
+    picture = Image.fromarray(np.ascontiguousarray(views([0])[0]))
+    if path.suffix == ".heic":
+        file = io.BytesIO()
+        pillow_heif.from_pillow(picture).save(file, exif=exif(orientation, focal))
+        path.write_bytes(file.getvalue())
+    elif path.suffix == ".dng":
+        pytest.importorskip("rawpy")
+        from raw_files import dng
+
+        path.write_bytes(dng(np.asarray(picture), orientation=orientation, focal35=focal or 0))
+    else:
+        picture.save(path, exif=exif(orientation, focal))
+    return inspect_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".heic", ".dng"])
+def test_the_focal_length_comes_from_exif_in_any_format(tmp_path, suffix):
+    camera = estimated_camera([written(tmp_path / f"a{suffix}", FOCAL_35)])
+    # 35 mm film has a diagonal of 43.27 mm.
+    expected = FOCAL_35 / 43.27 * math.hypot(WIDTH, HEIGHT)
+    assert camera.mean_focal_length() == pytest.approx(expected, rel=1e-3)
+    assert camera.has_prior_focal_length
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".heic", ".dng"])
+def test_without_exif_the_focal_length_of_a_stand_in_is_a_guess(tmp_path, suffix):
+    camera = estimated_camera([written(tmp_path / f"a{suffix}", None)])
+    assert camera.mean_focal_length() == pytest.approx(1.2 * WIDTH)
+    assert not camera.has_prior_focal_length
+
+
+@pytest.mark.parametrize("suffix", [".heic", ".dng"])
+def test_a_sideways_photo_has_the_camera_of_its_upright_pixels(tmp_path, suffix):
+    camera = estimated_camera([written(tmp_path / f"a{suffix}", FOCAL_35, orientation=6)])
+    assert (camera.width, camera.height) == (HEIGHT, WIDTH)
+    assert camera.has_prior_focal_length

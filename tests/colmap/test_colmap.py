@@ -16,7 +16,7 @@ from jaxsfm.colmap.database import (
 )
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_folders import write_models
+from jaxsfm.colmap.model_files import write_models
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.two_views import read_two_views
 from jaxsfm.io.images import ImageFile

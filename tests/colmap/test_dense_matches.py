@@ -11,8 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jaxsfm.colmap.external_matches import read_external_matches
-from jaxsfm.colmap.formats.dense_matches import read_dense_matches
-from jaxsfm.colmap.formats.gathered import PairPoints, gather, gather_pairs
+from jaxsfm.colmap.formats.dense_matches import PairPoints, gather, gather_pairs, read_dense_matches
 from jaxsfm.errors import UserError
 from jaxsfm.io.pairs import exhaustive_pairs
 

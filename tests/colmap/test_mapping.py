@@ -17,7 +17,7 @@ from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import drop_pairs, write_database
 from jaxsfm.colmap.map_options import LEAST_PARALLAX, MapOptions, narrowest_angle_deg
 from jaxsfm.colmap.mapper import attempt_of, build_models, complete, initial_pairs
-from jaxsfm.colmap.model_images import registered, take_out
+from jaxsfm.colmap.reconstruction import registered, take_out
 from jaxsfm.colmap.two_views import PairGeometry, TwoView, read_two_views
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import PairResult, exhaustive_pairs

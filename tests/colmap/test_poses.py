@@ -7,7 +7,8 @@ import pycolmap
 import pytest
 
 from jaxsfm.bench.synthetic import arc, camera_matrix
-from jaxsfm.colmap.poses import CameraPose, find_model, model_poses, read_model, read_poses
+from jaxsfm.colmap.model_files import find_model, read_model
+from jaxsfm.colmap.poses import CameraPose, model_poses, read_poses
 from jaxsfm.errors import UserError
 
 

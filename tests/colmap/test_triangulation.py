@@ -8,14 +8,13 @@ import pytest
 from databases import content
 from mapped import verified
 
-from jaxsfm.colmap import triangulation
+from jaxsfm.colmap import mapper
 from jaxsfm.colmap.database import read_images, read_matches, write_database
-from jaxsfm.colmap.inliers import keep_inliers, read_inliers
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.mapper import run_mapper
-from jaxsfm.colmap.model_images import registered, take_out
+from jaxsfm.colmap.mapper import run_mapper, with_all_points
 from jaxsfm.colmap.poses import model_poses
-from jaxsfm.colmap.triangulation import with_all_points
+from jaxsfm.colmap.reconstruction import registered, take_out
+from jaxsfm.colmap.two_views import keep_inliers, read_inliers
 from jaxsfm.errors import UserError
 
 ONE = MapOptions(refine_intrinsics=False, threads=1)
@@ -181,6 +180,6 @@ def test_a_model_keeps_its_points_if_hardly_one_is_found(
     synthetic, monkeypatch, before, found, points
 ):
     model, path = synthetic
-    monkeypatch.setattr(triangulation, "native", lambda *_: few_points(model, found))
+    monkeypatch.setattr(mapper, "native", lambda *_: few_points(model, found))
     kept = with_all_points(few_points(model, before), path, MapOptions())
     assert kept.num_points3D() == points

@@ -13,7 +13,7 @@ from room_scene import hidden
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, render, room, write_photo
 from jaxsfm.colmap.formats.undistorted import READABLE, write_undistorted
-from jaxsfm.colmap.poses import read_model
+from jaxsfm.colmap.model_files import read_model
 from jaxsfm.errors import UserError
 
 TEXTURE = cv2.resize(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8), (1024, 768))

@@ -11,8 +11,7 @@ import tolerances
 
 from jaxsfm.config import BackboneName, Config
 from jaxsfm.core.alexnet import AlexNet
-from jaxsfm.core.backbones import BACKBONES
-from jaxsfm.core.features import Extraction, extract
+from jaxsfm.core.features import BACKBONES, Extraction, extract
 from jaxsfm.core.scores import Head
 from jaxsfm.core.vgg import LAYERS, Preprocessing
 

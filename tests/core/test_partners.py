@@ -6,7 +6,7 @@ import numpy as np
 import oracles
 import pytest
 
-from jaxsfm.core.partners import TIE, partners
+from jaxsfm.core.retrieval import TIE, partners
 
 chosen = jax.jit(partners, static_argnames=("k", "candidates", "block"))
 

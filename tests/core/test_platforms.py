@@ -18,7 +18,7 @@ from strategies import rng_of
 
 from jaxsfm.config import PRESETS, PairShape
 from jaxsfm.core import align, bundle, features, pair, ransac, relocalize, sharded, soft_matching
-from jaxsfm.core.backbones import BACKBONES
+from jaxsfm.core.features import BACKBONES
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair_shape import Products
 from jaxsfm.core.scores import init_scores

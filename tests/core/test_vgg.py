@@ -10,7 +10,7 @@ import pytest
 import tolerances
 
 from jaxsfm.core import blocks
-from jaxsfm.core.layers import FINE_STRIDES, PAPER_LAYERS
+from jaxsfm.core.pair_shape import FINE_STRIDES, PAPER_LAYERS
 from jaxsfm.core.types import Pyramid
 from jaxsfm.core.vgg import LAYERS, VGG16, Preprocessing, init_shapes, preprocess
 from jaxsfm.core.winograd import conv3x3

@@ -6,8 +6,8 @@ from foreign_model import camera, exact_model
 from fuzz_children import run_cases
 from mutations import damaged, damaged_text, outcome
 
-from jaxsfm.colmap.model_files import check_binary
-from jaxsfm.colmap.poses import model_poses, read_model
+from jaxsfm.colmap.model_files import check_binary, read_model
+from jaxsfm.colmap.poses import model_poses
 
 
 def files(folder, *, text: bool):

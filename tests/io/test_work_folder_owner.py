@@ -132,7 +132,7 @@ def test_what_would_not_fit_on_the_disk_is_refused_before_native_code_begins(
 ):
     """On a full disk COLMAP would end the process, or write a model that is cut off."""
     from jaxsfm.colmap.database import write_database
-    from jaxsfm.colmap.model_folders import write_models
+    from jaxsfm.colmap.model_files import write_models
 
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=3_000_000))

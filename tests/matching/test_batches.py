@@ -17,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsfm
-from jaxsfm.cli.config_options import MatchingChoice
+from jaxsfm.cli.arguments import MatchingChoice
 from jaxsfm.config import Config, preset
 from jaxsfm.core.features import stored
-from jaxsfm.core.layers import FINE_STRIDES
 from jaxsfm.core.octaves import join_octaves
+from jaxsfm.core.pair_shape import FINE_STRIDES
 from jaxsfm.core.sharded import device_mesh, join_everywhere
 from jaxsfm.errors import UserError
 from jaxsfm.io.features import feature_capacity, image_capacity

@@ -12,7 +12,7 @@ import pytest
 
 import jaxsfm
 from jaxsfm.cli.main import main
-from jaxsfm.core.partners import partners
+from jaxsfm.core.retrieval import partners
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pair_selection import sequential_pairs

@@ -46,7 +46,7 @@ BUILD = ROOT / "build" / "mutants"
 EQUIVALENT = Path(__file__).parent / "equivalent.json"
 FILES = (
     "jaxsfm/core",
-    "jaxsfm/runs/turned_photos.py",
+    "jaxsfm/runs/run_photos.py",
     "jaxsfm/sfm/check",
     "jaxsfm/sfm/mapping.py",
     "jaxsfm/sfm/refine",
@@ -75,6 +75,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/octaves": ("tests/core/test_octaves.py", PRODUCTS),
     "core/pair_shape": ("tests/core/test_presets.py", "tests/core/test_platforms.py"),
     "core/ransac": ("tests/core/test_ransac.py", "tests/core/test_planes.py"),
+    "core/retrieval": ("tests/core/test_retrieval.py", "tests/core/test_partners.py"),
     "core/sharded": (BATCHES,),
     "core/types": ("tests/core/test_presets.py", PAIR),
     "core/winograd": ("tests/core/test_winograd.py", "tests/core/test_vgg.py"),
@@ -123,7 +124,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         "tests/runs/test_localize.py",
     ),
     "register/triangulate": ("tests/sfm/test_new_points.py",),
-    "runs/turned_photos": ("tests/runs/test_turned_photos.py", "tests/runs/test_run_photos.py"),
+    "runs/run_photos": ("tests/runs/test_turned_photos.py", "tests/runs/test_run_photos.py"),
     "sfm/mapping": (ROAD, "tests/sfm/test_two_mappings.py"),
     "sfm/refined_models": ("tests/sfm/test_held_parts.py", "tests/sfm/test_refined_models.py"),
     "sfm/settled_stage": (

@@ -17,7 +17,7 @@ import pytest
 from local_server import CONTENT, url
 from posix_only import MODULES, OURS, forbidden_names, windows_lacks
 
-from jaxsfm.colmap.formats.image_names import leads_out
+from jaxsfm.colmap.formats.tables import leads_out
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted(path for package in OURS for path in (ROOT / package).rglob("*.py"))

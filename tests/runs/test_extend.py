@@ -14,7 +14,8 @@ from test_localize import POSE, POSITION, SIZE, RecordingEngine, contents, write
 from jaxsfm.bench.synthetic import render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.database import read_matches
-from jaxsfm.colmap.poses import model_poses, read_model, read_poses
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.io.work_folder import RESULTS, lock_folder
 from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run

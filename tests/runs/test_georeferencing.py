@@ -16,7 +16,8 @@ from test_localize import POSE, POSITION, SIZE, write
 
 from jaxsfm.bench.synthetic import render, room
 from jaxsfm.cli.main import main
-from jaxsfm.colmap.poses import model_poses, read_model, read_poses
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.io.images import inspect_image
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.page.write import page

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from jaxsfm.cli.main import main
-from jaxsfm.colmap import model_folders
+from jaxsfm.colmap import model_files
 from jaxsfm.io.store import Store
 from jaxsfm.sfm import mapped_stage, refined_stage
 
@@ -89,8 +89,8 @@ def test_cameras_keep_what_is_known_of_their_focal_length(tmp_path):
         for camera_id, camera in sorted(model.cameras.items()):
             camera.has_prior_focal_length = camera_id % 2 == 1
             assert db.write_camera(camera) == camera_id
-    model_folders.write_models([model], tmp_path / "sparse")
-    (back,) = model_folders.read_models(tmp_path / "sparse", database)
+    model_files.write_models([model], tmp_path / "sparse")
+    (back,) = model_files.read_models(tmp_path / "sparse", database)
     known = {k: c.has_prior_focal_length for k, c in back.cameras.items()}
     assert known == {k: k % 2 == 1 for k in model.cameras} and True in known.values()
 

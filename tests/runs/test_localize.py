@@ -16,7 +16,7 @@ from kept_runs import change_report, with_two_models
 from jaxsfm.bench.synthetic import camera_matrix, look_at, render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.intrinsics import Intrinsics
-from jaxsfm.colmap.poses import read_model
+from jaxsfm.colmap.model_files import read_model
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, inspect_image

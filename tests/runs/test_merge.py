@@ -11,8 +11,9 @@ from room_scene import SIZE, arrays, errors, noisy_model
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.move_model import move_model
-from jaxsfm.colmap.poses import model_poses, read_model
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import move_model
 from jaxsfm.runs.merge import REPORT, merge_folders
 
 FIRST, SECOND = ["0.png", "1.png", "2.png", "3.png"], ["1.png", "2.png", "3.png", "4.png"]

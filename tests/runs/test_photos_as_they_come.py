@@ -15,7 +15,8 @@ from jaxsfm.bench.synthetic import (
     room,
     write_photo,
 )
-from jaxsfm.colmap.poses import CameraPose, Poses, model_poses, read_model
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import CameraPose, Poses, model_poses
 from jaxsfm.config import preset
 from jaxsfm.io.masks import mask_path
 from jaxsfm.report.finished_run import read_run

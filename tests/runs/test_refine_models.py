@@ -13,10 +13,11 @@ from room_scene import SIZE, Room, arrays, errors, exact_tracks, noisy_model, ot
 
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.given_model import has_rigs
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.move_model import move_model
-from jaxsfm.colmap.poses import model_poses, read_model
-from jaxsfm.colmap.updated_model import has_rigs
+from jaxsfm.colmap.model_files import read_model
+from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import move_model
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.runs.refine import REPORT, RefineOptions, RefineReport, refine_folder, refine_lines

@@ -17,8 +17,7 @@ from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.runs import run_photos
 from jaxsfm.runs.job import Job, MatchedPairs, match_pairs
-from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
-from jaxsfm.runs.turned_photos import turned
+from jaxsfm.runs.run_photos import LostMatcher, RunPhotos, turned
 from jaxsfm.sfm.limits import REGISTER
 
 TRIED = {pair: counts(30) for pair in exhaustive_pairs("abcd")}

@@ -11,7 +11,7 @@ from pair_results import counts
 
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import component_of, exhaustive_pairs
-from jaxsfm.runs.turned_photos import clear_turn, find_turned, groups_stored_alike
+from jaxsfm.runs.run_photos import clear_turn, find_turned, groups_stored_alike
 from jaxsfm.sfm.limits import UPRIGHT
 
 STRONG, WEAK = counts(UPRIGHT.least_inliers), counts(UPRIGHT.least_inliers - 1)

@@ -5,8 +5,8 @@ import pytest
 from room_scene import SIZE, noisy_model
 
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import CameraPose, model_poses
+from jaxsfm.colmap.reconstruction import move_model
 from jaxsfm.sfm.given_refinement import _described_px, move_back
 
 

@@ -13,7 +13,7 @@ from scipy.cluster.hierarchy import DisjointSet
 from test_refined_models import NAMES, FakePhotos
 
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.reconstruction import registered
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Config, Refinement
 from jaxsfm.sfm import refined_models

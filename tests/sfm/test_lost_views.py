@@ -14,8 +14,8 @@ from test_new_points import all_matches
 from verdicts import check_of, taken_out
 
 from jaxsfm.colmap.database import write_database
-from jaxsfm.colmap.model_images import fingerprint, registered
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import fingerprint, registered
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm.limits import RegisterLimits

@@ -5,7 +5,7 @@ import pytest
 from oracles import mapper_matches as oracle
 from strategies import rng_of
 
-from jaxsfm.colmap.inliers import ImageKeypoints, Inliers
+from jaxsfm.colmap.two_views import ImageKeypoints, Inliers
 from jaxsfm.io.pairs import exhaustive_pairs
 from jaxsfm.sfm import mapper_matches as module
 from jaxsfm.sfm.mapper_matches import (

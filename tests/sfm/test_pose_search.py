@@ -12,7 +12,7 @@ from wall_scene import matched
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.refine import octave_pose, plane_geometry, pose_search
 from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.octave_pose import OctavePose, PoseHypothesis, follow, trusted

@@ -22,11 +22,11 @@ from room_scene import (
 
 from jaxsfm.bench.synthetic import arc, camera_matrix, room
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.model_images import part_of, registered
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import part_of, registered
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.config import Refinement
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import passes, plane_geometry
 from jaxsfm.sfm.refine.candidates import plane_affines

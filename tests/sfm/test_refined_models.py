@@ -7,8 +7,8 @@ from room_scene import SIZE, noisy_model, read_of
 from verdicts import taken_out
 
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_images import part_of, registered
 from jaxsfm.colmap.other_camera import OtherCamera
+from jaxsfm.colmap.reconstruction import part_of, registered
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module

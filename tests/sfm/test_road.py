@@ -16,7 +16,7 @@ from room_run import CONFIG, NAMES, model_with, room_photos
 from test_new_points import all_matches
 from verdicts import outcome
 
-from jaxsfm.colmap.model_images import fingerprint, registered
+from jaxsfm.colmap.reconstruction import fingerprint, registered
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import exhaustive_pairs
 from jaxsfm.io.work_folder import WorkFolder

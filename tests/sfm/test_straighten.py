@@ -14,7 +14,7 @@ from jaxsfm.colmap.poses import CameraPose, model_poses
 from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.evaluation import Similarity, evaluate
 from jaxsfm.sfm.parts import straighten
 from jaxsfm.sfm.parts.straighten import (

@@ -8,7 +8,7 @@ from verdicts import outcome
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_images import registered
+from jaxsfm.colmap.reconstruction import registered
 from jaxsfm.sfm import settled_stage as module
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.settled_stage import told_apart

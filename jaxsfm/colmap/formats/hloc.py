@@ -21,8 +21,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from jaxsfm.colmap.formats.image_names import check_no_blanks
-from jaxsfm.colmap.formats.tables import MAX_KEYPOINTS, Tables, checked_keypoints, checked_matches
+from jaxsfm.colmap.formats.tables import (
+    MAX_KEYPOINTS,
+    Tables,
+    check_no_blanks,
+    checked_keypoints,
+    checked_matches,
+)
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, describe

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.formats.image_names import registered_images
+from jaxsfm.colmap.formats.tables import registered_images
 from jaxsfm.errors import UserError
 
 TRANSFORMS, POINTS, IMAGES = "transforms.json", "sparse_pc.ply", "images"

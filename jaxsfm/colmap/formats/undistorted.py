@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pycolmap
 
-from jaxsfm.colmap.formats.image_names import registered_images
+from jaxsfm.colmap.formats.tables import registered_images
 from jaxsfm.colmap.native import native
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space

@@ -14,12 +14,11 @@ from jaxsfm.io.images import MOST_NAMED, shown_name
 from jaxsfm.io.pairs import describe
 from jaxsfm.io.work_folder import PAGE
 from jaxsfm.report.finished_run import FinishedRun, read_run
-from jaxsfm.report.georeference_lines import georeference_lines, words_of
 from jaxsfm.report.page.figures import figures
 from jaxsfm.report.page.pairs import pair_pictures, pair_table
 from jaxsfm.report.page.photos import photo_table
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.report.summary import component_lines
+from jaxsfm.report.summary import component_lines, georeference_lines, words_of
 from jaxsfm.report.verdict import model_verdicts
 from jaxsfm.sfm.georeference.placement import AnchorRow
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.geodesy import east_north_up
+from jaxsfm.colmap.measured_positions import east_north_up
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.position_tables import OPTION

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from jaxsfm.colmap.move_model import move_model
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.reconstruction import move_model
 from jaxsfm.colmap.view import View
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.io.position_tables import ControlPoint, Position
 from jaxsfm.sfm.georeference.coordinate_system import CoordinateSystem, Frame
 from jaxsfm.sfm.georeference.placement import NamedAnchors, Placement, placement

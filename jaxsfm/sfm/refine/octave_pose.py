@@ -16,7 +16,7 @@ import numpy as np
 from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.pose_doubt import distinct_patches, projection_doubt
 

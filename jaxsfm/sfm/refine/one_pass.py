@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.mapper import MIN_POINTS
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Observations, Tracks
-from jaxsfm.colmap.triangulation import MIN_POINTS
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.parts.straighten import straightened

@@ -14,8 +14,7 @@ from jaxsfm.config import Config, Refinement
 from jaxsfm.core.align import square_patch
 from jaxsfm.io.images import ImageFile, read_image
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.io.photos import intensities
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Pixels, intensities
 from jaxsfm.sfm.refine.device_images import block_means, chunks, padded
 from jaxsfm.sfm.refine.patch_alignment import (
     AlignmentLimits,

@@ -17,9 +17,9 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from jaxsfm.colmap.mapper import MIN_POINTS
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.colmap.other_camera import OtherCamera
-from jaxsfm.colmap.triangulation import MIN_POINTS
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, Evidence
@@ -73,8 +73,8 @@ def _sizes_of_passes(passes: int, described_px: int) -> list[int]:
     return [described_px] * passes + larger
 
 
-def _working_sizes(reconstruction: "pycolmap.Reconstruction", read: Reader) -> Sizes:
-    """The sizes of all images."""
+def working_sizes(reconstruction: "pycolmap.Reconstruction", read: Reader) -> Sizes:
+    """The sizes of the working images of a model."""
     sizes = {}
     for image_id in sorted(reconstruction.reg_image_ids()):
         name = reconstruction.image(image_id).name
@@ -117,7 +117,7 @@ def refine_model(
     Raises:
       ImageError: an image of the model cannot be read any more.
     """
-    sizes = _working_sizes(reconstruction, read)
+    sizes = working_sizes(reconstruction, read)
     images, refinement = DeviceImages(read), settings.refinement
     now = _as_arrays(reconstruction, sizes)
     figures: list[PassFigures] = []

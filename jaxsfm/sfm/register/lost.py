@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Protocol
 
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.model_folders import colour_points, read_models
-from jaxsfm.colmap.model_images import fingerprint, registered_in_any
+from jaxsfm.colmap.model_files import read_models
+from jaxsfm.colmap.reconstruction import colour_points, fingerprint, registered_in_any
 from jaxsfm.colmap.view import View
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
-from jaxsfm.io.photos import Photos
-from jaxsfm.io.pixels import Pixels
+from jaxsfm.io.photos import Photos, Pixels
 from jaxsfm.io.store import digest
 from jaxsfm.io.typed_files import read_figures
 from jaxsfm.sfm.checker import opened

@@ -1,14 +1,66 @@
-"""The options that choose a `Config`: a preset, and single settings that differ from it."""
+"""Arguments of commands in the form that tyro expects, and the options that choose a `Config`: a
+preset, and single settings that differ from it."""
 
+import contextlib
 import dataclasses
+import functools
+import inspect
+import operator
+import os
+import re
+import typing
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from jaxsfm.cli.subcommands import named_options
+import tyro
+
 from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
 from jaxsfm.core.pair_shape import Products
+from jaxsfm.errors import UserError
 
+Command = Callable[..., int]
+_WRAPPED = re.compile(r"\n {4,}(?=[^\s$])")
+"""Where an argument's description goes on in the next line; lines of examples start with $."""
 Preset = Literal["paper", "default", "robust"]
+Positional = tyro.conf.Positional
+
+
+def unwrapped(command: Command) -> Command:
+    """Join the lines of every argument's description, also in the option classes of the command.
+
+    tyro wraps descriptions itself, but keeps some of the line ends that it finds.
+    """
+    documented: list[Callable[..., object]] = [command]
+    for kind in typing.get_type_hints(command).values():
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            documented += kind.__mro__[:-1]
+    for each in documented:
+        each.__doc__ = _WRAPPED.sub(" ", inspect.cleandoc(each.__doc__ or ""))
+    return command
+
+
+@contextlib.contextmanager
+def named_options() -> Iterator[None]:
+    """Make a ValueError about a field, which its message starts with, a UserError about the option
+    that sets the field."""
+    try:
+        yield
+    except ValueError as error:
+        field, _, problem = str(error).partition(" ")
+        option = field.rpartition(".")[2].replace("_", "-")
+        raise UserError(f"--{option} {problem}") from error
+
+
+def one_of(commands: Mapping[str, Command]) -> object:
+    """The type of a command's argument that is the result of one of several commands."""
+    return functools.reduce(
+        operator.or_,
+        (
+            Annotated[object, tyro.conf.subcommand(name, constructor=unwrapped(command))]
+            for name, command in commands.items()
+        ),
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -102,3 +154,22 @@ class ModelChoice(MatchingChoice):
             asked = self.first_look or None
             config = dataclasses.replace(config, first_look=asked, first_look_share=1.0)
         return config
+
+
+def check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) -> None:
+    """Check that a file can be written, before the work is done and not after it. None passes.
+
+    Raises:
+      UserError: the name ends in none of the suffixes, or the place cannot be written to. The
+        message starts with the option.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() not in suffixes:
+        raise UserError(f"{option} {path}: the name must end in {' or '.join(suffixes)}")
+    try:
+        writable = not path.is_dir() and path.parent.is_dir() and os.access(path.parent, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        raise UserError(f"{option} {path}: cannot be written there")

@@ -1,4 +1,5 @@
-"""Measured camera positions in COLMAP's database, where other tools find them."""
+"""Measured camera positions: on the Earth (WGS 84) in metres, and in COLMAP's database, where other
+tools find them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,3 +40,17 @@ def write_pose_priors(
                 variance = at.deviation**2
                 prior.position_covariance = np.diag([variance, variance, VERTICAL**2 * variance])
             db.write_pose_prior(prior)
+
+
+def east_north_up(lon_lat_height: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+    """Metres east, north and up of an origin, on the plane that touches the ellipsoid there.
+
+    Args:
+      lon_lat_height: float64 (n, 3): degrees, degrees, metres above the ellipsoid.
+      origin: latitude, longitude (degrees) and height (metres) of the origin.
+    """
+    if not len(lon_lat_height):
+        return np.zeros((0, 3))
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    lat_lon = np.ascontiguousarray(lon_lat_height[:, [1, 0, 2]], np.float64)
+    return np.asarray(transform.ellipsoid_to_enu(lat_lon, *origin))

@@ -1,10 +1,14 @@
-"""The images of COLMAP's models: which ones they have, and models with fewer of them."""
+"""What is asked of COLMAP's models, and done to them in place: which images they have, fewer
+images, another place in the world, and colours of their points."""
 
 import hashlib
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 import numpy as np
 import pycolmap
+from scipy.spatial import KDTree
+
+from jaxsfm.io.images import ImageError, WorkingImage
 
 LEAST_NEW = 3
 """A model that shares images with larger ones has so many images of its own, or it is left out. Of
@@ -64,3 +68,52 @@ def part_of(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap.
     part = pycolmap.Reconstruction(model)
     take_out(part, registered(model) - set(names))
     return part
+
+
+def move_model(
+    model: pycolmap.Reconstruction, scale: float, rotation: np.ndarray, translation: np.ndarray
+) -> None:
+    """Apply x -> scale * rotation @ x + translation to poses and points, in place.
+
+    Args:
+      rotation: float64 (3, 3).
+      translation: float64 (3,).
+    """
+    turned = pycolmap.Rotation3d(np.ascontiguousarray(rotation))
+    model.transform(pycolmap.Sim3d(scale, turned, translation))
+
+
+def coloured(model: pycolmap.Reconstruction, points: np.ndarray, colours: np.ndarray) -> None:
+    """Give every point of a model the colour of the nearest of other points, in place.
+
+    Args:
+      points: float64 (n, 3), world units.
+      colours: uint8 (n, 3).
+    """
+    ids = sorted(model.point3D_ids())
+    own = np.asarray([model.point3D(i).xyz for i in ids]).reshape(-1, 3)
+    nearest = np.asarray(KDTree(points).query(own)[1])
+    for i, row in zip(ids, nearest, strict=True):
+        model.point3D(i).color = colours[row]
+
+
+def colour_points(model: pycolmap.Reconstruction, read: Callable[[str], WorkingImage]) -> None:
+    """Give every 3-D point the mean colour of its observations, in place.
+
+    A photo that cannot be read any more is left out.
+    """
+    total: dict[int, np.ndarray] = {}
+    for image_id in sorted(model.reg_image_ids()):
+        image = model.image(image_id)
+        try:
+            rgb, scale, _ = read(image.name)
+        except ImageError:  # deleted since; other photos colour its points
+            continue
+        for point in image.points2D:
+            if point.has_point3D():
+                x, y = np.floor(point.xy / np.asarray(scale)).astype(int)
+                x, y = min(max(x, 0), rgb.shape[1] - 1), min(max(y, 0), rgb.shape[0] - 1)
+                value = np.append(rgb[y, x].astype(np.float64), 1.0)
+                total[point.point3D_id] = total.get(point.point3D_id, 0.0) + value
+    for point_id, value in total.items():
+        model.point3D(point_id).color = np.round(value[:3] / value[3]).astype(np.uint8)
