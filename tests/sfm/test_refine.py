@@ -255,13 +255,13 @@ def test_all_points_return_if_the_passes_end_early(rendered):
     assert len(figures.passes) == 1 and len(registered(after)) == 3 < len(registered(few))
 
 
-def test_working_sizes_are_widths_and_heights(rendered):
-    from jaxsfm.sfm.refine.passes import _working_sizes
+def testworking_sizes_are_widths_and_heights(rendered):
+    from jaxsfm.sfm.refine.passes import working_sizes
 
     def read(name):
         return np.zeros((30, 40), np.float32), (2.0, 2.5)
 
-    sizes = _working_sizes(noisy_model(rendered, 1.0), read)
+    sizes = working_sizes(noisy_model(rendered, 1.0), read)
     assert set(sizes.values()) == {((40, 30), (2.0, 2.5))}
 
 

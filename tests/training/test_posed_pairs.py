@@ -8,7 +8,7 @@ from jaxsfm.colmap.poses import read_poses
 from jaxsfm.errors import UserError
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.sfm.epipolar import sampson_error
-from jaxsfm.training import posed_pairs
+from jaxsfm.training import photos
 from jaxsfm.training.objective import Objective, loss
 from jaxsfm.training.photos import Crops
 from jaxsfm.training.relocalizer import TrainOptions, start_state, train_step, warped_examples
@@ -22,7 +22,7 @@ def inputs(scene):
 
 @pytest.fixture(scope="module")
 def pairs(weights, inputs):
-    return posed_pairs.posed_pairs(weights, *inputs, view=64, batch=3, seed=0)
+    return photos.posed_pairs(weights, *inputs, view=64, batch=3, seed=0)
 
 
 def test_windows_hold_matches_near_their_own_epipolar_lines(weights, pairs):
@@ -38,7 +38,7 @@ def test_windows_hold_matches_near_their_own_epipolar_lines(weights, pairs):
             assert all(c.min() >= 1 and c.max() <= 6 for c in cells)
             xy = [8 * c[:, ::-1] + 3.5 for c in cells]
             f = np.asarray(drawn.known[k], np.float64)
-            assert np.abs(sampson_error(f, *xy)).max() < posed_pairs.MAX_ERROR_PX + 0.1
+            assert np.abs(sampson_error(f, *xy)).max() < photos.MAX_ERROR_PX + 0.1
     errors = [_error(pairs, weights, step) for step in range(6)]
     shifted = [_error(pairs, weights, step, shift=16.0) for step in range(6)]
     assert np.mean(errors) < 0.5 * np.mean(shifted)
@@ -54,7 +54,7 @@ def _error(pairs, weights, step: int, shift: float = 0.0) -> float:
 
 
 def test_windows_depend_on_the_step_alone(weights, inputs, pairs):
-    again = posed_pairs.posed_pairs(weights, *inputs, view=64, batch=3, seed=0)
+    again = photos.posed_pairs(weights, *inputs, view=64, batch=3, seed=0)
     assert again.digest == pairs.digest
     pairs.draw(0, weights)
     for a, b in zip(pairs.draw(5, weights).cells, again.draw(5, weights).cells, strict=True):
@@ -87,7 +87,7 @@ def test_what_cannot_supervise_is_refused(weights, inputs):
     images, poses, camera = inputs
     few = {images[0].name: poses[images[0].name]}
     with pytest.raises(UserError, match="2 are needed"):
-        posed_pairs.posed_pairs(weights, images, few, camera, view=64, batch=1, seed=0)
+        photos.posed_pairs(weights, images, few, camera, view=64, batch=1, seed=0)
     distorted = parse_intrinsics("SIMPLE_RADIAL:320,160,120,0.1")
     with pytest.raises(UserError, match="pinhole"):
-        posed_pairs.posed_pairs(weights, images, poses, distorted, view=64, batch=1, seed=0)
+        photos.posed_pairs(weights, images, poses, distorted, view=64, batch=1, seed=0)
