@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from jaxsfm.sfm.evaluation import evaluate as evaluate
     from jaxsfm.sfm.refine.pair_alignment import align as align
     from jaxsfm.sfm.road import reconstruct as reconstruct
-    from jaxsfm.sfm.two_photos.pair_looks import match_photos as match_photos
+    from jaxsfm.sfm.two_photos.pair_passes import match_photos as match_photos
 
 _HOME = {
     "Config": "config",
@@ -56,7 +56,7 @@ _HOME = {
     "align": "sfm.refine.pair_alignment",
     "extract": "matching.pipeline",
     "match": "matching.pipeline",
-    "match_photos": "sfm.two_photos.pair_looks",
+    "match_photos": "sfm.two_photos.pair_passes",
     "open_images": "matching.pipeline",
     "reconstruct": "sfm.road",
     "RunOptions": "runs.run_options",

@@ -31,10 +31,10 @@ EXTRACTED_BY = (
 """Fields of `Config` that the features of an image depend on."""
 
 LATER_SETTINGS = (
-    "first_look",
-    "first_look_share",
+    "low_resolution",
+    "low_resolution_share",
     "aligned_octaves",
-    "closer_looks",
+    "max_rectified_planes",
     "view_graph",
     "checked",
     "refinement",
@@ -73,7 +73,7 @@ class Refinement:
     neighbours: int = 16
     """Number of 3-D points from which the surface normal at a point is estimated."""
     weak_octaves: int = 4
-    """Number of sizes (working size, half of it, ...) at which weak views are placed. These are
+    """Number of sizes (working size, half of it, ...) at which weak views are registered. These are
     views with too few aligned observations, as a night photo among day photos
     (`jaxsfm.sfm.refine.weak_views`). With 0 they keep the pose of the mapper."""
     weak_min_score: float = 0.6
@@ -114,13 +114,14 @@ class Config:
     """Longer side of the working image, pixels; larger images are reduced."""
     enlarge: float = 1.0
     """Smaller images are enlarged by up to this factor, but not beyond `max_size`."""
-    first_look: int | None = None
+    low_resolution: int | None = None
     """Longer side of the working image, pixels, at which a run describes and matches its photos.
     Only photos that this leaves without a place are matched at `max_size`, or all photos if it
     gives no model (`jaxsfm.runs.run_photos`). The refinement works at `max_size` in any case. None,
     or without a refinement: photos are described at `max_size` from the beginning."""
-    first_look_share: float = 1.0
-    """Where `first_look` hardly reduces the median photo: this share of its longer side instead."""
+    low_resolution_share: float = 1.0
+    """Where `low_resolution` hardly reduces the median photo: this share of its longer side
+    instead."""
     octaves: int = 1
     """Number of sizes at which an image is described: working size, half of it, ..."""
     centred: bool = False
@@ -161,9 +162,9 @@ class Config:
     """Number of sizes (working size, half of it, ...) at which the matches of a single pair are
     aligned to a fraction of a pixel (`jaxsfm.sfm.refine.pair_alignment`). With 0 they stay as they
     were verified. In models the tracks are aligned instead."""
-    closer_looks: int = 0
-    """How many planes of a single pair are looked at as seen from one place, at most, unless its
-    first look is strong (`jaxsfm.sfm.two_photos`). With 0 there is one look only: no other scale
+    max_rectified_planes: int = 0
+    """How many planes of a single pair are rectified and matched again, at most, unless its
+    first pass is strong (`jaxsfm.sfm.two_photos`). With 0 there is one pass only: no other scale
     or turn is tried either."""
     view_graph: bool = False
     """Whether only pairs that the view graph trusts are given to the mapper
@@ -190,30 +191,34 @@ class Config:
             del parts[later]
         return parts
 
-    def of_first_look(self, median: float) -> "Config":
-        """The settings of the first look at working images whose median longer side is `median`
-        pixels; these settings if there is none."""
+    def at_low_resolution(self, median: float) -> "Config":
+        """The settings of low-resolution matching of working images whose median longer side is
+        `median` pixels; these settings if there is none."""
         size = self.max_size
-        if self.first_look is not None and self.refinement is not None:
-            size = min(self.first_look, size)
-            if self.first_look_share < 1 and median < WORTH * size:
-                steps = int(self.first_look_share * median / FIRST_LOOK_STEP)
-                size = min(size, max(steps * FIRST_LOOK_STEP, LEAST_FIRST_LOOK))
-        return dataclasses.replace(self, max_size=size, first_look=None)
+        if self.low_resolution is not None and self.refinement is not None:
+            size = min(self.low_resolution, size)
+            if self.low_resolution_share < 1 and median < WORTH * size:
+                steps = int(self.low_resolution_share * median / LOW_RESOLUTION_STEP)
+                size = min(size, max(steps * LOW_RESOLUTION_STEP, LEAST_LOW_RESOLUTION))
+        return dataclasses.replace(self, max_size=size, low_resolution=None)
 
     def __post_init__(self) -> None:
         if self.max_size < MIN_SIDE:
             raise ValueError(f"max_size must be at least {MIN_SIDE} pixels; got {self.max_size}")
-        if self.first_look is not None and self.first_look < MIN_SIDE:
+        if self.low_resolution is not None and self.low_resolution < MIN_SIDE:
             raise ValueError(
-                f"first_look must be at least {MIN_SIDE} pixels; got {self.first_look}"
+                f"low_resolution must be at least {MIN_SIDE} pixels; got {self.low_resolution}"
             )
-        if not 0 < self.first_look_share <= 1:
-            raise ValueError(f"first_look_share must lie in (0, 1]; got {self.first_look_share}")
+        if not 0 < self.low_resolution_share <= 1:
+            raise ValueError(
+                f"low_resolution_share must lie in (0, 1]; got {self.low_resolution_share}"
+            )
         if not self.enlarge >= 1:
             raise ValueError(f"enlarge must be at least 1; got {self.enlarge}")
-        if self.closer_looks < 0:
-            raise ValueError(f"closer_looks must be at least 0; got {self.closer_looks}")
+        if self.max_rectified_planes < 0:
+            raise ValueError(
+                f"max_rectified_planes must be at least 0; got {self.max_rectified_planes}"
+            )
         for name, least in (("octaves", 1), ("aligned_octaves", 0)):
             count = getattr(self, name)
             if not least <= count <= MAX_OCTAVES:
@@ -253,22 +258,23 @@ MIN_SIDE = 48
 """Shortest usable side, pixels: three coarse cells, one window of the coarse-to-fine step."""
 
 WORTH = 1.25
-"""A first look is not worth its time if the median photo is reduced less than by this factor."""
-LEAST_FIRST_LOOK, FIRST_LOOK_STEP = 480, 80
-"""Pixels. By its share, a first look is not smaller than the first number. It is a multiple of the
-second one, so that a few photos more seldom change its size, and matches are used again."""
+"""Low-resolution matching is not worth its time if the median photo is reduced less than by this
+factor."""
+LEAST_LOW_RESOLUTION, LOW_RESOLUTION_STEP = 480, 80
+"""Pixels. By its share, the low resolution is not smaller than the first number. It is a multiple
+of the second one, so that a few photos more seldom change its size, and matches are used again."""
 
 MAX_OCTAVES = 4
 """Largest number of octaves. At an eighth of 1600 px there are only 12 x 9 coarse cells left."""
 
 _DEFAULT = Config(
-    first_look=800,
-    first_look_share=0.625,
+    low_resolution=800,
+    low_resolution_share=0.625,
     octaves=4,
     centred=True,
     pair=PairShape(local_refits=4, plane_rounds=5, one_to_one="similarity", consensus=1),
     aligned_octaves=4,
-    closer_looks=4,
+    max_rectified_planes=4,
     view_graph=True,
     checked=True,
     refinement=Refinement(),
@@ -279,7 +285,7 @@ PRESETS: dict[str, Config] = {
     "robust": dataclasses.replace(
         _DEFAULT,
         enlarge=2.0,
-        first_look=None,
+        low_resolution=None,
         pair=dataclasses.replace(_DEFAULT.pair, local_refits=10),
     ),
 }

@@ -14,11 +14,11 @@ from jaxsfm.errors import UserError
 EngineName = Literal["local", "ray"]
 Mapper = Literal["incremental", "global"]
 """COLMAP's mappers."""
-Step = Literal["upright", "map-again", "split", "second-places", "refine", "register"]
+Step = Literal["upright", "remap", "split", "pose-ambiguity", "refine", "register"]
 """The steps of a run that can be left out, to see what they are worth (`jaxsfm.sfm.road`).
 
-upright: photos that are stored sideways are turned. map-again: the second mapping. split: models in
-which photos contradict each other are split. second-places: photos are looked for in other places.
+upright: photos that are stored sideways are turned. remap: the second mapping. split: models in
+which photos contradict each other are split. pose-ambiguity: photos are looked for in other places.
 refine: the models are refined; without it they have points of a share of the matches, and no photos
 are registered. register: photos without a place are registered in the refined models.
 """
@@ -139,7 +139,7 @@ class ReconstructionChoice:
         its matches are mapped together with those of jaxsfm.
       keep_features: Keep the features in the folder (25 MB for a photo of 1536 x 1024), so that
         localize and extend need not compute them again. They use features of full size, so this
-        helps them with --first-look 0.
+        helps them with --low-resolution 0.
     """
 
     pairs: str = "auto"

@@ -8,10 +8,10 @@ from jaxsfm.sfm.check.model_check import (
     Alternative,
     Contradiction,
     ModelCheck,
-    OtherPlace,
+    PoseAmbiguity,
     VerdictColour,
 )
-from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refine.weak_views import RegistrationAttempt
 
 NAMES = [f"checked{k}.jpg" for k in range(9)]
 
@@ -21,13 +21,13 @@ OTHER = Alternative(basis="order", images=9, elsewhere=NAMES[2:4], contradicted=
 def check_of(colour: VerdictColour) -> ModelCheck:
     """A check with that verdict, which names all of NAMES."""
     contradiction = Contradiction(images=NAMES[:4], others=NAMES[4:], tested=400, contradicted=312)
-    place = OtherPlace(
+    place = PoseAmbiguity(
         image=NAMES[0], pairs=NAMES[1:], agreed=120, contradicted=3, rotation_deg=89.6
     )
     return ModelCheck(
         groups=[NAMES[:4], NAMES[4:]] if colour == "red" else [NAMES],
         contradictions=[contradiction] if colour == "red" else [],
-        other_places=[place] if colour == "amber" else [],
+        pose_ambiguities=[place] if colour == "amber" else [],
     )
 
 
@@ -46,13 +46,13 @@ def outcome(*parts: list[str]) -> Checked:
         Contradiction(images=parts[0], others=part, tested=100, contradicted=50)
         for part in parts[1:]
     ]
-    check = ModelCheck(groups=[*parts], contradictions=against, other_places=[])
+    check = ModelCheck(groups=[*parts], contradictions=against, pose_ambiguities=[])
     return Checked(check, {}, {}, set(), set(), [*parts])
 
 
-def taken_out(name: str) -> Placement:
+def taken_out(name: str) -> RegistrationAttempt:
     """What became of a photo that the refinement took out."""
-    return Placement(
+    return RegistrationAttempt(
         name=name,
         registered=True,
         octave_px=None,

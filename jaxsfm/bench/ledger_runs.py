@@ -46,9 +46,9 @@ ERROR, SECONDS = "error.json", "seconds.json"
 its stages took. The second one is written last."""
 NOTHING_AFTER: tuple[Step, ...] = (
     "upright",
-    "map-again",
+    "remap",
     "split",
-    "second-places",
+    "pose-ambiguity",
     "refine",
     "register",
 )

@@ -12,7 +12,9 @@ NAIVE = "paper-naive"
 
 def _configs() -> dict[str, Config]:
     paper, default = preset("paper"), preset("default")
-    unrefined = dataclasses.replace(default, aligned_octaves=0, closer_looks=0, refinement=None)
+    unrefined = dataclasses.replace(
+        default, aligned_octaves=0, max_rectified_planes=0, refinement=None
+    )
     return {
         "paper-grid": dataclasses.replace(paper, keypoints="grid"),
         "paper-grid-80px": dataclasses.replace(paper, keypoints="grid", threshold_px=80.0),

@@ -174,8 +174,8 @@ class LedgerOptions(SetOptions, NetworkOptions, SeedOptions):
         for all of them.
       threads: Number of threads of COLMAP, JAX and all else; -1 uses all cores.
       without: Leave out these steps of all runs. upright: photos that are stored sideways are
-        turned. map-again: the second mapping. split: models in which photos contradict each other
-        are split. second-places: photos are looked for in other places. refine: the models are
+        turned. remap: the second mapping. split: models in which photos contradict each other
+        are split. pose-ambiguity: photos are looked for in other places. refine: the models are
         refined. register: photos without a place are registered in the refined models.
       parts: Map so many parts of each set of photos, and check them, instead of the whole set.
         Nothing follows the check: the first mapping is not mended, refined or looked at again. This

@@ -32,7 +32,7 @@ from jaxsfm.io.photo_folder import SUFFIXES
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.epipolar import epipolar_residuals, fundamental_matrix, single_fundamental_matrix
-from jaxsfm.sfm.two_photos.pair_looks import match_photos
+from jaxsfm.sfm.two_photos.pair_passes import match_photos
 
 THRESHOLDS_PX = np.arange(1, 21)
 PUBLISHED_THRESHOLDS_PX = np.arange(11)
@@ -61,8 +61,8 @@ class WxbsRow(TypedDict):
     scores: list[float]
     """mAA for each seed."""
     matches: Spread
-    evidence: Spread | None
-    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos.look`)."""
+    significance: Spread | None
+    """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos.matching_pass`)."""
     seconds: float
 
 
@@ -110,7 +110,7 @@ class Matches(NamedTuple):
     xy1: np.ndarray
     seconds: float
     """Time of extracting both images and of matching; the first image of a size also compiles."""
-    evidence: float | None = None
+    significance: float | None = None
     """How strongly the matches speak for the pair (`jaxsfm.sfm.two_photos`); None if the method
     does not say it."""
 
@@ -153,7 +153,7 @@ class Matcher:
             found = match_photos(weights, features0, features1, config=config, seed=seed)
             taken = seconds0 + seconds1 + time.monotonic() - start
             xy0, xy1 = found.result.keypoints0.astype(np.float64), found.aligned.keypoints1
-            results.append(Matches(xy0, xy1, taken, found.evidence))
+            results.append(Matches(xy0, xy1, taken, found.significance))
         return results
 
     def _naive(self, image0: ImageFile, image1: ImageFile, config: Config, seed: int) -> Matches:
@@ -241,7 +241,7 @@ def _row(
             limits = PUBLISHED_THRESHOLDS_PX if published else THRESHOLDS_PX
             scores.append(mean_average_accuracy(error, limits))
     name = f"{folder.parent.name}/{folder.name}"
-    evidence = [run.evidence for run in runs if run.evidence is not None]
+    significance = [run.significance for run in runs if run.significance is not None]
     return {
         "pair": name,
         "half": half_of(name),
@@ -250,7 +250,7 @@ def _row(
         "maa": spread(scores),
         "scores": scores,
         "matches": spread(len(run.xy0) for run in runs),
-        "evidence": spread(evidence) if evidence else None,
+        "significance": spread(significance) if significance else None,
         "seconds": float(np.median([run.seconds for run in runs])),
     }
 
@@ -285,7 +285,7 @@ def cells(row: WxbsRow) -> Cells:
         "method": row["method"],
         **_maa(row["maa"]),
         "matches": f"{row['matches']['mean']:.0f}",
-        "evidence": "" if row["evidence"] is None else f"{row['evidence']['mean']:.0f}",
+        "significance": "" if row["significance"] is None else f"{row['significance']['mean']:.0f}",
         "seconds": f"{row['seconds']:.2f}",
     }
 

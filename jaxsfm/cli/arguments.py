@@ -131,7 +131,7 @@ class ModelChoice(MatchingChoice):
         pairs. It is for scenes that repeat themselves. preset: as the preset says.
       refine: Number of passes of the refinement, which moves keypoints to a fraction of a pixel. 0
         switches it off. Without it, as many as the preset says.
-      first_look: Longer side, in pixels, at which photos are described and matched. Photos that
+      low_resolution: Longer side, in pixels, at which photos are described and matched. Photos that
         find no place in this way are matched at --max-size, and so are all photos if there is no
         model. 0, or --refine 0, describes all photos at --max-size. Without it, as the preset says:
         default takes 800, and five eighths of the median photo if that has less than 1000 pixels.
@@ -139,7 +139,7 @@ class ModelChoice(MatchingChoice):
 
     view_graph: Literal["preset", "yes", "no"] = "preset"
     refine: int | None = None
-    first_look: int | None = None
+    low_resolution: int | None = None
 
     def _config(self, relocalizer: Path | None) -> Config:
         config = super()._config(relocalizer)
@@ -150,9 +150,9 @@ class ModelChoice(MatchingChoice):
                 raise ValueError(f"refine must be at least 0; got {self.refine}")
             passes = Refinement(passes=self.refine) if self.refine else None
             config = dataclasses.replace(config, refinement=passes)
-        if self.first_look is not None:
-            asked = self.first_look or None
-            config = dataclasses.replace(config, first_look=asked, first_look_share=1.0)
+        if self.low_resolution is not None:
+            asked = self.low_resolution or None
+            config = dataclasses.replace(config, low_resolution=asked, low_resolution_share=1.0)
         return config
 
 

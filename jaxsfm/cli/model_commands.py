@@ -94,20 +94,22 @@ def extend(
         return 0
     assert report.extended is not None
     last = report.extended[-1]
-    placed, without = set(last.placed), set(last.added) - set(last.placed)
+    registered, without = set(last.registered), set(last.added) - set(last.registered)
     for name in last.skipped:
         print(f"skipped    {report.images.skipped[name]}")
     for photo in report.lost:
         if photo.image in without:
             print(f"lost       {shown_name(photo.image)}: {photo.detail}")
-    print(f"placed     {len(last.placed)} of {len(last.added)} new photos in {last.rounds} rounds")
+    print(
+        f"registered {len(last.registered)} of {len(last.added)} new photos in {last.rounds} rounds"
+    )
     for k, model in enumerate(report.models):
-        if grown := placed.intersection(model.images):
+        if grown := registered.intersection(model.images):
             print(
                 f"sparse/{k}   {len(grown)} new photos: {model.registered} images, "
                 f"{model.points} points"
             )
-    return 0 if last.placed else 1
+    return 0 if last.registered else 1
 
 
 def refine(

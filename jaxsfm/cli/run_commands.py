@@ -133,7 +133,7 @@ def match(
     from jaxsfm.io.photo_folder import with_mask
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.extraction import image_features
-    from jaxsfm.sfm.two_photos.pair_looks import match_photos
+    from jaxsfm.sfm.two_photos.pair_passes import match_photos
 
     check_seed(seed)
     files = [
@@ -173,7 +173,7 @@ def match(
     print(
         f"{result.num_inliers} matches on {len(result.homographies)} planes "
         f"({aligned.sum()} aligned), confidence {100 * found.confidence:.0f} %, after "
-        f"{'one look' if found.looks == 1 else f'{found.looks} looks'}: {out}"
+        f"{'one pass' if found.passes == 1 else f'{found.passes} passes'}: {out}"
     )
     return 0
 

@@ -7,7 +7,7 @@ import pycolmap
 
 from jaxsfm.colmap.view import View
 
-MIN_POINTS = 6
+MIN_RESECTION_POINTS = 6
 """Fewer matches give no pose."""
 MIN_INLIER_SHARE = 0.05
 """RANSAC expects at least this share of the matches to be right. COLMAP's own value is a quarter,
@@ -69,7 +69,7 @@ def find_view(
     Returns:
       None if no pose is found.
     """
-    if len(points) < MIN_POINTS:
+    if len(points) < MIN_RESECTION_POINTS:
         return None
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.estimate_focal_length = estimate_focal_length

@@ -216,12 +216,12 @@ def masks_folder(report: RunReport) -> Path | None:
     return Path(folder) if isinstance(folder, str) else None
 
 
-def _looks(store: Store, report: RunReport) -> Store:
+def _matches_of(store: Store, report: RunReport) -> Store:
     """Where the matches of a run are; `store` has those at the size of its config."""
-    identity, looks = report.identity, report.looks
-    if looks is None or looks.whole:
+    identity, low_resolution = report.identity, report.low_resolution
+    if low_resolution is None or low_resolution.whole:
         return store
-    first = dataclasses.replace(identity, config=identity.config | {"max_size": looks.first_px})
+    first = dataclasses.replace(identity, config=identity.config | {"max_size": low_resolution.px})
     return Store(store.path, to_json(first))
 
 
@@ -263,5 +263,5 @@ def read_run(
         colours=colours,
         reference=known,
         store=store,
-        matches=_looks(store, report),
+        matches=_matches_of(store, report),
     )

@@ -139,15 +139,15 @@ def _refused(report: RunReport) -> dict[str, _Refused]:
         )
         for check in report.checks
         if check
-        for group in check.told_apart
+        for group in check.split_groups
         for name in group
     }
-    rows = [at for each in report.refinement for at in (each.placed if each else ())]
+    rows = [at for each in report.refinement for at in (each.registrations if each else ())]
     # What registration says comes after the reason for which a photo was taken out.
-    for at in sorted(rows, key=lambda at: bool(at.doubt)):
-        if at.doubt:
+    for at in sorted(rows, key=lambda at: bool(at.reason)):
+        if at.reason:
             before = found.get(at.name)
-            why = f"registration found no place that can be trusted: {at.doubt}"
+            why = f"registration found no place that can be trusted: {at.reason}"
             found[at.name] = _Refused(
                 had_pose=before is not None or at.candidates > 0,
                 why=f"{before.why}; {why}" if before else why,
@@ -189,8 +189,8 @@ def _stage(own: Sequence[PairRow], connected: bool) -> tuple[Stage, str]:
     )
     if dropped:
         detail += f"; the view graph dropped {dropped} more (--view-graph no keeps them)"
-    if refuted := sum(row.view_graph is not None and row.view_graph.refuted for row in own):
-        detail += f"; the check of the model refuted {refuted} more"
+    if rejected := sum(row.view_graph is not None and row.view_graph.rejected for row in own):
+        detail += f"; the check of the model rejected {rejected} more"
     return "not connected", detail
 
 

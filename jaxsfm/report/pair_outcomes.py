@@ -42,16 +42,16 @@ class PairOutcomes(NamedTuple):
             return ""
         if row.verified and row.view_graph is not None:
             verdict = row.view_graph
-            if verdict.refuted:
+            if verdict.rejected:
                 return f"{row.colmap_inliers} inliers, but {verdict.reason}"
             if verdict.rotation_error_deg is None:
                 return f"{row.colmap_inliers} inliers, but they give no relative pose"
             return (
                 f"{row.colmap_inliers} inliers, but its rotation differs from that of stronger "
                 f"pairs by {verdict.rotation_error_deg:.0f} deg ({TRUST.rotation_deg:.0f} deg are "
-                f"allowed), and its strength is {verdict.strength:.3f}"
+                f"allowed), and its strength is {verdict.edge_weight:.3f}"
                 + f" (a pair of strength {TRUST.strong} or more may have any rotation)"
-                * (verdict.strength < TRUST.strong)
+                * (verdict.edge_weight < TRUST.strong)
             )
         if row.inliers and row.handed_on:
             return (
@@ -79,7 +79,7 @@ class PairOutcomes(NamedTuple):
             inliers=row.inliers,
             colmap_inliers=row.colmap_inliers,
             trusted=row.trusted,
-            strength=row.view_graph and row.view_graph.strength,
+            edge_weight=row.view_graph and row.view_graph.edge_weight,
             rotation_error_deg=row.view_graph and row.view_graph.rotation_error_deg,
             missed=self.missed(row),
         )

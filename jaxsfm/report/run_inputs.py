@@ -105,10 +105,10 @@ class FoundPhotos(PhotoFolder):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class UsedLooks:
+class LowResolution:
     """The sizes at which the photos of a run were described."""
 
-    first_px: Count
+    px: Count
     """The longer side of the photos at first, pixels."""
     whole: bool = False
     """Whether photos of this size gave no model, so that they were matched at full size."""
@@ -116,11 +116,8 @@ class UsedLooks:
     def in_words(self) -> str:
         """At what size the photos were described, in a sentence without a full stop."""
         if self.whole:
-            return (
-                f"no model was made of photos of {self.first_px} px, so they were matched at full "
-                "size"
-            )
-        return f"photos were described at {self.first_px} px"
+            return f"no model was made of photos of {self.px} px, so they were matched at full size"
+        return f"photos were described at {self.px} px"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

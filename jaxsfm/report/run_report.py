@@ -20,10 +20,10 @@ from jaxsfm.io.atomic import Json, write_atomic
 from jaxsfm.io.typed_files import read_json
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
+    LowResolution,
     RecordedOptions,
     RunIdentity,
     UsedExternalMatches,
-    UsedLooks,
     UsedWeights,
 )
 from jaxsfm.report.run_results import (
@@ -53,7 +53,7 @@ class Extension:
     """Date and time, UTC."""
     added: list[str]
     """New photos that could be used."""
-    placed: list[str]
+    registered: list[str]
     """Those of `added` that have a pose now."""
     skipped: list[str]
     """New files that could not be used."""
@@ -87,7 +87,7 @@ class RunReport:
     images: FoundPhotos
     pairs: TriedPairs
     given: UsedExternalMatches | None = None
-    looks: UsedLooks | None = field(default=None, metadata=OMITTED)
+    low_resolution: LowResolution | None = field(default=None, metadata=OMITTED)
     """None: all photos were described at the size of the config."""
     turned: dict[str, Annotated[int, Meta(ge=1, lt=360)]] = field(
         default_factory=dict, metadata=OMITTED

@@ -63,7 +63,7 @@ class PairRow:
     def outvoted(self) -> bool:
         """Whether the view graph dropped the pair, so that `--view-graph no` keeps it."""
         verdict = self.view_graph
-        return self.verified and verdict is not None and not (verdict.trusted or verdict.refuted)
+        return self.verified and verdict is not None and not (verdict.trusted or verdict.rejected)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ class ClosestPair:
     inliers: Count | None = None
     colmap_inliers: Count | None = None
     trusted: bool | None = None
-    strength: Number | None = None
+    edge_weight: Number | None = None
     rotation_error_deg: Number | None = None
     missed: str
     """What the pair lacks to be used, in words; empty if it was used."""

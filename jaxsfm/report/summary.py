@@ -10,7 +10,7 @@ from jaxsfm.report.run_results import EvaluationReport, LostPhoto, ViewGraph
 from jaxsfm.report.verdict import model_verdicts, verdict_lines
 from jaxsfm.sfm.georeference.coordinate_system import Frame
 from jaxsfm.sfm.georeference.georeference import Georeference
-from jaxsfm.sfm.georeference.placement import MAX_TURN_DEG, Placement, Rms
+from jaxsfm.sfm.georeference.model_georeference import MAX_TURN_DEG, RegistrationAttempt, Rms
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 MAX_GROUPS = 10
@@ -92,11 +92,11 @@ def refinement_lines(refinement: RefinementFigures) -> list[str]:
         f"{last.added} added in the last of {len(refinement.passes)} passes"
         + ("" if last.accepted else "; too few agreed, so this pass was taken back")
     ]
-    for at in refinement.placed:
+    for at in refinement.registrations:
         name, px = shown_name(at.name), at.octave_px
-        if px and not at.doubt:
+        if px and not at.reason:
             lines.append(
-                f"placed           {name}: {at.agreed} points agree at "
+                f"registered       {name}: {at.agreed} points agree at "
                 f"{'full' if px == 1 else f'1/{px}'} size, with a median error of "
                 f"{at.error_px:.1f} px" + ("" if at.registered else "; it had no place before")
             )
@@ -120,8 +120,8 @@ def summary_lines(report: RunReport) -> list[str]:
         f"{pairs.handed_on} handed to COLMAP"
         + (f", {pairs.trusted} trusted" if pairs.trusted is not None else ""),
     ]
-    if looks := report.looks:
-        lines.append(f"looks            {looks.in_words()}")
+    if low_resolution := report.low_resolution:
+        lines.append(f"low resolution   {low_resolution.in_words()}")
     if turned := report.turned:
         each = [f"{shown_name(name)} by {degrees} deg" for name, degrees in turned.items()]
         lines.append(f"turned           {named(each)} clockwise, to stand as the others do")
@@ -202,7 +202,7 @@ def georeference_lines(found: Georeference | None) -> list[str]:
     return lines
 
 
-def _model_lines(found: Georeference, best: Placement) -> list[str]:
+def _model_lines(found: Georeference, best: RegistrationAttempt) -> list[str]:
     if best.similarity is None or best.residual is None or found.frame is None:
         return [f"not moved        {best.why_not}"]
     used = len(best.anchors) - len(best.outliers)

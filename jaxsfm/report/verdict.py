@@ -12,7 +12,7 @@ from jaxsfm.sfm.check.model_check import (
     Basis,
     Contradiction,
     ModelCheck,
-    OtherPlace,
+    PoseAmbiguity,
     VerdictColour,
     repeats,
 )
@@ -91,11 +91,11 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
       model: the folder of the model, if the words should name it.
     """
     colour = check.verdict
-    places = sorted(check.other_places, key=lambda each: -each.agreed)
+    places = sorted(check.pose_ambiguities, key=lambda each: -each.agreed)
     headline = in_words(colour)
     if colour == "amber" and check.unconfirmed:
         headline = f"{colour}: the photos do not show most points of the model"
-    elif colour == "amber" and check.shrunk:
+    elif colour == "amber" and check.scale_drift:
         headline = f"{colour}: a part of the model may have shrunk"
     elif colour == "amber" and places:
         count = len({place.image for place in places})
@@ -109,15 +109,15 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
     )
 
 
-def _reasons(check: ModelCheck, places: Sequence[OtherPlace]) -> list[Reason]:
+def _reasons(check: ModelCheck, places: Sequence[PoseAmbiguity]) -> list[Reason]:
     contradictions = sorted(check.contradictions, key=lambda each: -each.contradicted)
     reasons = [
         Reason("contradiction", [_against(each) for each in contradictions]),
         Reason("second place", [_fits(place) for place in places]),
         Reason("other model", [_other_model(check.alternative)] if check.alternative else []),
         Reason("neighbours", [_apart(pair) for pair in check.apart]),
-        Reason("told apart", [_told_apart(check.told_apart)] if check.told_apart else []),
-        Reason("scale", [_shrunk(check.shrunk)] if check.shrunk else []),
+        Reason("split", [_split_groups(check.split_groups)] if check.split_groups else []),
+        Reason("scale", [_scale_drift(check.scale_drift)] if check.scale_drift else []),
         Reason("not refined", [Finding(_UNCONFIRMED)] if check.unconfirmed else []),
     ]
     return [reason for reason in reasons if reason.findings]
@@ -151,7 +151,7 @@ def _against(found: Contradiction) -> Finding:
     return Finding(text, found.images, found.others)
 
 
-def _fits(place: OtherPlace) -> Finding:
+def _fits(place: PoseAmbiguity) -> Finding:
     put = "the pair with {} puts" if len(place.pairs) == 1 else "the pairs with {} put"
     text = (
         f"{shown_name(place.image)}, turned by {place.rotation_deg:.0f} degrees: "
@@ -182,7 +182,7 @@ def _apart(pair: Sequence[str]) -> Finding:
     return Finding(text, pair[:1], pair[1:])
 
 
-def _told_apart(groups: Sequence[list[str]]) -> Finding:
+def _split_groups(groups: Sequence[list[str]]) -> Finding:
     shown = "; ".join(named(group) for group in groups[:MAX_FINDINGS])
     more = f"; and {len(groups) - MAX_FINDINGS} more" if len(groups) > MAX_FINDINGS else ""
     return Finding(
@@ -193,7 +193,7 @@ def _told_apart(groups: Sequence[list[str]]) -> Finding:
     )
 
 
-def _shrunk(names: list[str]) -> Finding:
+def _scale_drift(names: list[str]) -> Finding:
     see = "sees its" if len(names) == 1 else "see their"
     return Finding(
         f"{named(names)} {see} points a hundred times nearer than other photos do, or nearer still",
@@ -201,7 +201,7 @@ def _shrunk(names: list[str]) -> Finding:
     )
 
 
-def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
+def _advice(check: ModelCheck, places: Sequence[PoseAmbiguity]) -> str:
     """What to do next, in one sentence; empty for a model that nothing speaks against."""
     colour, other = check.verdict, check.alternative
     if colour == "red":
@@ -215,16 +215,16 @@ def _advice(check: ModelCheck, places: Sequence[OtherPlace]) -> str:
             "do not use this model before you have looked at it; add photos that overlap more, and "
             f"--intrinsics if the camera is known, {_AGAIN}"
         )
-    if check.shrunk:
+    if check.scale_drift:
         return (
             "do not trust distances in this model; look where these photos and the others meet, "
             f"add photos that show what both show, {_AGAIN}"
         )
-    if repeats(check.told_apart):
+    if repeats(check.split_groups):
         one_way = (
             " (alternative/0 is one way, which photos contradict)" if other and other.whole else ""
         )
-        way = _photos_on_the_way(*map(named, check.told_apart[:2]))
+        way = _photos_on_the_way(*map(named, check.split_groups[:2]))
         return (
             "look at each model by itself; each may be right, and what is missing is how they "
             f"belong together{one_way}; {way}"

@@ -22,10 +22,10 @@ from jaxsfm.report.finished_run import FinishedRun, evaluation_report
 from jaxsfm.report.lost_photos import explained
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
+    LowResolution,
     RecordedOptions,
     RunIdentity,
     UsedExternalMatches,
-    UsedLooks,
     UsedWeights,
 )
 from jaxsfm.report.run_report import FORMAT, Extension, RunReport
@@ -62,7 +62,7 @@ class StageResults:
     georeference: Georeference | None
     """How the models were moved into metres."""
     weights: UsedWeights
-    looks: UsedLooks | None
+    low_resolution: LowResolution | None
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -106,7 +106,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
             each=_pair_rows(counts, stages.handed_on, verified, verdicts),
         ),
         given=None if about is None else msgspec.convert(about, UsedExternalMatches),
-        looks=stages.looks,
+        low_resolution=stages.low_resolution,
         turned=_turned(stages.usable, stages.identity.orientations),
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
@@ -153,7 +153,7 @@ def extended_report(
     extension = Extension(
         finished=_now(),
         added=sorted(new.images),
-        placed=sorted(grown.placed),
+        registered=sorted(grown.registered),
         skipped=sorted(new.skipped),
         rounds=grown.rounds,
         pairs=len(counts),

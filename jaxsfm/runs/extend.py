@@ -256,7 +256,7 @@ def write_extension(
             on_view=on_view,
         )
     models = read_models(run.folder / "sparse", database)
-    for k in sorted(set(grown.placed.values())):
+    for k in sorted(set(grown.registered.values())):
         models[k] = grown.models[k].to_colmap()
         colour_points(models[k], photos.rgb)
     write_models(models, target / "sparse")

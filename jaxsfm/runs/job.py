@@ -1,6 +1,6 @@
 """A job: photos whose features and matches an engine computes and a store keeps, at one size.
 
-A run matches its photos at a small size first (`first_look`).
+A run matches its photos at a low resolution first (`low_resolution`).
 """
 
 import dataclasses
@@ -151,8 +151,9 @@ class MatchedPairs(NamedTuple):
         return sorted(best_pairs(counts, n))
 
 
-def first_look(config: Config, images: Collection[ImageFile]) -> Config | None:
-    """The settings of the first look; None if it would hardly be smaller than the second one."""
+def low_resolution(config: Config, images: Collection[ImageFile]) -> Config | None:
+    """The settings of low-resolution matching; None if it would hardly be smaller than full
+    size."""
 
     def median(at: Config) -> int:
         sides = sorted(max(working_size(each.size, at.max_size, at.enlarge)) for each in images)
@@ -161,12 +162,12 @@ def first_look(config: Config, images: Collection[ImageFile]) -> Config | None:
     if not images:
         return None
     full = median(config)
-    first = config.of_first_look(full)
+    first = config.at_low_resolution(full)
     return first if full / median(first) >= WORTH else None
 
 
-def job_of_look(job: Job, identity: RunIdentity, config: Config) -> Job:
-    """The same job with the settings of a look."""
+def job_at_size(job: Job, identity: RunIdentity, config: Config) -> Job:
+    """The same job at the size of some settings."""
     identity = dataclasses.replace(identity, config=config.matching())
     store = Store(job.store.path, to_json(identity))
     return dataclasses.replace(job, config=config, store=store)

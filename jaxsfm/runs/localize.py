@@ -28,7 +28,7 @@ from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.options import check_threads
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.typed_json import to_json
-from jaxsfm.runs.closer_looks import look_closer, pairs_to_look_at
+from jaxsfm.runs.further_matching import match_further, pairs_to_rematch
 from jaxsfm.runs.job import Job
 from jaxsfm.runs.localize_report import (
     LocalizationReport,
@@ -49,11 +49,11 @@ from jaxsfm.runs.working_model import (
     weights_of_run,
 )
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.register.locate_view import Place, UnregisteredView, best_place, place_in
+from jaxsfm.sfm.register.locate_view import LocatedView, UnregisteredView, best_location, locate_in
 
 MANY_INLIERS = 100
 """A pose that so many matches agree with is not looked for again. A photo of a sixth of the size
-had 465, and alignment found 21 of the 30 points that it needs: closer looks changed nothing."""
+had 465, and alignment found 21 of the 30 points that it needs: further passes changed nothing."""
 PHOTOS_TOGETHER = 64
 """Photos whose features and matches are asked from workers in one call: workers take seconds to
 start, and the features of so many photos take 1.6 GB on the disk."""
@@ -145,10 +145,10 @@ def localize_photos(
         bar = tqdm(total=len(queries), desc="localizing", unit="photo", disable=not job.progress)
         with bar:
             for query, matches in match_queries(job, queries, files):
-                closer = functools.partial(
-                    look_closer, job, {**files, query.image.name: query.image}
+                further = functools.partial(
+                    match_further, job, {**files, query.image.name: query.image}
                 )
-                rows.append(_localize_query(query, matches, finished, models, images, closer))
+                rows.append(_localize_query(query, matches, finished, models, images, further))
                 bar.update()
     return LocalizationReport(
         version=importlib.metadata.version("jaxsfm"),
@@ -162,7 +162,7 @@ def locate_photo(
     models: Sequence[WorkingModel],
     matches: Mapping[Pair, PairResult],
     images: DeviceImages,
-) -> Place:
+) -> LocatedView:
     """Find the pose of a photo in the model of which it shows most (`Localization.support`)."""
     views = [
         view_without_pose(query.image, camera, model.config)
@@ -171,8 +171,8 @@ def locate_photo(
     wanted = UnregisteredView(views, query.cameras[0].estimated, query.shortlist)
     refinement, seed = models[0].config.refinement or Refinement(), models[0].seed
     every = [each.model for each in models]
-    return best_place(
-        place_in(every, k, wanted, matches, images, refinement=refinement, seed=seed)
+    return best_location(
+        locate_in(every, k, wanted, matches, images, refinement=refinement, seed=seed)
         for k in range(len(every))
     )
 
@@ -183,23 +183,23 @@ def _localize_query(
     run: FinishedRun,
     models: Sequence[WorkingModel],
     images: DeviceImages,
-    closer: Callable[[Iterable[Pair]], dict[Pair, PairResult]],
+    further: Callable[[Iterable[Pair]], dict[Pair, PairResult]],
 ) -> LocalizedPhoto | UnusablePhoto:
     """The row of a photo, whose matches may be the reason why it has none.
 
-    A photo whose pose is not trusted is looked at closer (`jaxsfm.runs.closer_looks`), unless many
-    matches agree with its pose: what is missing is then something else than matches.
+    A photo whose pose is not trusted is matched further (`jaxsfm.runs.further_matching`), unless
+    many matches agree with its pose: what is missing is then something else than matches.
     """
     try:
         if isinstance(matches, str):
             raise ImageError(matches)
         place, config = locate_photo(query, models, matches, images), models[0].config
         found = place.found
-        if not found.trusted and found.inliers < MANY_INLIERS and config.closer_looks:
+        if not found.trusted and found.inliers < MANY_INLIERS and config.max_rectified_planes:
             counts = {pair: result.counts for pair, result in matches.items()}
             least = config.min_inliers
-            pairs = pairs_to_look_at([query.image.name], query.shortlist, counts, least=least)
-            likely = closer(pairs)
+            pairs = pairs_to_rematch([query.image.name], query.shortlist, counts, least=least)
+            likely = further(pairs)
             every = matches | likely
             if likely:
                 again = locate_photo(query, models, every, images)

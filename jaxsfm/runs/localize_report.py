@@ -79,7 +79,7 @@ class LocalizedPhoto:
             "agreed": found.agreed,
             "octave_px": found.octave_px,
             "error_px": _finite(found.error_px),
-            "doubt_px": _finite(found.doubt_px),
+            "uncertainty_px": _finite(found.uncertainty_px),
             "confidence": {
                 "trusted": found.trusted,
                 "centre_error": _finite(found.centre_error),

@@ -30,7 +30,7 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page import page_after_run
-from jaxsfm.report.run_inputs import RunIdentity, UsedLooks, UsedWeights
+from jaxsfm.report.run_inputs import LowResolution, RunIdentity, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
@@ -148,13 +148,13 @@ def reconstruct_folder(
             stages = dataclasses.replace(stages, images=[photos.images[i.name] for i in good])
         with folder.publish() as target:
             models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
-            looks = None
+            low_resolution = None
             if matched.described != config:
-                looks = UsedLooks(first_px=matched.described.max_size)
-            if looks and not _has_model(models.made, good):
+                low_resolution = LowResolution(px=matched.described.max_size)
+            if low_resolution and not _has_model(models.made, good):
                 # Nothing that photos could be registered in was made of small photos.
                 logger.info("no model was made of small photos; matching them at full size")
-                looks = dataclasses.replace(looks, whole=True)
+                low_resolution = dataclasses.replace(low_resolution, whole=True)
                 matched = photos.match_at_full_size(matched.counts, seconds)
                 models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
             made = models.made
@@ -171,7 +171,7 @@ def reconstruct_folder(
                     reconstructed=made,
                     georeference=moved,
                     weights=msgspec.convert(weights.described(config), UsedWeights),
-                    looks=looks,
+                    low_resolution=low_resolution,
                     seconds=seconds,
                 ),
                 config=config,

@@ -206,7 +206,7 @@ def refine_lines(report: RefineReport) -> list[str]:
     if report.refinement.camera is not None:
         lines.append(f"camera: {report.refinement.camera.in_words()}")
     lines += [f"not read: {reason}" for reason in report.unread.values()]
-    for at in report.refinement.placed:
+    for at in report.refinement.registrations:
         if at.name in report.removed:
             lines.append(f"taken out: {shown_name(at.name)}: next to nothing of it agrees")
         elif at.octave_px is None and at.name not in report.unread:

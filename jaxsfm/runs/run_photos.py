@@ -18,17 +18,17 @@ from jaxsfm.io.pairs import Pair, PairCounts, PairResult, components, make_pair
 from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.report.typed_json import to_json
-from jaxsfm.runs.closer_looks import closest_pairs, look_closer, pairs_to_look_at
+from jaxsfm.runs.further_matching import closest_pairs, match_further, pairs_to_rematch
 from jaxsfm.runs.job import (
     Job,
     MatchedPairs,
-    first_look,
-    job_of_look,
+    job_at_size,
+    low_resolution,
     match_pairs,
     pairs_without,
 )
 from jaxsfm.sfm.limits import REGISTER, TRUST, UPRIGHT
-from jaxsfm.sfm.view_graph import relative_strengths
+from jaxsfm.sfm.view_graph import relative_weights
 
 logger = logging.getLogger("jaxsfm")
 
@@ -44,10 +44,10 @@ class RunPhotos:
 
     def match(self, seconds: dict[str, float]) -> tuple[MatchedPairs, dict[str, str]]:
         """Match the pairs at a small size; says also why photos cannot be decoded."""
-        first = first_look(self.job.config, self.images.values())
-        look = job_of_look(self.job, self.identity, first or self.job.config)
-        counts, lost = match_pairs(look, self.images, self.pairs, seconds)
-        return MatchedPairs(look.store, look.config, counts), lost
+        first = low_resolution(self.job.config, self.images.values())
+        sized = job_at_size(self.job, self.identity, first or self.job.config)
+        counts, lost = match_pairs(sized, self.images, self.pairs, seconds)
+        return MatchedPairs(sized.store, sized.config, counts), lost
 
     def match_at_full_size(
         self, before: Mapping[Pair, PairCounts], seconds: dict[str, float]
@@ -62,7 +62,7 @@ class RunPhotos:
             for name in self.images
             for pair in closest_pairs(name, before)[: REGISTER.partners_without_model]
         }
-        job = job_of_look(self.job, self.identity, self.job.config)
+        job = job_at_size(self.job, self.identity, self.job.config)
         counts, _ = match_pairs(job, self.images, sorted(best), seconds)
         return MatchedPairs(job.store, job.config, counts)
 
@@ -75,7 +75,7 @@ class RunPhotos:
         if not turned:
             return self, matched
         identity = self.identity.with_images(turned.values())
-        job = job_of_look(self.job, identity, self.job.config)
+        job = job_at_size(self.job, identity, self.job.config)
         images = {**self.images, **turned}
         photos = dataclasses.replace(self, job=job, identity=identity, images=images)
         return photos, photos.match(seconds)[0]
@@ -89,39 +89,39 @@ class RunPhotos:
 @dataclasses.dataclass(frozen=True)
 class LostMatcher:
     """Matches photos without a place with their best partners at full size: as they are, or as seen
-    from one place (`jaxsfm.runs.closer_looks`)."""
+    from one place (`jaxsfm.runs.further_matching`)."""
 
     photos: RunPhotos
     counts: Mapping[Pair, PairCounts]
     """Of all pairs that were tried."""
     tried: set[tuple[Pair, bool]] = dataclasses.field(default_factory=set)
-    """The pairs that were looked at, and whether closer. No pair is looked at twice alike."""
+    """The pairs that were looked at, and whether further. No pair is matched twice alike."""
 
     def __call__(
         self,
         lost: Collection[str],
-        placed: Collection[str],
+        registered: Collection[str],
         false: Collection[Pair],
         *,
-        closer: bool,
+        further: bool,
     ) -> dict[Pair, PairResult]:
         """Matches of lost photos, original pixels (`jaxsfm.sfm.register.lost.MatchLost`)."""
         job, identity = self.photos.job, self.photos.identity
-        config = job.config if closer else dataclasses.replace(job.config, closer_looks=0)
+        config = job.config if further else dataclasses.replace(job.config, max_rectified_planes=0)
         counts = {pair: count for pair, count in self.counts.items() if pair not in false}
-        pairs = pairs_to_look_at(lost, placed, counts, least=job.config.min_inliers)
-        pairs = [pair for pair in pairs if (pair, closer) not in self.tried]
-        if not pairs or (closer and not config.closer_looks):
+        pairs = pairs_to_rematch(lost, registered, counts, least=job.config.min_inliers)
+        pairs = [pair for pair in pairs if (pair, further) not in self.tried]
+        if not pairs or (further and not config.max_rectified_planes):
             return {}
-        self.tried.update((pair, closer) for pair in pairs)
-        settings = {**config.matching(), "closer_looks": config.closer_looks}
+        self.tried.update((pair, further) for pair in pairs)
+        settings = {**config.matching(), "max_rectified_planes": config.max_rectified_planes}
         store = Store(job.store.path, to_json(dataclasses.replace(identity, config=settings)))
         sought = sorted({name for pair in pairs for name in pair} & set(lost))
-        what = "closer looks" if closer else "full size"
+        what = "further passes" if further else "full size"
         logger.info("no place yet, %s: %s", what, named(sought))
         bar = tqdm(pairs, desc=what, unit="pair", disable=not job.progress)
-        full = job_of_look(job, identity, config)
-        return look_closer(full, self.photos.images, bar, store=store)
+        full = job_at_size(job, identity, config)
+        return match_further(full, self.photos.images, bar, store=store)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,9 +143,9 @@ class Trials:
         images[name] = turned(self.images[name], quarters)
         config = self.job.config
         config = dataclasses.replace(config, max_size=min(UPRIGHT.trial_px, config.max_size))
-        look = job_of_look(self.job, self.identity.with_images([images[name]]), config)
+        sized = job_at_size(self.job, self.identity.with_images([images[name]]), config)
         pairs = [make_pair(name, other) for other in partners]
-        counts, _ = match_pairs(look.here(), images, pairs, self.seconds)
+        counts, _ = match_pairs(sized.here(), images, pairs, self.seconds)
         return sum(found.num_inliers for found in counts.values())
 
 
@@ -195,7 +195,7 @@ def groups_stored_alike(
     with most verified matches comes first.
     """
     inliers = {pair: float(found.num_inliers) for pair, found in counts.items()}
-    strength = relative_strengths(inliers)
+    strength = relative_weights(inliers)
     enough = UPRIGHT.least_inliers
     strong = [p for p, x in strength.items() if x >= TRUST.strong and inliers[p] >= enough]
     groups = components(names, strong)

@@ -15,7 +15,7 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.check_model import Checked, VerifiedMatches, check_model
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck, repeats
-from jaxsfm.sfm.check.other_places import second_places
+from jaxsfm.sfm.check.pose_ambiguity import find_pose_ambiguities
 from jaxsfm.sfm.refine.device_images import DeviceImages
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Checker(NamedTuple):
                 checks.append(None)
         return checks
 
-    def with_second_places(
+    def with_pose_ambiguities(
         self, model: "pycolmap.Reconstruction", done: Checked, check: ModelCheck
     ) -> ModelCheck:
         """A check with the second places of the photos.
@@ -82,19 +82,19 @@ class Checker(NamedTuple):
         They are not looked for if photos contradict each other, here or in other models: this
         speaks against the model already.
         """
-        if check.contradictions or repeats(check.told_apart):
+        if check.contradictions or repeats(check.split_groups):
             return check
         try:
-            found = second_places(
+            found = find_pose_ambiguities(
                 *self._opened(model),
                 self._matches(),
                 self._refinement(),
                 done.against,
             )
         except ImageError as error:
-            logger.warning("no second places were looked for: %s", error)
+            logger.warning("pose ambiguities were not looked for: %s", error)
             return check
-        return dataclasses.replace(check, other_places=found)
+        return dataclasses.replace(check, pose_ambiguities=found)
 
     def _opened(self, model: "pycolmap.Reconstruction") -> tuple[Model, DeviceImages]:
         return opened(self.with_all_points(model), self.given.photos)

@@ -21,9 +21,9 @@ class UprightLimits:
     """So many photos of the largest group are matched with the photo that is tried. A group may be
     a walk around a building, so a few of them might show other sides."""
     least_inliers: int = 60
-    """A pair is strong if it has so many verified matches, and `TrustLimits.strong` of the strength
-    that it could have. A turn is believed with so many matches, summed over all partners. Two
-    photos of different things often have one plane of 26 matches by accident, rarely two."""
+    """A pair is strong if it has so many verified matches, and `TrustLimits.strong` of the edge
+    weight that it could have. A turn is believed with so many matches, summed over all partners.
+    Two photos of different things often have one plane of 26 matches by accident, rarely two."""
     times_others: float = 1.5
     """... and if it has so many times the matches of any other turn. Photos beside far partners
     of their sets: a wrong turn never had more than 0.91 times those of the right one
@@ -35,14 +35,14 @@ class TrustLimits:
     """Which pairs are trusted."""
 
     strong: float = 0.3
-    """In the first mapping, a pair with so much strength may have any rotation. False pairs reached
-    0.09 before weak ones lost strength (`weak`)."""
+    """In the first mapping, a pair with so large an edge weight may have any rotation. False pairs
+    reached 0.09 before weak ones lost weight (`weak`)."""
     weak: float = 0.25
-    """A pair loses half of its strength if its weight is this share of the median of all images'
+    """A pair loses half of its edge weight if its weight is this share of the median of all images'
     best pairs."""
     steepness: float = 2.5
-    """A pair keeps 1 / (1 + (h / weight) ^ steepness) of its strength, where h is `weak` times the
-    median weight of all images' best pairs. In 30 runs of castle-P19 at five sizes, 461 of 2982
+    """A pair keeps 1 / (1 + (h / weight) ^ steepness) of its edge weight, where h is `weak` times
+    the median weight of all images' best pairs. In 30 runs of castle-P19 at five sizes, 461 of 2982
     false pairs were trusted without this, and 2 are with it (docs/decisions/view-graph.md)."""
     rotation_deg: float = 15.0
     """Largest error of a trusted pair's rotation against the averaged ones, unless the pair is
@@ -89,7 +89,7 @@ class CheckLimits:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SecondPlaceLimits:
+class PoseAmbiguityLimits:
     """Whether a photo fits into a model in a second place."""
 
     least_inliers: int = 30
@@ -121,9 +121,9 @@ class RegisterLimits:
     partners: int = 3
     """A lost photo is matched at full size with so many others. Each pair takes up to a minute on
     two cores."""
-    evidence: float = 60.0
-    """Matches of a pair count if they have at least this evidence. They are more often wrong than
-    right then: alignment has to confirm the place that they give."""
+    significance: float = 60.0
+    """Matches of a pair count if they have at least this significance. They are more often wrong
+    than right then: alignment has to confirm the place that they give."""
     contradicted_share: float = 0.15
     """A place is doubtful if the view contradicts a larger share of the points that it should show.
     Of 79 views of right models (castle-P19 at 1280 px, Sacre Coeur, kitchen), three do so to more
@@ -137,4 +137,4 @@ class RegisterLimits:
 
 
 UPRIGHT, TRUST, ORDER = UprightLimits(), TrustLimits(), OrderLimits()
-CHECK, SECOND_PLACES, REGISTER = CheckLimits(), SecondPlaceLimits(), RegisterLimits()
+CHECK, POSE_AMBIGUITY, REGISTER = CheckLimits(), PoseAmbiguityLimits(), RegisterLimits()

@@ -30,7 +30,7 @@ from jaxsfm.sfm.checker import Checker, VerifiedPairs
 from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.mapper_matches import mapper_matches
 from jaxsfm.sfm.photo_order import follow, neighbours, ordered, orders
-from jaxsfm.sfm.view_graph import Verdict, strengths, trusted_pairs
+from jaxsfm.sfm.view_graph import Verdict, edge_weights, trusted_pairs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -73,9 +73,9 @@ class MappedModels:
             for each in done.check.contradictions
         )
 
-    def in_parts(self) -> bool:
+    def is_inconsistent(self) -> bool:
         """Whether a model has parts that contradict each other, or that nothing holds together."""
-        return any(done is not None and len(done.parts) > 1 for done in self.checks)
+        return any(done is not None and len(done.components) > 1 for done in self.checks)
 
     def rejected(self) -> dict[Pair, Contradiction]:
         """The pairs that joined photos which contradict each other.
@@ -84,8 +84,10 @@ class MappedModels:
         rejected only if there is none of these: with them gone, the groups may be joined rightly.
         """
         done = [each for each in self.checks if each is not None]
-        opposed = {pair: why for each in done for pair, why in each.refuted.items()}
-        return opposed or {pair: why for each in done for pair, why in each.suspected.items()}
+        opposed = {pair: why for each in done for pair, why in each.rejected.items()}
+        return opposed or {
+            pair: why for each in done for pair, why in each.rejection_candidates.items()
+        }
 
     def apart(self, following: set[Pair]) -> set[Pair]:
         """Those pairs of photos that follow each other that do not agree with their model."""
@@ -105,7 +107,7 @@ class MappedModels:
         parts = [
             part
             for model, done in zip(self.models, self.checks, strict=True)
-            for part in (done.parts if done is not None else [registered(model)])
+            for part in (done.components if done is not None else [registered(model)])
         ]
         inside: dict[str, set[int]] = {}
         for k, part in enumerate(parts):
@@ -151,7 +153,7 @@ class MappingFigures:
         return {
             pair
             for pair, verdict in self.verdicts.items()
-            if not verdict.trusted and (verdict.refuted or self.basis == "order")
+            if not verdict.trusted and (verdict.rejected or self.basis == "order")
         }
 
 
@@ -185,7 +187,7 @@ class Mapper:
             return Trust()
         return Trust(verdicts=trusted_pairs(self._geometries()))
 
-    def trust_again(self, first: MappedModels) -> Trust | None:
+    def trust_for_remapping(self, first: MappedModels) -> Trust | None:
         """What a second mapping trusts; None if a second one has no other pairs to go by.
 
         Args:
@@ -198,7 +200,7 @@ class Mapper:
         numbered = bool(found) and ordered(found, names)
         if not (rejected or numbered):
             return None
-        links = follow(found, strengths(left)) if numbered else set[Pair]()
+        links = follow(found, edge_weights(left)) if numbered else set[Pair]()
         verdicts = trusted_pairs(left, strict=True, first=links)
         verdicts |= {pair: _rejected(each) for pair, each in rejected.items()}
         return Trust(basis="order" if numbered else "pairs", verdicts=verdicts)
@@ -265,11 +267,13 @@ class Mapper:
         """The strong pairs of photos that follow each other by their names.
 
         Where a photographer walks on to another place, the last photo before and the first one
-        after have a weak pair, which says nothing: photos 13 and 14 of Herz-Jesus-P25 have a
-        strength of 0.0002, and all others that follow each other 0.7 to 1.
+        after have a weak pair, which says nothing: photos 13 and 14 of Herz-Jesus-P25 have an
+        edge weight of 0.0002, and all others that follow each other 0.7 to 1.
         """
-        strength = strengths(self._geometries())
-        return {pair for pair in neighbours(strength.keys()) if strength[pair] >= TRUST.strong}
+        edge_weight = edge_weights(self._geometries())
+        return {
+            pair for pair in neighbours(edge_weight.keys()) if edge_weight[pair] >= TRUST.strong
+        }
 
     def _geometries(self) -> dict[Pair, PairGeometry]:
         return {pair: view.geometry for pair, view in self.given.two_views.items()}
@@ -278,8 +282,8 @@ class Mapper:
 def _rejected(each: Contradiction) -> Verdict:
     return Verdict(
         trusted=False,
-        refuted=True,
-        strength=0.0,
+        rejected=True,
+        edge_weight=0.0,
         rotation_error_deg=None,
         reason=(
             f"the photos it joins contradict each other: of {each.tested} points of one group, "

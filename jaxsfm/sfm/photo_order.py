@@ -53,7 +53,7 @@ def follow(found: Iterable[Order], pairs: Mapping[Pair, float]) -> set[Pair]:
     common order come last.
 
     Args:
-      pairs: the strength of each pair that may be taken.
+      pairs: the edge weight of each pair that may be taken.
     """
     distance: dict[Pair, int] = {}
     place = [{name: k for k, name in enumerate(order)} for order in found]

@@ -25,7 +25,7 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.io.photos import Photos
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.checker import opened
-from jaxsfm.sfm.refine.fixed_structure import Evidence
+from jaxsfm.sfm.refine.fixed_structure import ResectionMatches
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
 from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import (
@@ -33,7 +33,7 @@ from jaxsfm.sfm.refine.passes import (
     refine_model,
 )
 from jaxsfm.sfm.refine.weak_views import taken_out
-from jaxsfm.sfm.settled_stage import adjusted_part
+from jaxsfm.sfm.selected_stage import adjusted_component
 
 if TYPE_CHECKING:
     import pycolmap
@@ -117,7 +117,7 @@ class _Refining(NamedTuple):
                 model,
                 self.photos.gray,
                 self._settings(),
-                evidence=Evidence(self.believed.matches, options.seed),
+                resection=ResectionMatches(self.believed.matches, options.seed),
                 with_all_points=self._whole,
                 described_px=described_px(options.scale / self.photos.median_scale()),
                 on_pass=self.on_pass,
@@ -152,14 +152,15 @@ class _Refining(NamedTuple):
         unconfirmed = done.unconfirmed_views() if asked else set()
         use = np.asarray([name not in unconfirmed for name in names])[arrays.tracks.view]
         parts = [
-            [names[k] for k in part] for part in held_parts(arrays.tracks.select(use), len(names))
+            [names[k] for k in part]
+            for part in covisibility_components(arrays.tracks.select(use), len(names))
         ]
         left = [part for part in parts if len(part) >= MIN_VIEWS]
         if len(parts) == 1 or not left:
             return [(model, dataclasses.replace(done, holds=bool(left)))]
         stay = {name for part in left for name in part}
         shown = np.bincount(arrays.tracks.view, minlength=len(names)).tolist()
-        rows = {row.name: row for row in done.placed}
+        rows = {row.name: row for row in done.registrations}
         out = [
             dataclasses.replace(rows[name], held=count)
             if name in unconfirmed
@@ -170,11 +171,13 @@ class _Refining(NamedTuple):
         made: list[RefinedModel] = []
         for part in left:
             scale = self.photos.median_scale()
-            alone = adjusted_part(model, part, loss_px=scale, options=self.options)
-            own = [row for row in done.placed if row.name in part]
+            alone = adjusted_component(model, part, loss_px=scale, options=self.options)
+            own = [row for row in done.registrations if row.name in part]
             # What became of photos that no model has stands in the first part.
-            own += [] if made else [row for row in done.placed if row.name not in names] + out
-            made.append((alone, dataclasses.replace(done, placed=own)))
+            own += (
+                [] if made else [row for row in done.registrations if row.name not in names] + out
+            )
+            made.append((alone, dataclasses.replace(done, registrations=own)))
         return made
 
     def _settings(self) -> PassSettings:
@@ -186,7 +189,7 @@ class _Refining(NamedTuple):
         return with_all_points(model, self.believed.database, self.options)
 
 
-def held_parts(tracks: Tracks, count: int) -> list[list[int]]:
+def covisibility_components(tracks: Tracks, count: int) -> list[list[int]]:
     """Parts of a refined model that confirmed points hold together.
 
     The refinement keeps only the observations that alignment confirms. What is left of a wrong
@@ -235,9 +238,9 @@ def _with_one_camera(
 def described_px(ratio: float) -> int:
     """The size in which keypoints were found, as the nearest power of two of working pixels.
 
-    After a first look it is at least two, so that a pass at full size follows the others. With two
-    passes at full size instead, the demo (described at 480 px of 640) is 0.0145 instead of 0.0062
-    deg off.
+    After low-resolution matching it is at least two, so that a pass at full size follows the
+    others. With two passes at full size instead, the demo (described at 480 px of 640) is 0.0145
+    instead of 0.0062 deg off.
 
     Args:
       ratio: working pixels per pixel of the images in which they were found, at least 1.

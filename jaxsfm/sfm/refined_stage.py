@@ -26,7 +26,7 @@ from jaxsfm.sfm.mapped_stage import (
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refined_models import Believed, RefinedModels, refine_models
-from jaxsfm.sfm.settled_stage import SettledModels
+from jaxsfm.sfm.selected_stage import SelectedModels
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,10 +61,10 @@ def check_refined(check: ModelCheck | None, done: RefinementFigures | None) -> M
     return check and dataclasses.replace(check, unconfirmed=unconfirmed)
 
 
-def refine_settled(
+def refine_selected(
     given: MatchedPhotos,
     verified: VerifiedStage,
-    settled: SettledModels,
+    selected: SelectedModels,
     database: Path,
     kept: StageCache,
     on_pass: Callable[[], None] = lambda: None,
@@ -79,38 +79,38 @@ def refine_settled(
 
     def refine(folder: Path) -> None:
         after = refine_models(
-            settled.models(),
+            selected.models(),
             Photos(given.images, config),
-            Believed(settled.database, believed_matches(given, settled)),
+            Believed(selected.database, believed_matches(given, selected)),
             config=config,
             options=given.options,
             on_pass=on_pass,
         )
         write_refined(folder, after)
 
-    key = digest(settled.key, *refinement_settings(config))
+    key = digest(selected.key, *refinement_settings(config))
     refined = kept.folder.stage("refined", key, refine)
-    shutil.copyfile(settled.database, database)
+    shutil.copyfile(selected.database, database)
     refinement, order = read_figures(refined / FIGURES, RefinedFigures)
     models = read_models(refined / SPARSE, database)
     if config.refinement is not None and None in refinement:
         kept.folder.forget_stage("refined")  # a photo could not be read; perhaps it can next time
     checks = [
-        check_refined(settled.figures.checks[k], done)
+        check_refined(selected.figures.checks[k], done)
         for k, done in zip(order, refinement, strict=True)
     ]
     return Reconstructed(
         verification=verified.figures,
-        mapping=dataclasses.replace(settled.figures, checks=checks),
+        mapping=dataclasses.replace(selected.figures, checks=checks),
         models=models,
-        alternative=settled.models(ALTERNATIVE),
+        alternative=selected.models(ALTERNATIVE),
         refinement=refinement,
     )
 
 
-def believed_matches(given: MatchedPhotos, settled: SettledModels) -> Mapping[Pair, PairResult]:
+def believed_matches(given: MatchedPhotos, selected: SelectedModels) -> Mapping[Pair, PairResult]:
     """The matches that no check has found to be false, original pixels."""
-    false = settled.figures.misleading()
+    false = selected.figures.misleading()
     return ChosenMatches(given.matches, [pair for pair in given.matches if pair not in false])
 
 

@@ -31,9 +31,9 @@ from jaxsfm.sfm.mapped_stage import (
     verify_matches,
 )
 from jaxsfm.sfm.mapping import MappedModels, Mapper
-from jaxsfm.sfm.refined_stage import Reconstructed, refine_settled
+from jaxsfm.sfm.refined_stage import Reconstructed, refine_selected
 from jaxsfm.sfm.register.lost import MatchLost, register_lost
-from jaxsfm.sfm.settled_stage import settle
+from jaxsfm.sfm.selected_stage import select_models
 
 logger = logging.getLogger("jaxsfm")
 
@@ -81,24 +81,24 @@ def walk(
         first = map_trusted(given, verified, trust, "mapped", kept, watch.on_image)
         # 6. Map once more, if something speaks against the models or many photos are left out.
         second = None
-        if "map-again" not in without:
-            second = _map_again(given, verified, mapper, first, kept)
+        if "remap" not in without:
+            second = _remap(given, verified, mapper, first, kept)
         # 7. Keep the better mapping, and split it where photos still contradict each other.
         # 8. Look for second places of photos.
-        settled = settle(given, verified, (first, second), kept, without=without)
+        selected = select_models(given, verified, (first, second), kept, without=without)
     with watch.stage("refinement"):
         # 9. Move the keypoints to a fraction of a pixel.
         if "refine" in without:
             given = given.unrefined()
-        made = refine_settled(given, verified, settled, database, kept, watch.on_pass)
+        made = refine_selected(given, verified, selected, database, kept, watch.on_pass)
     if "register" in without or given.config.refinement is None:
         return made
     # 10. Register the photos that have no place. The verdict follows from the checks.
     with watch.stage("registration"):
-        return register_lost(given, settled, made, kept, match_lost)
+        return register_lost(given, selected, made, kept, match_lost)
 
 
-def _map_again(
+def _remap(
     given: MatchedPhotos,
     verified: VerifiedStage,
     mapper: Mapper,
@@ -115,13 +115,13 @@ def _map_again(
         return None
     trust, why = None, ""
     if first.contradicted() or first.apart(mapper.following()):
-        trust, why = mapper.trust_again(first), "photos contradict the model"
+        trust, why = mapper.trust_for_remapping(first), "photos contradict the model"
     if trust is None:
         trust, why = mapper.trust_thoroughly(first), "the model lacks photos"
     if trust is None:
         return None
     logger.info("%s; mapping once more", why)
-    return map_trusted(given, verified, trust, "mapped-again", kept)
+    return map_trusted(given, verified, trust, "remapped", kept)
 
 
 def reconstruct(

@@ -5,11 +5,11 @@ walls are verified. Each such pair looks sound by itself, but contradicts the ot
 are compared, the strongest first:
 
 1. A pair's *weight* is its number of inliers, times the root of the share of the image that they
-   cover. Its *strength* is the weight relative to the best pairs of its two images (geometric
-   mean). The strength is less if the weight is small compared with those of other images' best
+   cover. Its *edge weight* is the weight relative to the best pairs of its two images (geometric
+   mean). The edge weight is less if the weight is small compared with those of other images' best
    pairs: an image of which all pairs are false has a best pair, too.
 2. Pairs are joined strongest first, as in a maximum spanning tree. Where two groups of images meet,
-   the pairs between them vote, with their strengths, on the rotation between the groups; the
+   the pairs between them vote, with their edge weights, on the rotation between the groups; the
    largest group of agreeing votes decides.
 3. The rotations of all images are then averaged over the agreeing pairs (robustly), and a pair
    whose own rotation is further than `TRUST.rotation_deg` from them is dropped, unless it is
@@ -19,9 +19,9 @@ are compared, the strongest first:
    rotation is. If it is not strong, nothing speaks for it, and it is dropped.
 
 So a false pair is trusted only where no stronger pair contradicts it. The order of images and pairs
-has no effect. On castle-P19 the rotations of false pairs are off by 75-180 deg, and their strength
-is 0.01-0.09 there, before step 1 makes it less. Those of true pairs are off by less than 10 deg,
-with one exception in 90.
+has no effect. On castle-P19 the rotations of false pairs are off by 75-180 deg, and their edge
+weight is 0.01-0.09 there, before step 1 makes it less. Those of true pairs are off by less than 10
+deg, with one exception in 90.
 """
 
 import dataclasses
@@ -42,13 +42,13 @@ class Verdict:
     """Whether a pair is trusted, and if not, why."""
 
     trusted: bool
-    strength: float
+    edge_weight: float
     """0 .. 1, see the module. Near 1: it is the best pair of both its images."""
     rotation_error_deg: float | None
     """The pair's own rotation against the averaged ones; None: it has none."""
     reason: str = ""
     """Why it is not trusted; empty for trusted pairs."""
-    refuted: bool = False
+    rejected: bool = False
     """The photos contradict each other where the pair joined them (`jaxsfm.sfm.check`)."""
 
 
@@ -58,14 +58,14 @@ def rotation_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arcsin(np.minimum(half_sine, 1.0)))
 
 
-def strengths(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
-    """The strength of every pair, 0 .. 1 (see the module)."""
+def edge_weights(geometries: Mapping[Pair, PairGeometry]) -> dict[Pair, float]:
+    """The edge weight of every pair, 0 .. 1 (see the module)."""
     weight = {p: float(g.num_inliers * np.sqrt(g.spread)) for p, g in geometries.items()}
-    return relative_strengths(weight)
+    return relative_weights(weight)
 
 
-def relative_strengths(weight: Mapping[Pair, float]) -> dict[Pair, float]:
-    """The strength of every pair, 0 .. 1, by the weights of all pairs."""
+def relative_weights(weight: Mapping[Pair, float]) -> dict[Pair, float]:
+    """The edge weight of every pair, 0 .. 1, by the weights of all pairs."""
     best: dict[str, float] = {}
     for pair, w in weight.items():
         for image in pair:
@@ -88,13 +88,13 @@ def trusted_pairs(
     Args:
       strict: strong pairs may not have any rotation either. This is for photos of repeated
         structure, whose false pairs are as strong as true ones.
-      first: pairs that are joined before all others, because something else than their strength
+      first: pairs that are joined before all others, because something else than their edge weight
         speaks for them.
     """
-    strength = strengths(geometries)
-    ranked = sorted(geometries, key=lambda p: (p not in first, -strength[p], p))
-    known = [p for p in ranked if geometries[p].rotation is not None and strength[p] > 0]
-    rotations = _average(_grow(known, geometries, strength), known, geometries)
+    edge_weight = edge_weights(geometries)
+    ranked = sorted(geometries, key=lambda p: (p not in first, -edge_weight[p], p))
+    known = [p for p in ranked if geometries[p].rotation is not None and edge_weight[p] > 0]
+    rotations = _average(_grow(known, geometries, edge_weight), known, geometries)
     verdicts = {}
     determined = set(known)
     for pair in sorted(geometries):
@@ -103,22 +103,22 @@ def trusted_pairs(
             reason = "no relative pose"
         else:
             error = float(_error_deg(pair, geometries, rotations))
-            if error > TRUST.rotation_deg and (strict or strength[pair] < TRUST.strong):
+            if error > TRUST.rotation_deg and (strict or edge_weight[pair] < TRUST.strong):
                 reason = (
                     f"its rotation is {error:.0f} deg from the one that stronger pairs give "
-                    f"(its strength is {strength[pair]:.3f} of 1)"
+                    f"(its edge weight is {edge_weight[pair]:.3f} of 1)"
                 )
         verdicts[pair] = Verdict(
             trusted=not reason,
-            strength=strength[pair],
+            edge_weight=edge_weight[pair],
             rotation_error_deg=error,
             reason=reason,
         )
     for pair in bridges([pair for pair, verdict in verdicts.items() if verdict.trusted]):
-        if strength[pair] < TRUST.strong:
+        if edge_weight[pair] < TRUST.strong:
             why = (
-                f"it alone joins two groups of photos, and it is weak (its strength is "
-                f"{strength[pair]:.3f} of 1)"
+                f"it alone joins two groups of photos, and it is weak (its edge weight is "
+                f"{edge_weight[pair]:.3f} of 1)"
             )
             verdicts[pair] = dataclasses.replace(verdicts[pair], trusted=False, reason=why)
     return verdicts
@@ -173,14 +173,14 @@ def _error_deg(
 def _grow(
     ranked: list[Pair],
     geometries: Mapping[Pair, PairGeometry],
-    strength: Mapping[Pair, float],
+    edge_weight: Mapping[Pair, float],
 ) -> Rotations:
     """Camera rotations (world to camera). Each connected group of images has a world of its own."""
     names = sorted({image for pair in ranked for image in pair})
     index = {name: k for k, name in enumerate(names)}
     ends = np.asarray([[index[a], index[b]] for a, b in ranked]).reshape(-1, 2)
     relative = np.asarray([_rotation(pair, geometries) for pair in ranked]).reshape(-1, 3, 3)
-    votes = np.asarray([strength[pair] for pair in ranked])
+    votes = np.asarray([edge_weight[pair] for pair in ranked])
     rotations = np.tile(np.eye(3), (len(names), 1, 1))
     group = list(range(len(names)))
     members = [[k] for k in group]

@@ -130,7 +130,7 @@ def test_the_published_protocol_is_run_beside_published_figures(root, tmp_path, 
     args = ["--root", str(root), "--methods", "rootsift", "--seeds", "1", "--protocol", "lo"]
     assert main(["bench", "wxbs", *args, "--json", str(out)]) == 0
     (row,) = json.loads(out.read_text())["rows"]
-    assert row["maa"]["mean"] > 0.5 and row["evidence"] is None
+    assert row["maa"]["mean"] > 0.5 and row["significance"] is None
     lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     assert lines[-2:] == ["published, all pairs DKM 0.589", "published, all pairs RoMa 0.801"]
 

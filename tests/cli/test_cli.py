@@ -506,7 +506,7 @@ def test_a_model_that_may_be_wrong_ends_with_3(
 def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("jaxsfm.io.features.total_memory", lambda: 920_000_000)
     # Closer looks at photos of 64 pixels compile dozens of programs, which takes minutes.
-    monkeypatch.setattr("jaxsfm.sfm.two_photos.pair_looks.is_settled", lambda first: True)
+    monkeypatch.setattr("jaxsfm.sfm.two_photos.pair_passes.is_conclusive", lambda first: True)
     images = [scene / "images" / n for n in ("view0.png", "view2.png")]
     refuse(capsys, ["match", *images, "--out", tmp_path / "m.npz"], "view0.png", "--max-size")
     args = ["match", *map(str, images), "--out", str(tmp_path / "m.npz"), "--max-size", "64"]
@@ -576,7 +576,7 @@ def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
     monkeypatch.setattr(mapping, "run_mapper", without_one)
     report = run(scene, tmp_path / "out", "--intrinsics", scene / "K.txt")
     assert report["models"][0]["registered"] == 3
-    (placed,) = [p for p in report["refinement"][0]["placed"] if p["name"] == "view2.png"]
+    (placed,) = [p for p in report["refinement"][0]["registrations"] if p["name"] == "view2.png"]
     assert not placed["registered"] and placed["octave_px"]
     assert "view2.png" in capsys.readouterr().out.split("it had no place before")[0]
 
@@ -585,10 +585,10 @@ def test_an_image_that_the_mapper_leaves_out_is_placed_by_its_matches(
 def test_another_model_is_written_beside_the_result_and_goes_when_there_is_none(
     scene, tmp_path, monkeypatch, capsys
 ):
-    from jaxsfm.sfm import settled_stage
+    from jaxsfm.sfm import selected_stage
     from jaxsfm.sfm.check.model_check import Alternative
 
-    settled, out = settled_stage._settled, tmp_path / "out"
+    settled, out = selected_stage._selected, tmp_path / "out"
 
     def two(*arguments):
         made = settled(*arguments)
@@ -598,7 +598,7 @@ def test_another_model_is_written_beside_the_result_and_goes_when_there_is_none(
 
     args = ["reconstruct", scene / "images", "--out", out, "--intrinsics", scene / "K.txt"]
     args = [str(a) for a in args]
-    monkeypatch.setattr(settled_stage, "_settled", two)
+    monkeypatch.setattr(selected_stage, "_selected", two)
     assert main(args) == 3
     assert "alternative/0 is another mapping, which follows the order" in capsys.readouterr().out
     assert (out / "alternative" / "0" / "images.bin").is_file()

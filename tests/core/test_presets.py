@@ -12,8 +12,8 @@ from jaxsfm.core.types import Status
 PAPER = {
     # What the paper and the authors' code say: section numbers are the paper's.
     "max_size": 1600,  # longer side, pixels; section 4
-    "first_look": None,  # photos are described at one size
-    "first_look_share": 1.0,
+    "low_resolution": None,  # photos are described at one size
+    "low_resolution_share": 1.0,
     "layers": "pool4/pool3",  # conv4 and conv3 in the paper
     "keypoints": "relocalized",  # section 3.2
     "children": 2,  # K
@@ -29,7 +29,7 @@ PAPER = {
     "convolutions": "float32",
     "products": "float32",
     "aligned_octaves": 0,
-    "closer_looks": 0,
+    "max_rectified_planes": 0,
     "view_graph": False,
     "checked": False,
     "refinement": None,
@@ -66,12 +66,12 @@ REFINEMENT = {
     "weak_min_score": 0.6,
 }
 DEFAULT = PAPER | {
-    "first_look": 800,
-    "first_look_share": 0.625,
+    "low_resolution": 800,
+    "low_resolution_share": 0.625,
     "octaves": 4,
     "centred": True,
     "aligned_octaves": 4,
-    "closer_looks": 4,
+    "max_rectified_planes": 4,
     "view_graph": True,
     "checked": True,
     "refinement": REFINEMENT,
@@ -86,7 +86,7 @@ EXPECTED = {
     "paper": PAPER | {"pair": PAPER_PAIR},
     "default": DEFAULT | {"pair": DEFAULT_PAIR},
     "robust": DEFAULT
-    | {"enlarge": 2.0, "first_look": None, "pair": DEFAULT_PAIR | {"local_refits": 10}},
+    | {"enlarge": 2.0, "low_resolution": None, "pair": DEFAULT_PAIR | {"local_refits": 10}},
 }
 
 
@@ -101,7 +101,7 @@ def test_there_are_three_presets_and_others_are_refused_by_name():
         preset("best")
 
 
-def test_the_first_look_is_smaller_and_only_where_a_refinement_follows():
+def test_the_low_resolution_is_smaller_and_only_where_a_refinement_follows():
     default = preset("default")
     for changes, median, size in (
         ({}, 1600, 800),
@@ -110,19 +110,19 @@ def test_the_first_look_is_smaller_and_only_where_a_refinement_follows():
         ({}, 768, 480),
         ({}, 640, 480),
         ({}, 500, 480),
-        ({"first_look": 300}, 640, 300),
-        ({"first_look_share": 1.0}, 640, 800),
+        ({"low_resolution": 300}, 640, 300),
+        ({"low_resolution_share": 1.0}, 640, 800),
         ({"max_size": 600}, 600, 480),
         ({"max_size": 300}, 300, 300),
         ({"refinement": None}, 1600, 1600),
-        ({"first_look": None}, 1600, 1600),
-        ({"first_look": 2000, "first_look_share": 1.0}, 1600, 1600),
+        ({"low_resolution": None}, 1600, 1600),
+        ({"low_resolution": 2000, "low_resolution_share": 1.0}, 1600, 1600),
     ):
         config = dataclasses.replace(default, **changes)
-        expected = dataclasses.replace(config, max_size=size, first_look=None)
-        assert config.of_first_look(median) == expected, (changes, median)
+        expected = dataclasses.replace(config, max_size=size, low_resolution=None)
+        assert config.at_low_resolution(median) == expected, (changes, median)
     # The matches of the second look are those of a run without a first one.
-    assert default.matching() == dataclasses.replace(default, first_look=None).matching()
+    assert default.matching() == dataclasses.replace(default, low_resolution=None).matching()
 
 
 def test_what_the_paper_fixes_for_all_presets():
@@ -161,14 +161,14 @@ def test_a_pair_shape_needs_room_for_correspondences():
     "field, allowed, refused",
     [
         ("max_size", 48, 47),
-        ("first_look", 48, 47),
-        ("first_look_share", 1.0, 1.01),
-        ("first_look_share", 0.01, 0.0),
+        ("low_resolution", 48, 47),
+        ("low_resolution_share", 1.0, 1.01),
+        ("low_resolution_share", 0.01, 0.0),
         ("enlarge", 1.0, 0.99),
         ("octaves", 1, 0),
         ("octaves", 4, 5),
         ("aligned_octaves", 0, -1),
-        ("closer_looks", 0, -1),
+        ("max_rectified_planes", 0, -1),
         ("aligned_octaves", 4, 5),
         ("threshold_px", 0.01, 0.0),
         ("min_inliers", 4, 3),

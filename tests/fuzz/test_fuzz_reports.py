@@ -15,7 +15,7 @@ from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.scene import shown_scene
 
 ERRORS = {"mean": 0.01, "median": 0.02, "max": 0.03}
-VERDICT = {"trusted": True, "strength": 0.5, "rotation_error_deg": 0.1, "reason": ""}
+VERDICT = {"trusted": True, "edge_weight": 0.5, "rotation_error_deg": 0.1, "reason": ""}
 CHECK = {
     "groups": [sorted(NAMES)[:2], sorted(NAMES)[2:3]],
     "contradictions": [
@@ -26,7 +26,7 @@ CHECK = {
             "contradicted": 9,
         }
     ],
-    "other_places": [
+    "pose_ambiguities": [
         {
             "image": sorted(NAMES)[0],
             "pairs": sorted(NAMES)[1:2],
@@ -165,5 +165,5 @@ def test_what_runs_report_is_what_their_readers_need(plain, tmp_path):
     assert refusal([]) == "Expected `object`, got `array`"
     assert refusal({**real, "lost": None}).endswith("at `$.lost`")
     real = json.loads(json.dumps(real))
-    real["pairs"]["each"][1]["view_graph"]["strength"] = "0.5"
-    assert refusal(real).endswith("at `$.pairs.each[1].view_graph.strength`")
+    real["pairs"]["each"][1]["view_graph"]["edge_weight"] = "0.5"
+    assert refusal(real).endswith("at `$.pairs.each[1].view_graph.edge_weight`")

@@ -53,7 +53,7 @@ FILES = (
     "jaxsfm/sfm/refined_models.py",
     "jaxsfm/sfm/register",
     "jaxsfm/sfm/road.py",
-    "jaxsfm/sfm/settled_stage.py",
+    "jaxsfm/sfm/selected_stage.py",
     "jaxsfm/sfm/view_graph.py",
 )
 ALIGN = ("tests/core/test_align.py", "tests/core/test_alignment_noise.py")
@@ -82,18 +82,18 @@ TESTS: dict[str, tuple[str, ...]] = {
     "check/agreement": ("tests/sfm/test_check_agreement.py", CHECK),
     "check/common_places": ("tests/sfm/test_check_places.py", "tests/bench/test_outcomes.py"),
     "check/grouping": ("tests/sfm/test_check_grouping.py", "tests/sfm/test_doubt.py"),
-    "check/other_places": ("tests/sfm/test_check_places.py", CHECK),
+    "check/pose_ambiguity": ("tests/sfm/test_check_places.py", CHECK),
     "check/check_model": (
         "tests/sfm/test_check_thinning.py",
         "tests/sfm/test_check_scale.py",
         CHECK,
         "tests/sfm/test_check_places.py",
     ),
-    "check/model_check": ("tests/sfm/test_settled_stage.py", "tests/report/test_verdict.py"),
+    "check/model_check": ("tests/sfm/test_selected_stage.py", "tests/report/test_verdict.py"),
     "refine/candidates": (REFINE, WEAK),
     "refine/device_images": (
         DEVICE,
-        "tests/sfm/test_placing.py",
+        "tests/sfm/test_pose_uncertainty.py",
         "tests/sfm/test_pair_alignment.py",
         REFINE,
     ),
@@ -102,9 +102,13 @@ TESTS: dict[str, tuple[str, ...]] = {
         "tests/sfm/test_most_views.py",
         WEAK,
     ),
-    "refine/octave_pose": ("tests/sfm/test_placing.py", "tests/sfm/test_single_view.py", WEAK),
+    "refine/octave_pose": (
+        "tests/sfm/test_pose_uncertainty.py",
+        "tests/sfm/test_single_view.py",
+        WEAK,
+    ),
     "refine/patch_alignment": (DEVICE, REFINE, WEAK),
-    "refine/pose_doubt": ("tests/sfm/test_placing.py",),
+    "refine/pose_uncertainty": ("tests/sfm/test_pose_uncertainty.py",),
     "refine/pose_search": ("tests/sfm/test_pose_search.py",),
     "refine/one_pass": (REFINE, WEAK),
     "refine/passes": (REFINE, WEAK),
@@ -113,7 +117,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "refine/weak_views": (WEAK,),
     "register/grow": (
         "tests/sfm/test_new_points.py",
-        "tests/sfm/test_placed_views.py",
+        "tests/sfm/test_registered_views.py",
         "tests/sfm/test_refused_places.py",
         "tests/runs/test_extend.py",
     ),
@@ -126,13 +130,13 @@ TESTS: dict[str, tuple[str, ...]] = {
     "register/triangulate": ("tests/sfm/test_new_points.py",),
     "runs/run_photos": ("tests/runs/test_turned_photos.py", "tests/runs/test_run_photos.py"),
     "sfm/mapping": (ROAD, "tests/sfm/test_two_mappings.py"),
-    "sfm/refined_models": ("tests/sfm/test_held_parts.py", "tests/sfm/test_refined_models.py"),
-    "sfm/settled_stage": (
-        "tests/sfm/test_settled_stage.py",
-        "tests/sfm/test_told_apart.py",
+    "sfm/refined_models": ("tests/sfm/test_covisibility.py", "tests/sfm/test_refined_models.py"),
+    "sfm/selected_stage": (
+        "tests/sfm/test_selected_stage.py",
+        "tests/sfm/test_split.py",
         ROAD,
     ),
-    "sfm/view_graph": ("tests/sfm/test_viewgraph.py", "tests/sfm/test_placing.py"),
+    "sfm/view_graph": ("tests/sfm/test_viewgraph.py", "tests/sfm/test_pose_uncertainty.py"),
 }
 """Module (last two parts of its path) -> the tests that should notice a mistake in it, quickest
 first; otherwise tests/core/test_MODULE.py or tests/sfm/test_MODULE.py. A test_MODULE_laws.py of

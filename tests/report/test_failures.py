@@ -20,7 +20,7 @@ from jaxsfm.report.summary import component_lines, help_lines
 from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement, taken_out
+from jaxsfm.sfm.refine.weak_views import RegistrationAttempt, taken_out
 from jaxsfm.sfm.view_graph import Verdict
 
 REPORT = RunReport.from_json(
@@ -49,8 +49,8 @@ def counts(status: Status, tentative: int, inliers: int = 0) -> PairCounts:
     )
 
 
-def verdict(trusted: bool, error: float | None = 40.0, strength: float = 0.05) -> Verdict:
-    return Verdict(trusted=trusted, strength=strength, rotation_error_deg=error)
+def verdict(trusted: bool, error: float | None = 40.0, edge_weight: float = 0.05) -> Verdict:
+    return Verdict(trusted=trusted, edge_weight=edge_weight, rotation_error_deg=error)
 
 
 def pair_rows(results, handed_on, verified, verdicts) -> list[PairRow]:
@@ -220,8 +220,10 @@ def test_an_image_that_refinement_took_out_says_what_was_missing():
         ("b", "c"): counts(Status.VERIFIED, 90, 60),
     }
     placed = [
-        Placement(name="a", registered=True, octave_px=None, candidates=9, agreed=1, error_px=None),
-        Placement(
+        RegistrationAttempt(
+            name="a", registered=True, octave_px=None, candidates=9, agreed=1, error_px=None
+        ),
+        RegistrationAttempt(
             name="c",
             registered=True,
             octave_px=None,
@@ -236,7 +238,7 @@ def test_an_image_that_refinement_took_out_says_what_was_missing():
         tried,
         {("a", "b"): 300, ("b", "c"): 42},
         [["a", "b"]],
-        refinement=[None, RefinementFigures(passes=[], placed=placed)],
+        refinement=[None, RefinementFigures(passes=[], registrations=placed)],
     )
     (row,) = found["lost"]
     assert row["image"] == "c" and row["stage"] == "not confirmed"
@@ -261,16 +263,16 @@ def test_an_image_that_registration_refused_says_why(verified, candidates, stage
         ("b", "c"): counts(Status.VERIFIED, 90, 60),
     }
     reason = "its matches with its neighbour b do not agree with it"
-    placed = Placement(
+    placed = RegistrationAttempt(
         name="c",
         registered=False,
         octave_px=None,
         candidates=candidates,
         agreed=0,
         error_px=None,
-        doubt=reason,
+        reason=reason,
     )
-    figures = RefinementFigures(passes=[], placed=[placed])
+    figures = RefinementFigures(passes=[], registrations=[placed])
     found = explained(
         "abc", tried, {("a", "b"): 300, ("b", "c"): verified}, [["a", "b"]], refinement=[figures]
     )
@@ -279,11 +281,17 @@ def test_an_image_that_registration_refused_says_why(verified, candidates, stage
     assert row["detail"].endswith(f"; registration found no place that can be trusted: {reason}")
 
 
-def test_an_image_that_was_told_apart_and_then_refused_says_both():
+def test_an_image_that_was_split_off_and_then_refused_says_both():
     tried = {("a", "b"): counts(Status.VERIFIED, 500, 400)}
     tried |= {("b", "c"): counts(Status.VERIFIED, 90, 60)}
-    refused = Placement(
-        name="c", registered=False, octave_px=None, candidates=0, agreed=0, error_px=None, doubt="X"
+    refused = RegistrationAttempt(
+        name="c",
+        registered=False,
+        octave_px=None,
+        candidates=0,
+        agreed=0,
+        error_px=None,
+        reason="X",
     )
     told = [["a", "b"], ["c"]]
     (row,) = explained(
@@ -291,8 +299,8 @@ def test_an_image_that_was_told_apart_and_then_refused_says_both():
         tried,
         dict.fromkeys(tried, 42),
         [["a", "b"]],
-        refinement=[RefinementFigures(passes=[], placed=[refused])],
-        checks=[ModelCheck(groups=[], contradictions=[], other_places=[], told_apart=told)],
+        refinement=[RefinementFigures(passes=[], registrations=[refused])],
+        checks=[ModelCheck(groups=[], contradictions=[], pose_ambiguities=[], split_groups=told)],
     )["lost"]
     assert row["stage"] == "not confirmed"
     assert "speaks against the model that it was in; registration" in row["detail"]
@@ -302,8 +310,14 @@ def test_an_image_that_was_told_apart_and_then_refused_says_both():
 def test_an_image_that_was_taken_out_and_then_refused_says_both():
     """It was taken out of the second model, and what registration says stands in the first one."""
     tried = {("a", "b"): counts(Status.VERIFIED, 500, 400)}
-    refused = Placement(
-        name="c", registered=False, octave_px=None, candidates=0, agreed=0, error_px=None, doubt="X"
+    refused = RegistrationAttempt(
+        name="c",
+        registered=False,
+        octave_px=None,
+        candidates=0,
+        agreed=0,
+        error_px=None,
+        reason="X",
     )
     rows = [[refused], [taken_out("c", 17)]]
     (row,) = explained(
@@ -311,7 +325,7 @@ def test_an_image_that_was_taken_out_and_then_refused_says_both():
         tried,
         dict.fromkeys(tried, 42),
         [["a", "b"]],
-        refinement=[RefinementFigures(passes=[], placed=placed) for placed in rows],
+        refinement=[RefinementFigures(passes=[], registrations=placed) for placed in rows],
     )["lost"]
     assert row["stage"] == "not confirmed"
     assert "too few of its 17 points are shown by a third photo" in row["detail"]
@@ -323,7 +337,9 @@ def test_an_image_that_contradicts_the_model_it_was_in_says_so():
         ("b", name): counts(Status.VERIFIED, 90, 60) for name in "cd"
     }
     parts = [["a", "b"], ["c"], ["d"]]
-    check = ModelCheck(groups=[["a", "b"]], contradictions=[], other_places=[], told_apart=parts)
+    check = ModelCheck(
+        groups=[["a", "b"]], contradictions=[], pose_ambiguities=[], split_groups=parts
+    )
     verified = dict.fromkeys(tried, 42)
     found = explained("abcd", tried, verified, [["a", "b"], ["d"]], checks=[check, None])
     first, second = found["lost"]
@@ -396,13 +412,13 @@ def test_an_untrusted_pair_says_by_how_much_it_missed():
     assert "no relative pose" in lost["no_model"]
 
 
-def test_a_refuted_pair_says_what_contradicts_it_and_nothing_of_its_rotation():
+def test_a_rejected_pair_says_what_contradicts_it_and_nothing_of_its_rotation():
     pair, reason = ("a", "b"), "the photos it joins contradict each other: of 100 points, 30"
-    refuted = Verdict(
-        trusted=False, refuted=True, strength=0.0, rotation_error_deg=None, reason=reason
+    rejected = Verdict(
+        trusted=False, rejected=True, edge_weight=0.0, rotation_error_deg=None, reason=reason
     )
     results = {pair: counts(Status.VERIFIED, 60, 30)}
-    found = explained("ab", results, {pair: 28}, [["b"]], verdicts={pair: refuted})
+    found = explained("ab", results, {pair: 28}, [["b"]], verdicts={pair: rejected})
     missed = found["view_graph"]["components"][0]["nearest"]["missed"]
     assert missed == f"28 inliers, but {reason}"
     (row,) = found["lost"]

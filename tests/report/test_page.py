@@ -44,10 +44,10 @@ def text(plain) -> str:
     return (plain[0] / "report.html").read_text()
 
 
-def row(a: str, b: str, inliers=100, verified=80, strength=0.5, trusted=True) -> PairRow:
+def row(a: str, b: str, inliers=100, verified=80, edge_weight=0.5, trusted=True) -> PairRow:
     verdict = Verdict(
         trusted=trusted,
-        strength=strength,
+        edge_weight=edge_weight,
         rotation_error_deg=1.0,
         reason="" if trusted else "it is off",
     )
@@ -287,14 +287,15 @@ def test_the_page_names_the_camera_that_the_photos_speak_for(plain):
     run = read_run(plain[0])
     assert 'id="camera"' not in page(run)
     camera = OtherCamera(model="PINHOLE", params=[5, 5, 3, 2], distance_px=4, halves_px=0.5)
-    figures = RefinementFigures(passes=[], placed=[], camera=camera)
+    figures = RefinementFigures(passes=[], registrations=[], camera=camera)
     report = dataclasses.replace(run.report, refinement=[figures])
     body = without_scripts(page(dataclasses.replace(run, report=report)))
     assert f"<b>Camera:</b> {camera.in_words()}." in body
 
 
 @pytest.mark.parametrize(
-    ("doubt", "label"), [({"unconfirmed": True}, "Not refined"), ({"shrunk": NAMES[:2]}, "Scale")]
+    ("doubt", "label"),
+    [({"unconfirmed": True}, "Not refined"), ({"scale_drift": NAMES[:2]}, "Scale")],
 )
 def test_the_page_says_what_speaks_against_a_model_as_a_whole(plain, doubt, label):
     run = read_run(plain[0])
@@ -309,8 +310,8 @@ def test_the_page_says_what_speaks_against_a_model_as_a_whole(plain, doubt, labe
 def test_names_in_a_verdict_are_only_ever_text(plain):
     run = read_run(plain[0])
     check = check_of("amber")
-    place = dataclasses.replace(check.other_places[0], image=HOSTILE, pairs=[HOSTILE] * 5)
-    check = dataclasses.replace(check, other_places=[place])
+    place = dataclasses.replace(check.pose_ambiguities[0], image=HOSTILE, pairs=[HOSTILE] * 5)
+    check = dataclasses.replace(check, pose_ambiguities=[place])
     text = page(dataclasses.replace(run, report=dataclasses.replace(run.report, checks=[check])))
     assert (
         HOSTILE not in text and html.escape(HOSTILE, quote=True).replace("&#x27;", "&#39;") in text

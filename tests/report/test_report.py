@@ -6,7 +6,7 @@ import pytest
 
 from jaxsfm.io.images import ImageError, inspect_image
 from jaxsfm.report.finished_run import masks_folder
-from jaxsfm.report.run_inputs import UsedLooks
+from jaxsfm.report.run_inputs import LowResolution
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.summary import summary_lines
 
@@ -78,19 +78,19 @@ def test_second_tries_and_refinement_are_said():
     dusk = night | {"name": "dusk", "agreed": 321, "octave_px": 4, "error_px": 1.26}
     late = dusk | {"name": "late", "registered": False}
     never = night | {"name": "never", "registered": False}
-    doubtful = late | {"name": "doubtful", "doubt": "its neighbour does not agree with it"}
+    doubtful = late | {"name": "doubtful", "reason": "its neighbour does not agree with it"}
     done = {
         "passes": [figures, figures],
-        "placed": [night, dusk, dusk | {"octave_px": 1}, late, never, doubtful],
+        "registrations": [night, dusk, dusk | {"octave_px": 1}, late, never, doubtful],
     }
     text = "\n".join(summary_lines(report(mapping=attempts, refinement=[done])))
     assert "started 2 times, images registered: 0, 2" in text
     assert "5 observations agreed, 3 dropped, 4 added in the last of 2 passes" in text
     assert "not refined      night" in text and "taken back" not in text
     assert (
-        "placed           dusk: 321 points agree at 1/4 size, with a median error of 1.3 px" in text
+        "registered       dusk: 321 points agree at 1/4 size, with a median error of 1.3 px" in text
     )
-    assert "placed           dusk: 321 points agree at full size" in text
+    assert "registered       dusk: 321 points agree at full size" in text
     assert (
         "late: 321 points agree at 1/4 size, with a median error of 1.3 px; it had no place" in text
     )
@@ -98,7 +98,7 @@ def test_second_tries_and_refinement_are_said():
         "never" not in text and text.count("it had no place before") == 1 and "doubtful" not in text
     )
     assert "camera  " not in text
-    back = {"passes": [figures | {"accepted": False}], "placed": []}
+    back = {"passes": [figures | {"accepted": False}], "registrations": []}
     other = {"model": "PINHOLE", "params": [5, 5, 3, 2], "distance_px": 4.52, "halves_px": 0.44}
     text = "\n".join(summary_lines(report(refinement=[back | {"camera": other}])))
     assert "too few agreed, so this pass was taken back" in text
@@ -159,7 +159,7 @@ def test_the_masks_of_a_run_are_those_of_the_user():
     ],
 )
 def test_at_what_size_photos_were_described_is_said(whole, said):
-    assert UsedLooks(first_px=800, whole=whole).in_words() == said
-    lines = summary_lines(report(looks={"first_px": 800, "whole": whole}))
-    assert f"looks            {said}" in lines
-    assert not any(line.startswith("looks") for line in summary_lines(report()))
+    assert LowResolution(px=800, whole=whole).in_words() == said
+    lines = summary_lines(report(low_resolution={"px": 800, "whole": whole}))
+    assert f"low resolution   {said}" in lines
+    assert not any(line.startswith("low_resolution") for line in summary_lines(report()))

@@ -33,8 +33,8 @@ def old(tmp_path) -> Path:
 def test_a_report_of_the_first_format_is_read_and_loses_nothing(old):
     plain, report = json.loads(FORMAT_1.read_text()), read_report(old)
     assert "format" not in plain and report.format == 1
-    for row in plain["pairs"]["each"]:  # nothing could be refuted then
-        row["view_graph"]["refuted"] = False
+    for row in plain["pairs"]["each"]:  # nothing could be rejected then
+        row["view_graph"]["rejected"] = False
     for model in plain["refinement"]:  # nothing was doubted then
         for done in model["passes"]:
             done["doubtful_views"] = []
@@ -83,7 +83,7 @@ def test_a_part_of_a_report_is_read_whatever_the_rest_is(tmp_path):
     file.write_text('{"version": 1, "view_graph": {"components": []}, "models": [{}]}')
     assert read_part(tmp_path, ViewGraph, "view_graph") == ViewGraph()
     for keys, says in [
-        (("looks",), "the key 'looks' is missing"),
+        (("low_resolution",), "the key 'looks' is missing"),
         (("models", "first"), "the key 'first' is missing"),
         (("version",), "Expected `object`, got `int`"),
     ]:

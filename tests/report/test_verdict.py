@@ -80,7 +80,7 @@ def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move()
     assert f"look whether {NAMES[2]} stands where the model has it, and not where" in advice
 
 
-def test_another_model_without_a_photo_elsewhere_is_looked_at_too():
+def test_another_model_without_a_photo_elsewhere_is_matched_too():
     other = dataclasses.replace(OTHER, elsewhere=[])
     verdict = model_verdict(dataclasses.replace(check_of("green"), alternative=other))
     _, found, advice = verdict_lines([verdict])
@@ -100,9 +100,9 @@ def test_neighbours_that_disagree_are_amber_and_named():
     assert f"look whether {NAMES[4]} stands where the model has it; if" in advice
 
 
-def test_photos_that_were_told_apart_are_amber_and_each_group_is_named():
+def test_photos_that_were_split_off_are_amber_and_each_group_is_named():
     groups = [NAMES[:3], NAMES[3:5], *([name] for name in NAMES[5:])]
-    verdict = model_verdict(dataclasses.replace(check_of("green"), told_apart=groups))
+    verdict = model_verdict(dataclasses.replace(check_of("green"), split_groups=groups))
     head, parts, advice = verdict_lines([verdict])
     assert head == "verdict          amber: two models may explain these photos"
     assert parts == (
@@ -114,13 +114,13 @@ def test_photos_that_were_told_apart_are_amber_and_each_group_is_named():
     assert "look at each model by itself" in advice
     found = only_finding(verdict)
     assert found.images == NAMES[:3] and found.others == NAMES[3:]
-    check = dataclasses.replace(check_of("green"), told_apart=groups[:3])
+    check = dataclasses.replace(check_of("green"), split_groups=groups[:3])
     found = only_finding(model_verdict(check))
     assert found.text.endswith(f"; {NAMES[5]}")
 
 
 def test_a_part_that_may_have_shrunk_is_amber_and_its_photos_are_named():
-    verdict = model_verdict(dataclasses.replace(check_of("green"), shrunk=NAMES[:2]))
+    verdict = model_verdict(dataclasses.replace(check_of("green"), scale_drift=NAMES[:2]))
     head, scale, advice = verdict_lines([verdict])
     assert head == "verdict          amber: a part of the model may have shrunk"
     assert scale == (
@@ -130,7 +130,7 @@ def test_a_part_that_may_have_shrunk_is_amber_and_its_photos_are_named():
     assert "do not trust distances in this model" in advice
     found = only_finding(verdict)
     assert found.images == NAMES[:2] and not found.others
-    alone = model_verdict(dataclasses.replace(check_of("green"), shrunk=NAMES[:1]))
+    alone = model_verdict(dataclasses.replace(check_of("green"), scale_drift=NAMES[:1]))
     assert f"{NAMES[0]} sees its points" in only_finding(alone).text
 
 
@@ -144,10 +144,10 @@ def test_a_model_of_which_the_photos_show_few_points_is_amber():
     assert "do not use this model before you have looked at it" in advice
 
 
-def test_the_model_that_was_told_apart_is_shown_as_one_way_to_join_the_groups():
+def test_the_model_that_was_split_off_is_shown_as_one_way_to_join_the_groups():
     whole = Alternative(basis="order", images=8, elsewhere=NAMES[3:], contradicted=9, whole=True)
     groups = [NAMES[:3], NAMES[3:5]]
-    check = dataclasses.replace(check_of("green"), told_apart=groups, alternative=whole)
+    check = dataclasses.replace(check_of("green"), split_groups=groups, alternative=whole)
     lines = verdict_lines([model_verdict(check)])
     assert lines[1] == (
         "other model      alternative/0 has 8 photos in one model, as they were before they were "
@@ -157,12 +157,12 @@ def test_the_model_that_was_told_apart_is_shown_as_one_way_to_join_the_groups():
     assert "look at each model by itself" in lines[3] and "alternative/0" in lines[3]
 
 
-def test_a_photo_that_was_told_apart_alone_leaves_the_others_green():
+def test_a_photo_that_was_split_off_alone_leaves_the_others_green():
     groups = [NAMES[:3], NAMES[3:4]]
-    check = dataclasses.replace(check_of("green"), told_apart=groups)
+    check = dataclasses.replace(check_of("green"), split_groups=groups)
     assert check.verdict == "green"
-    assert dataclasses.replace(check, told_apart=[*groups, NAMES[4:5]]).verdict == "green"
-    assert dataclasses.replace(check, told_apart=[*groups, NAMES[4:6]]).verdict == "amber"
+    assert dataclasses.replace(check, split_groups=[*groups, NAMES[4:5]]).verdict == "green"
+    assert dataclasses.replace(check, split_groups=[*groups, NAMES[4:6]]).verdict == "amber"
 
 
 def test_a_red_model_points_to_the_other_one():
@@ -194,9 +194,9 @@ def test_words_on_several_models_say_which_one(report):
 
 def test_the_strongest_findings_come_first_and_the_others_are_counted():
     check = check_of("amber")
-    (place,) = check.other_places
+    (place,) = check.pose_ambiguities
     places = [dataclasses.replace(place, image=f"{n}.jpg", agreed=n) for n in (5, 80, 3, 70, 60)]
-    verdict = model_verdict(dataclasses.replace(check, other_places=places))
+    verdict = model_verdict(dataclasses.replace(check, pose_ambiguities=places))
     (reason,) = verdict.reasons
     assert [each.images for each in reason.findings[:3]] == [["80.jpg"], ["70.jpg"], ["60.jpg"]]
     assert "from 80.jpg to" in verdict.advice and "5 photos fit" in verdict.headline
@@ -206,7 +206,7 @@ def test_the_strongest_findings_come_first_and_the_others_are_counted():
 
 
 def test_a_red_model_tells_of_second_places_too():
-    places = check_of("amber").other_places
-    check = dataclasses.replace(check_of("red"), other_places=places)
+    places = check_of("amber").pose_ambiguities
+    check = dataclasses.replace(check_of("red"), pose_ambiguities=places)
     labels = [line[:17].strip() for line in verdict_lines([model_verdict(check)])]
     assert labels == ["verdict", "contradiction", "second place", "what next"]

@@ -101,7 +101,7 @@ def test_the_report_says_what_was_added_and_what_was_lost(extended, plain):
     report = extended.report
     (row,) = report["extended"]
     assert len(plain[1]["checks"]) == 1 and report["checks"] == []  # other models now
-    assert row["added"] == ["elsewhere.png", "new.png"] and row["placed"] == ["new.png"]
+    assert row["added"] == ["elsewhere.png", "new.png"] and row["registered"] == ["new.png"]
     assert report["models"][0]["registered"] == 4
     (lost,) = report["lost"]
     assert lost["image"] == "elsewhere.png" and lost["detail"]
@@ -201,7 +201,7 @@ def test_a_photo_comes_into_the_model_that_it_fits_best_and_others_stay(copied, 
     write(photos / "new.png", render(room(), POSE, SIZE))
     assert main(["extend", str(run)]) == 0
     text = capsys.readouterr().out
-    assert "placed     1 of 1 new photos in 1 rounds" in text
+    assert "registered 1 of 1 new photos in 1 rounds" in text
     assert "sparse/1   1 new photos: 4 images" in text
     assert "sparse/0" not in text and "lost" not in text
     assert [len(each["images"]) for each in read_report(run).to_json()["models"]] == [2, 4]

@@ -101,8 +101,9 @@ def localized(photos, plain) -> dict[str, dict]:
     before = contents(plain[0])
     options = LocalizeOptions(reference=photos / "reference")
     with pytest.MonkeyPatch.context() as patch:
-        # Closer looks compile programs for minutes; test_localize_closer.py says when they follow.
-        patch.setattr(localize_module, "look_closer", lambda *_: {})
+        # Further passes compile programs for minutes; test_localize_further.py says when they
+        # follow.
+        patch.setattr(localize_module, "match_further", lambda *_: {})
         result = localize([photos / "photos"], plain[0], options=options)
     assert contents(plain[0]) == before  # the run stays as it is
     return {Path(row["photo"]).name: row for row in result["photos"]}
@@ -381,7 +382,7 @@ def test_the_command_writes_poses_and_tells_them(plain, photos, tmp_path, capsys
 
 def test_nothing_localized_ends_with_1(plain, photos, capsys, monkeypatch):
     numbers = dict.fromkeys(("on_surface", "inliers", "candidates", "agreed"), 0)
-    errors = dict.fromkeys(("octave_px", "error_px", "doubt_px"))
+    errors = dict.fromkeys(("octave_px", "error_px", "uncertainty_px"))
     errors |= dict.fromkeys(("centre_error", "rotation_error_deg"))
     found = Localization(view=None, trusted=False, why="no plane", **numbers, **errors)
     row = LocalizedPhoto(

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 SIZE, VIEWS = (320, 240), 5
 LIMIT_DEG = 0.5
 """The cameras are not known. Half a pixel of the principal point turns all of them by 0.1 deg."""
-CONFIG = dataclasses.replace(preset("default"), first_look=None)
+CONFIG = dataclasses.replace(preset("default"), low_resolution=None)
 
 
 def names() -> list[str]:

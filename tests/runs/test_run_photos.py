@@ -48,49 +48,49 @@ def photos_in(folder: Path, names: str = "abcd") -> RunPhotos:
 
 @pytest.fixture
 def looks(monkeypatch) -> list:
-    """The job, the pairs and the store of every closer look; each gives matches of its pairs."""
+    """The job, the pairs and the store of every rectified pass; each gives matches of its pairs."""
     done: list = []
 
-    def look_closer(job: Job, images: dict, pairs: Any, *, store: Store) -> dict:
+    def match_further(job: Job, images: dict, pairs: Any, *, store: Store) -> dict:
         assert sorted(images) == [*"abcd"]
         done.append((job, list(pairs), store))
         return {pair: result(pair) for pair in done[-1][1]}
 
-    monkeypatch.setattr(run_photos, "look_closer", look_closer)
+    monkeypatch.setattr(run_photos, "match_further", match_further)
     return done
 
 
 def test_lost_photos_are_matched_at_full_size_with_photos_that_have_a_place(looks, tmp_path):
     match = LostMatcher(photos_in(tmp_path), TRIED)
-    for closer, planes in ((False, 0), (True, preset("default").closer_looks)):
-        found = match({"d"}, {"a", "b"}, set(), closer=closer)
+    for further, planes in ((False, 0), (True, preset("default").max_rectified_planes)):
+        found = match({"d"}, {"a", "b"}, set(), further=further)
         job, pairs, store = looks.pop()
         assert [*found] == pairs == [("a", "d"), ("b", "d")]
-        assert job.config == dataclasses.replace(preset("default"), closer_looks=planes)
+        assert job.config == dataclasses.replace(preset("default"), max_rectified_planes=planes)
         assert job.store.identity["config"] == preset("default").matching()
-        assert store.identity["config"]["closer_looks"] == planes
+        assert store.identity["config"]["max_rectified_planes"] == planes
     assert planes == 4 and not looks
 
 
-def test_a_preset_without_closer_looks_matches_lost_photos_as_they_are_only(looks, tmp_path):
+def test_a_preset_without_further_passes_matches_lost_photos_as_they_are_only(looks, tmp_path):
     photos = photos_in(tmp_path)
     job = dataclasses.replace(photos.job, config=preset("paper"))
     match = LostMatcher(dataclasses.replace(photos, job=job), TRIED)
-    assert match({"d"}, {"a", "b"}, set(), closer=True) == {} and not looks
-    assert match({"d"}, {"a", "b"}, set(), closer=False) and len(looks) == 1
+    assert match({"d"}, {"a", "b"}, set(), further=True) == {} and not looks
+    assert match({"d"}, {"a", "b"}, set(), further=False) and len(looks) == 1
 
 
 def test_nothing_is_matched_where_nothing_is_lost_or_nothing_has_a_place(looks, tmp_path):
-    for lost, placed in (({}, {*"abcd"}), ({*"abcd"}, {})):
+    for lost, registered in (({}, {*"abcd"}), ({*"abcd"}, {})):
         match = LostMatcher(photos_in(tmp_path), TRIED)
-        assert match(lost, placed, set(), closer=True) == {}
+        assert match(lost, registered, set(), further=True) == {}
     assert not looks
 
 
-@pytest.mark.parametrize("closer", [False, True])
-def test_no_pair_is_looked_at_twice(looks, tmp_path, closer):
+@pytest.mark.parametrize("further", [False, True])
+def test_no_pair_is_matched_twice(looks, tmp_path, further):
     """A photo that has found a place is a new partner of the others."""
-    match = functools.partial(LostMatcher(photos_in(tmp_path), TRIED), closer=closer)
+    match = functools.partial(LostMatcher(photos_in(tmp_path), TRIED), further=further)
     assert [*match({"c", "d"}, {"a", "b"}, set())] == [
         ("a", "c"), ("b", "c"), ("a", "d"), ("b", "d")
     ]  # fmt: skip
@@ -98,8 +98,8 @@ def test_no_pair_is_looked_at_twice(looks, tmp_path, closer):
     assert match({"d"}, {"a", "b", "c"}, set()) == {} and len(looks) == 2
 
 
-def test_pairs_that_were_found_to_be_false_are_not_looked_at(looks, tmp_path):
-    match = functools.partial(LostMatcher(photos_in(tmp_path), TRIED), closer=True)
+def test_pairs_that_were_found_to_be_false_are_not_matched(looks, tmp_path):
+    match = functools.partial(LostMatcher(photos_in(tmp_path), TRIED), further=True)
     assert [*match({"d"}, {"a", "b", "c"}, {("a", "d")})] == [("b", "d"), ("c", "d")]
     assert match({"d"}, {"a"}, {("a", "d")}) == {}
 

@@ -23,9 +23,9 @@ from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.sfm.check.check_model import pair_fits
-from jaxsfm.sfm.check.other_places import Refused, Surface, other_place, other_places
+from jaxsfm.sfm.check.pose_ambiguity import Refused, Surface, pose_ambiguities, pose_ambiguity
 from jaxsfm.sfm.evaluation import Similarity
-from jaxsfm.sfm.limits import CHECK, SECOND_PLACES
+from jaxsfm.sfm.limits import CHECK, POSE_AMBIGUITY
 from jaxsfm.sfm.refine import plane_geometry
 
 NAMES = [f"{k}.png" for k in range(6)]
@@ -167,7 +167,7 @@ def refused(*results: PairResult) -> Refused:
 
 
 def places(seen: Scene, against: Refused):
-    return other_places(surface(seen.model), seen.images, REFINEMENT, against)
+    return pose_ambiguities(surface(seen.model), seen.images, REFINEMENT, against)
 
 
 @pytest.mark.parametrize(("motion", "turned_deg"), [(TURNED, 70.0), (ASIDE, 0.0)])
@@ -209,7 +209,7 @@ def test_matches_that_put_a_view_where_it_is_give_no_second_place(equal):
 
 @pytest.mark.parametrize(
     ("count", "found"),
-    [(SECOND_PLACES.least_inliers - 1, 0), (SECOND_PLACES.least_inliers + 5, 1)],
+    [(POSE_AMBIGUITY.least_inliers - 1, 0), (POSE_AMBIGUITY.least_inliers + 5, 1)],
 )
 def test_few_matches_give_no_second_place(equal, count, found):
     seen = equal
@@ -217,14 +217,14 @@ def test_few_matches_give_no_second_place(equal, count, found):
     few = matched(twins.pair, twins.keypoints0[:count], twins.keypoints1[:count])
     whole = surface(seen.model)
     view = (whole, whole.few(), seen.images, REFINEMENT, refused(few))
-    assert sum(other_place(*view, k) is not None for k in (0, 3)) == 2 * found
+    assert sum(pose_ambiguity(*view, k) is not None for k in (0, 3)) == 2 * found
 
 
 @pytest.mark.parametrize(
     ("points", "found"),
     [
-        (SECOND_PLACES.least_agreed - 5, False),
-        (SECOND_PLACES.least_agreed + 60, True),
+        (POSE_AMBIGUITY.least_agreed - 5, False),
+        (POSE_AMBIGUITY.least_agreed + 60, True),
     ],
 )
 def test_a_place_from_which_few_points_are_seen_is_no_second_place(equal, points, found):
@@ -233,7 +233,7 @@ def test_a_place_from_which_few_points_are_seen_is_no_second_place(equal, points
     few = equal._replace(model=equal.model.with_tracks(equal.model.tracks.select_points(rows)))
     against = refused(twin_matches(equal.model, 0, 3, TURNED))
     whole = surface(few.model)
-    place = other_place(whole, whole.few(), few.images, REFINEMENT, against, 0)
+    place = pose_ambiguity(whole, whole.few(), few.images, REFINEMENT, against, 0)
     assert (place is not None) == found
 
 

@@ -19,7 +19,7 @@ from jaxsfm.sfm.check.check_model import (
     VerifiedMatches,
     check_model,
     median_depths,
-    shrunk,
+    scale_drift,
 )
 
 
@@ -56,23 +56,23 @@ def test_depths_are_medians_along_the_axis_of_the_view():
 @pytest.mark.parametrize(("nearer", "found"), [(0.99, []), (1.01, names(0, 2, 4))])
 def test_a_part_has_shrunk_if_its_photos_see_their_points_a_hundred_times_nearer(nearer, found):
     far = nearer * MOST_SPREAD
-    assert shrunk(seeing_at(1, far, 1, far, 1, far)) == found
+    assert scale_drift(seeing_at(1, far, 1, far, 1, far)) == found
 
 
 def test_photos_without_points_and_with_points_behind_them_say_nothing():
-    assert shrunk(seeing_at(0, 0, 0)) == []
-    assert shrunk(seeing_at(1, -500, 1, 0, 1, -500)) == []
-    assert shrunk(seeing_at(1, -500, 500, 0, 1, 500)) == names(0, 4)
+    assert scale_drift(seeing_at(0, 0, 0)) == []
+    assert scale_drift(seeing_at(1, -500, 1, 0, 1, -500)) == []
+    assert scale_drift(seeing_at(1, -500, 500, 0, 1, 500)) == names(0, 4)
 
 
 @pytest.mark.parametrize(("bad", "found"), [(1, False), (3, True)])
 def test_a_single_misplaced_photo_among_many_is_no_part(bad, found):
     assert OUTER == 5
     depths = [1e-6] * bad + [1.0] * (30 - bad)
-    assert bool(shrunk(seeing_at(*depths))) == found
+    assert bool(scale_drift(seeing_at(*depths))) == found
 
 
-def with_shrunk_part(model: Model, views: list[int], factor: float) -> Model:
+def with_drifted_scale(model: Model, views: list[int], factor: float) -> Model:
     """The model, in which some views and the points that they see shrink towards the first of them.
 
     Points that other views see, too, are there twice.
@@ -94,20 +94,20 @@ def with_shrunk_part(model: Model, views: list[int], factor: float) -> Model:
 
 def test_a_part_that_shrinks_keeps_its_pixels_and_is_found_by_the_check():
     seen = scene([([big_wall(), poster(1)], cameras([-10.0, -4.0, 3.0, -7.0, 0.0, 8.0]))])
-    model = with_shrunk_part(seen.model, [3, 4, 5], 300.0)
+    model = with_drifted_scale(seen.model, [3, 4, 5], 300.0)
     for k, view in enumerate(model.views):
         rows = model.rows[k]
         xy, _ = view.project(model.tracks.points[model.tracks.point[rows]])
         np.testing.assert_allclose(xy, model.tracks.xy[rows], atol=1e-6)
-    assert shrunk(seen.model) == [] and shrunk(model) == names(3, 4, 5)
+    assert scale_drift(seen.model) == [] and scale_drift(model) == names(3, 4, 5)
     results = [true_matches(seen.model, a, b) for a in range(6) for b in range(a + 1, 6)]
     matches = {result.pair: result for result in results}
     given = VerifiedMatches(matches, matches.keys(), 0)
     found = check_model(model, seen.images, given, REFINEMENT)
-    assert found is not None and found.check.shrunk == names(3, 4, 5)
+    assert found is not None and found.check.scale_drift == names(3, 4, 5)
     assert found.check.verdict != "green" and found.check.doubted()
 
 
 def test_a_shrunk_part_alone_makes_a_verdict_amber():
-    check = dataclasses.replace(check_of("green"), shrunk=["checked0.jpg", "checked3.jpg"])
+    check = dataclasses.replace(check_of("green"), scale_drift=["checked0.jpg", "checked3.jpg"])
     assert check.verdict == "amber" and check.doubted()

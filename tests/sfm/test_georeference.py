@@ -18,7 +18,7 @@ from jaxsfm.sfm.georeference.georeference import (
     triangulated,
     views_by_name,
 )
-from jaxsfm.sfm.georeference.placement import Placement
+from jaxsfm.sfm.georeference.model_georeference import ModelGeoreference
 from jaxsfm.sfm.georeference.robust_similarity import Anchors, robust_similarity
 
 DRAWS = 50
@@ -36,7 +36,7 @@ def measured(centres, **changes) -> MeasuredPositions:
     return dataclasses.replace(made, **changes)
 
 
-def moved(flown: Flight, given: MeasuredPositions) -> Placement:
+def moved(flown: Flight, given: MeasuredPositions) -> ModelGeoreference:
     (found,) = move_models([flown.model], given).models
     return found
 

@@ -22,31 +22,31 @@ from jaxsfm.sfm.limits import RegisterLimits
 from jaxsfm.sfm.mapped_stage import MatchedPhotos, StageCache, VerificationFigures
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refine.weak_views import RegistrationAttempt
 from jaxsfm.sfm.refined_stage import Reconstructed
 from jaxsfm.sfm.register import lost as module
 from jaxsfm.sfm.register.grow import ExtendedModels
 from jaxsfm.sfm.register.locate_view import Localization
 from jaxsfm.sfm.register.lost import MatchLost, register_lost
-from jaxsfm.sfm.settled_stage import SettledModels
+from jaxsfm.sfm.selected_stage import SelectedModels
 from jaxsfm.sfm.view_graph import Verdict
 
 LOST = NAMES[3]
 OUT = taken_out(LOST)
-REFINED = RefinementFigures(passes=[], placed=[])
-TAKEN_OUT = RefinementFigures(passes=[], placed=[OUT])
+REFINED = RefinementFigures(passes=[], registrations=[])
+TAKEN_OUT = RefinementFigures(passes=[], registrations=[OUT])
 
 
 class Run(NamedTuple):
     """A run of the room after its refinement."""
 
     given: MatchedPhotos
-    settled: SettledModels
+    selected: SelectedModels
     made: Reconstructed
     kept: StageCache
 
     def registered(self, match_lost: MatchLost | None = None) -> Reconstructed:
-        return register_lost(self.given, self.settled, self.made, self.kept, match_lost)
+        return register_lost(self.given, self.selected, self.made, self.kept, match_lost)
 
 
 @pytest.fixture
@@ -58,16 +58,16 @@ def run(rendered, tmp_path) -> Callable[..., Run]:
         false: Collection[Pair] = (),
     ) -> Run:
         given = room_photos(tmp_path, rendered, all_matches(rendered), photos=photos)
-        untrusted = Verdict(trusted=False, strength=0.0, rotation_error_deg=None, refuted=True)
+        untrusted = Verdict(trusted=False, edge_weight=0.0, rotation_error_deg=None, rejected=True)
         figures = MappingFigures(
             verdicts=dict.fromkeys(false, untrusted),
             attempts=[],
             checks=[check_of("green"), check_of("amber")][: len(models)],
         )
-        folder = tmp_path / "settled"
+        folder = tmp_path / "selected"
         folder.mkdir()
-        settled = SettledModels(figures, folder, "key")
-        write_database(settled.database, given.images, given.matches, given.cameras)
+        selected = SelectedModels(figures, folder, "key")
+        write_database(selected.database, given.images, given.matches, given.cameras)
         made = Reconstructed(
             verification=VerificationFigures(verified={}, angles={}),
             mapping=figures,
@@ -75,14 +75,14 @@ def run(rendered, tmp_path) -> Callable[..., Run]:
             alternative=[],
             refinement=refinement or [REFINED] * len(models),
         )
-        return Run(given, settled, made, StageCache(WorkFolder(tmp_path / "run", {}), "matches"))
+        return Run(given, selected, made, StageCache(WorkFolder(tmp_path / "run", {}), "matches"))
 
     return make
 
 
-def row_of(figures: RefinementFigures | None, name: str = LOST) -> Placement | None:
+def row_of(figures: RefinementFigures | None, name: str = LOST) -> RegistrationAttempt | None:
     assert figures is not None
-    return {row.name: row for row in figures.placed}.get(name)
+    return {row.name: row for row in figures.registrations}.get(name)
 
 
 def test_a_photo_that_was_taken_out_is_registered_where_it_shows_most_and_nothing_moves(
@@ -100,7 +100,7 @@ def test_a_photo_that_was_taken_out_is_registered_where_it_shows_most_and_nothin
         np.testing.assert_allclose(poses[name].centre, pose.centre, atol=1e-12)
         np.testing.assert_allclose(poses[name].rotation, pose.rotation, atol=1e-12)
     row = row_of(made.refinement[1])
-    assert row is not None and not row.registered and not row.doubt and row.octave_px == 1
+    assert row is not None and not row.registered and not row.reason and row.octave_px == 1
     assert [check and check.verdict for check in made.mapping.checks] == ["green", "amber"]
     assert given.made.models[1].num_reg_images() == 3  # what was given has not changed
 
@@ -124,7 +124,7 @@ def test_a_photo_of_another_place_gets_none_and_keeps_the_reason_it_had(
     made = given.registered()
     assert [fingerprint(each) for each in made.models] == [fingerprint(model)]
     row = row_of(made.refinement[0])
-    assert row is not None and row.held == held and bool(row.doubt) == (held is None)
+    assert row is not None and row.held == held and bool(row.reason) == (held is None)
 
 
 def test_pairs_that_were_found_to_be_false_say_nothing(rendered, run):
@@ -189,17 +189,17 @@ class FakeGrow:
         # One photo is left, and is registered by its matches at full size.
         ([["3.png"], ["4.png"]], ["full 4.png"]),
         # It needs closer looks.
-        ([["3.png"], [], ["4.png"]], ["full 4.png", "closer 4.png"]),
+        ([["3.png"], [], ["4.png"]], ["full 4.png", "further 4.png"]),
         # They do not help, and nothing new can be its partner.
-        ([["3.png"], [], []], ["full 4.png", "closer 4.png"]),
+        ([["3.png"], [], []], ["full 4.png", "further 4.png"]),
         # Without any new photo at first, further matches are made all the same.
         (
             [[], ["3.png"], [], []],
-            ["full 3.png 4.png", "full 4.png", "closer 4.png"],
+            ["full 3.png 4.png", "full 4.png", "further 4.png"],
         ),
         (
             [[], [], ["3.png"], []],
-            ["full 3.png 4.png", "closer 3.png 4.png", "closer 4.png"],
+            ["full 3.png 4.png", "further 3.png 4.png", "further 4.png"],
         ),
     ],
 )
@@ -208,10 +208,10 @@ def test_more_is_matched_only_while_photos_are_lost_and_a_new_one_was_registered
 ):
     told, grow = [], FakeGrow(rendered, *plan)
 
-    def match_lost(lost, placed, false, *, closer) -> Mapping[Pair, PairResult]:
-        assert not {*lost} & {*placed} and {*lost} | {*placed} == {*NAMES}
+    def match_lost(lost, registered, false, *, further) -> Mapping[Pair, PairResult]:
+        assert not {*lost} & {*registered} and {*lost} | {*registered} == {*NAMES}
         assert {*false} == {("0.png", "1.png")}
-        told.append(" ".join(["closer" if closer else "full", *sorted(lost)]))
+        told.append(" ".join(["further" if further else "full", *sorted(lost)]))
         return all_matches(rendered)
 
     monkeypatch.setattr(module, "grow", grow)
@@ -243,7 +243,7 @@ def test_a_camera_that_no_model_has_may_be_adjusted(rendered, run, monkeypatch, 
         return ExtendedModels(list(models), {}, {}, 1)
 
     given = run(model_with(rendered, [0, 1, 2, 4]))
-    cameras = dict(module.read_images(given.settled.database))
+    cameras = dict(module.read_images(given.selected.database))
     if not shared:
         image_id, camera = cameras[LOST]
         alone = pycolmap.Camera(camera.todict())
@@ -260,7 +260,7 @@ def test_where_no_more_matches_are_found_the_search_ends(rendered, run, monkeypa
     told: list[Any] = []
     monkeypatch.setattr(module, "grow", FakeGrow(rendered, []))
     given = run(model_with(rendered, [0, 1, 2]))
-    given.registered(lambda *_, closer: told.append(closer) or {})
+    given.registered(lambda *_, further: told.append(further) or {})
     assert told == [False, True]
 
 

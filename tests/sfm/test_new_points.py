@@ -125,7 +125,7 @@ def test_as_few_new_points_as_a_model_needs_are_aligned(rendered, monkeypatch, m
     arguments = half_known(rendered), {NEW}, all_matches(rendered), images_of(rendered)
     count = len(new_points(*arguments, refinement=None).points)
     assert not aligned
-    monkeypatch.setattr(triangulate, "MIN_POINTS", count + missing)
+    monkeypatch.setattr(triangulate, "MIN_NEW_POINTS", count + missing)
     new_points(*arguments, refinement=Refinement())
     assert bool(aligned) == (missing == 0)
 
@@ -150,7 +150,7 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
         images_of(rendered),
         refinement=Refinement(),
     )
-    assert [*grown.placed] == [NEW, "4.png"] and grown.rounds == 2
+    assert [*grown.registered] == [NEW, "4.png"] and grown.rounds == 2
     (model,) = grown.models
     points = model.tracks.points
     np.testing.assert_array_equal(points[: len(tracks.points)], tracks.points)
@@ -161,7 +161,7 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_a_view_gets_its_place_in_the_model_of_which_it_shows_most_points(rendered, swapped):
-    """It could be placed in the model of fewer points, too, which stays as it is."""
+    """It could be registered in the model of fewer points, too, which stays as it is."""
     models = [of_three_views(rendered, every=2), of_three_views(rendered)]
     every = {view.name: view for view in rendered.views}
     order = [1, 0] if swapped else [0, 1]
@@ -176,9 +176,9 @@ def test_a_view_gets_its_place_in_the_model_of_which_it_shows_most_points(render
             refinement=Refinement(),
         )
 
-    assert grown(models[:1]).placed == {NEW: 0}
+    assert grown(models[:1]).registered == {NEW: 0}
     both = grown([models[k] for k in order])
-    assert both.placed == {NEW: order.index(1)}
+    assert both.registered == {NEW: order.index(1)}
     assert both.models[order.index(0)] is models[0]
     assert len(both.models[order.index(1)].views) == 4
     assert both.located[NEW].agreed > grown(models[:1]).located[NEW].agreed
@@ -204,6 +204,6 @@ def test_a_view_that_too_few_points_hold_is_not_placed(rendered, monkeypatch, mi
     assert points is not None
     monkeypatch.setattr(grow_module, "MIN_COUNT", len(points.rows) + missing)
     found = grown()
-    assert bool(found.placed) == (missing == 0)
+    assert bool(found.registered) == (missing == 0)
     why = found.located[NEW].why
     assert why is None if not missing else f"only {len(points.rows)} of them hold it" in (why or "")

@@ -190,5 +190,5 @@ def test_without_octaves_keypoints_stay_where_they_were():
 
 def test_alignment_is_no_part_of_what_a_stored_match_depends_on():
     config = preset("default")
-    for setting in ("aligned_octaves", "closer_looks"):
+    for setting in ("aligned_octaves", "max_rectified_planes"):
         assert config.matching() == dataclasses.replace(config, **{setting: 0}).matching()

@@ -14,10 +14,10 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.refine import octave_pose, plane_geometry, pose_search
-from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, AlignedPoints, FixedStructure
+from jaxsfm.sfm.refine.fixed_structure import NO_MATCHES, AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.octave_pose import OctavePose, PoseHypothesis, follow, trusted
 from jaxsfm.sfm.refine.pose_search import MIN_PATCHES, search
-from jaxsfm.sfm.refine.weak_views import place_weak_views
+from jaxsfm.sfm.refine.weak_views import register_weak_views
 from jaxsfm.sfm.register import locate_view
 from jaxsfm.sfm.register.locate_view import Localization, locate
 
@@ -96,15 +96,15 @@ def test_a_pose_far_from_where_anything_agrees_is_not_trusted(rendered, degrees,
 
 def test_what_a_descent_found_is_forgotten_when_a_pose_climbs_away(rendered, monkeypatch):
     view = rendered.views[NIGHT]
-    stale = _octave(view, 1, doubt_px=0.1)
+    stale = _octave(view, 1, uncertainty_px=0.1)
     pose = PoseHypothesis(view=view, own_camera=False, octaves={1: stale}, share=0.9)
     counts = {0: 31, 1: 35}  # of the pose itself, and of the first one beside it
 
-    def settle(tried, *_):
+    def converge(tried, *_):
         for k, each in enumerate(tried):
             each.agreed = counts.get(k, 0)
 
-    monkeypatch.setattr(pose_search, "settle", settle)
+    monkeypatch.setattr(pose_search, "converge", converge)
     monkeypatch.setattr(pose_search, "follow", lambda moved, *_: None)
     search([pose], structure_of(rendered))
     assert pose.octaves == {} and pose.share == 0.0 and pose.view is not view
@@ -117,12 +117,12 @@ def test_a_pose_climbs_only_for_a_tenth_more_and_enough(rendered, monkeypatch, o
     pose = PoseHypothesis(view=rendered.views[NIGHT], own_camera=False)
     counts = [own, *[0] * 4, beside, 0, 0, 0]
 
-    def settle(tried, *_):
+    def converge(tried, *_):
         for each, count in zip(tried, counts, strict=True):
             each.agreed = count
         counts[:] = [99, *[0] * 8]  # the next step stays
 
-    monkeypatch.setattr(pose_search, "settle", settle)
+    monkeypatch.setattr(pose_search, "converge", converge)
     moved = pose_search._climb([pose], structure_of(rendered))
     assert bool(moved) is climbs
     # The fifth of eight directions is opposite to the first: the photo's middle moves to the left.
@@ -131,12 +131,14 @@ def test_a_pose_climbs_only_for_a_tenth_more_and_enough(rendered, monkeypatch, o
     assert np.median(way[:, 0]) == pytest.approx(-0.8 * side if climbs else 0, abs=0.1 * side)
 
 
-def _octave(view: View, px: int, *, doubt_px: float, patches: int = MIN_PATCHES) -> OctavePose:
+def _octave(
+    view: View, px: int, *, uncertainty_px: float, patches: int = MIN_PATCHES
+) -> OctavePose:
     """A pose at which 40 of 100 points agree."""
     offsets = np.random.default_rng(0).uniform(-1, 1, (100, 3))
     could = view.centre + 5 * view.rotation[2] + offsets
     seen = AlignedPoints(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 2)), could)
-    return OctavePose(view, px, seen, 40, 1.0, doubt_px, patches)
+    return OctavePose(view, px, seen, 40, 1.0, uncertainty_px, patches)
 
 
 def _shown(count: int, could: int = 100) -> SimpleNamespace:
@@ -174,7 +176,7 @@ def test_a_pose_stands_out_with_five_times_what_is_beside_it_in_enough_patches(
     rendered, monkeypatch, beside, could, patches, right
 ):
     view = rendered.views[NIGHT]
-    one = _octave(view, 2, doubt_px=9.0, patches=patches)
+    one = _octave(view, 2, uncertainty_px=9.0, patches=patches)
     pose = _hypothesis(view, one)
     shown = [_shown(0), _shown(0), _shown(beside, could), _shown(0)]
     _compared(monkeypatch, rendered, [pose], lambda k, _: shown[k])
@@ -182,7 +184,7 @@ def test_a_pose_stands_out_with_five_times_what_is_beside_it_in_enough_patches(
 
 
 def test_a_pose_of_which_nothing_can_be_said_beside_it_does_not_stand_out(rendered, monkeypatch):
-    pose = _hypothesis(rendered.views[NIGHT], _octave(rendered.views[NIGHT], 2, doubt_px=0.1))
+    pose = _hypothesis(rendered.views[NIGHT], _octave(rendered.views[NIGHT], 2, uncertainty_px=0.1))
     _compared(monkeypatch, rendered, [pose], lambda *_: _shown(0, 49))
     assert pose.searched and pose.stands_out is None
 
@@ -196,7 +198,7 @@ def test_poses_beside_are_turned_by_two_patches_to_four_sides(rendered, monkeypa
         return [(each, _shown(0)) for each in views]
 
     monkeypatch.setattr(FixedStructure, "shown_from", shown_from)
-    pose = _hypothesis(view, _octave(view, 2, doubt_px=0.1))
+    pose = _hypothesis(view, _octave(view, 2, uncertainty_px=0.1))
     pose_search._compare([pose], structure_of(rendered))
     np.testing.assert_allclose(ways, [[60, 0], [-60, 0], [0, 60], [0, -60]], atol=2)
 
@@ -217,7 +219,7 @@ def test_the_coarsest_octave_stands_out_and_of_those_that_do_the_surest_counts(
     rendered, monkeypatch, beside, best
 ):
     view = rendered.views[NIGHT]
-    octaves = [_octave(view, px, doubt_px=d) for px, d in ((4, 1.5), (2, 1.2), (1, 0.9))]
+    octaves = [_octave(view, px, uncertainty_px=d) for px, d in ((4, 1.5), (2, 1.2), (1, 0.9))]
     for order in (octaves, octaves[::-1]):
         pose = _hypothesis(view, *order)
         _compared(monkeypatch, rendered, [pose], lambda _, px: _shown(beside.get(px, 0)), 3)
@@ -230,7 +232,7 @@ def test_an_octave_that_gives_another_place_does_not_count(rendered, monkeypatch
     """Off by more than a patch's side of 2 x 15 pixels."""
     view = rendered.views[NIGHT]
     away = pose_search._turned(view, np.asarray([px, 0.0]))
-    coarse, other = _octave(view, 2, doubt_px=1.5), _octave(away, 1, doubt_px=0.1)
+    coarse, other = _octave(view, 2, uncertainty_px=1.5), _octave(away, 1, uncertainty_px=0.1)
     pose = _hypothesis(view, coarse, other)
     _compared(monkeypatch, rendered, [pose], lambda *_: _shown(0))
     assert pose.stands_out is (other if same else coarse)
@@ -238,7 +240,7 @@ def test_an_octave_that_gives_another_place_does_not_count(rendered, monkeypatch
 
 def test_a_pose_is_judged_by_itself(rendered, monkeypatch):
     view = rendered.views[NIGHT]
-    one = _octave(view, 2, doubt_px=0.1)
+    one = _octave(view, 2, uncertainty_px=0.1)
     for first in (True, False):
         good, bad = _hypothesis(view, one), _hypothesis(view, one)
         poses = [good, bad] if first else [bad, good]
@@ -250,14 +252,14 @@ def test_a_pose_is_judged_by_itself(rendered, monkeypatch):
 def test_a_climb_has_four_steps_in_eight_directions(rendered, monkeypatch):
     tried = []
 
-    def settle(poses, *_):
+    def converge(poses, *_):
         tried.append([each.view for each in poses])
         for k, each in enumerate(poses):
             each.agreed = (30 * 2 ** len(tried)) * (
                 k == 3
             )  # the third direction is better each time
 
-    monkeypatch.setattr(pose_search, "settle", settle)
+    monkeypatch.setattr(pose_search, "converge", converge)
     view = rendered.views[NIGHT]
     pose = PoseHypothesis(view=view, own_camera=False)
     assert pose_search._climb([pose], structure_of(rendered)) == [pose]
@@ -272,7 +274,9 @@ def test_a_climb_has_four_steps_in_eight_directions(rendered, monkeypatch):
 def test_small_photos_are_not_searched_around(rendered):
     """At an eighth of their size there is no room for twenty patches."""
     view = rendered.views[NIGHT]
-    pose = PoseHypothesis(view=view, own_camera=False, octaves={1: _octave(view, 1, doubt_px=0.1)})
+    pose = PoseHypothesis(
+        view=view, own_camera=False, octaves={1: _octave(view, 1, uncertainty_px=0.1)}
+    )
     search([pose], structure_of(rendered, Refinement(weak_octaves=4)))
     assert not pose.searched
     for width, has_room in ((1200, True), (1199, False)):  # forty patches of 120 x 120 pixels
@@ -282,12 +286,12 @@ def test_small_photos_are_not_searched_around(rendered):
 
 def test_after_a_search_a_pose_has_to_stand_out(rendered):
     view = rendered.views[NIGHT]
-    sure = _octave(view, 1, doubt_px=0.1)
+    sure = _octave(view, 1, uncertainty_px=0.1)
     pose = PoseHypothesis(view=view, own_camera=False, octaves={1: sure}, share=0.9)
     assert trusted(pose) is sure
     assert trusted(dataclasses.replace(pose, searched=True)) is None
-    for doubt_px, right in ((2.0, True), (2.01, False)):
-        found = _octave(view, 2, doubt_px=doubt_px)
+    for uncertainty_px, right in ((2.0, True), (2.01, False)):
+        found = _octave(view, 2, uncertainty_px=uncertainty_px)
         after = dataclasses.replace(pose, searched=True, stands_out=found, share=0.01)
         assert trusted(after) is (found if right else None)
 
@@ -298,13 +302,13 @@ def test_the_refinement_searches_around_views_that_it_cannot_place(rendered, muc
     whole = exact_model(scene)
     views = list(whole.views)
     views[NIGHT] = turned(views[NIGHT], 2.0)
-    model, (placed,) = place_weak_views(
+    model, (placed,) = register_weak_views(
         whole.with_views(views),
         [NIGHT_NAME],
         images_of(scene),
         refinement=REFINEMENT,
         refine_intrinsics=False,
-        evidence=NO_EVIDENCE,
+        resection=NO_MATCHES,
     )
     assert placed.octave_px is not None and off_px(model.views[NIGHT], scene) < 0.5
 

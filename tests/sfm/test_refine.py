@@ -126,7 +126,9 @@ def test_a_view_that_is_weak_in_one_pass_is_placed(rendered, monkeypatch):
     monkeypatch.setattr(module, "_gather", weak_once)
     _, figures = refine(noisy_model(rendered, 0.7), rendered)
     assert [f.weak_views for f in figures.passes] == [["2.png"], []]
-    assert [p.name for p in figures.placed] == ["2.png"] and figures.placed[0].octave_px
+    assert [p.name for p in figures.registrations] == ["2.png"] and figures.registrations[
+        0
+    ].octave_px
 
 
 def test_photos_that_agree_in_nothing_leave_the_model_as_it_was(rendered):

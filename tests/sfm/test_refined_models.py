@@ -12,14 +12,14 @@ from jaxsfm.colmap.reconstruction import part_of, registered
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.sfm import refined_models as module
-from jaxsfm.sfm.refine.fixed_structure import Evidence
+from jaxsfm.sfm.refine.fixed_structure import ResectionMatches
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refined_models import Believed, RefinedModels, refine_models
 
 NAMES = [f"{k}.png" for k in range(5)]
 DATABASE, OPTIONS = Path("d.db"), MapOptions(seed=3)
-TAKEN_OUT = RefinementFigures(passes=[], placed=[taken_out(NAMES[4])])
-STAYS = RefinementFigures(passes=[], placed=[])
+TAKEN_OUT = RefinementFigures(passes=[], registrations=[taken_out(NAMES[4])])
+STAYS = RefinementFigures(passes=[], registrations=[])
 
 
 class FakePhotos:
@@ -46,8 +46,10 @@ def refined(rendered, monkeypatch):
     def run(*, gone: bool = False, options: MapOptions = OPTIONS) -> tuple[RefinedModels, list]:
         given, coloured = [], []
 
-        def refine_model(model, read, settings, *, evidence, with_all_points, **_):
-            assert with_all_points("a model") == "whole" and evidence == Evidence({}, options.seed)
+        def refine_model(model, read, settings, *, resection, with_all_points, **_):
+            assert with_all_points("a model") == "whole" and resection == ResectionMatches(
+                {}, options.seed
+            )
             given.append(model)
             if gone:
                 raise ImageError("2.png: cannot be read")

@@ -63,7 +63,7 @@ def displaced(result: PairResult) -> PairResult:
 def test_a_view_gets_a_place_that_nothing_contradicts():
     seen = wall_with_poster(1)
     found = grown(seen)
-    assert found.placed == {NAMES[NEW]: 0} and found.located[NAMES[NEW]].why is None
+    assert found.registered == {NAMES[NEW]: 0} and found.located[NAMES[NEW]].why is None
     (model,) = found.models
     assert [view.name for view in model.views] == NAMES
     off = np.linalg.norm(model.views[NEW].centre - seen.model.views[NEW].centre)
@@ -71,7 +71,7 @@ def test_a_view_gets_a_place_that_nothing_contradicts():
 
 
 def refused(found: ExtendedModels, why: str) -> None:
-    assert found.placed == {}
+    assert found.registered == {}
     located, (model,) = found.located[NAMES[NEW]], found.models
     assert why in (located.why or "") and located.candidates > 30
     assert not located.trusted and located.points is None and located.octave_px is None
@@ -92,21 +92,21 @@ def test_photos_that_were_not_taken_next_contradict_no_place():
     """Matches of photos that are far apart are false more often than places are."""
     seen = wall_with_poster(1)
     away = displaced(true_matches(seen.model, 0, NEW))
-    assert grown(seen, away).placed == {NAMES[NEW]: 0}
+    assert grown(seen, away).registered == {NAMES[NEW]: 0}
 
 
-@pytest.mark.parametrize(("against", "placed"), [({}, [NAMES[NEW]]), ({NAMES[NEW]: "why"}, [])])
+@pytest.mark.parametrize(("against", "registered"), [({}, [NAMES[NEW]]), ({NAMES[NEW]: "why"}, [])])
 def test_a_view_is_asked_about_once_and_a_refused_one_leaves_the_model_as_it_was(
-    monkeypatch, against, placed
+    monkeypatch, against, registered
 ):
     asked, seen = [], wall_with_poster(1)
-    monkeypatch.setattr(module, "doubts", lambda *given: asked.append(given) or against)
+    monkeypatch.setattr(module, "objections", lambda *given: asked.append(given) or against)
     found = grown(seen)
-    assert [*found.placed] == placed and found.rounds == 1 and len(asked) == 1
+    assert [*found.registered] == registered and found.rounds == 1 and len(asked) == 1
     model, _, _, details, following, _ = asked[0]
     assert [view.name for view in model.views] == NAMES and details == {NAMES[NEW]: True}
     assert set(following) == {(NAMES[NEW - 1], NAMES[NEW])}
     known = seen.model.part(set(NAMES[:NEW]))[0].tracks
-    if not placed:
+    if not registered:
         np.testing.assert_array_equal(found.models[0].tracks.xy, known.xy)
-    assert (len(found.models[0].tracks.xy) > len(known.xy)) == bool(placed)
+    assert (len(found.models[0].tracks.xy) > len(known.xy)) == bool(registered)

@@ -21,7 +21,7 @@ from jaxsfm.config import Config
 from jaxsfm.io.pairs import exhaustive_pairs
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.options import Step
-from jaxsfm.sfm import mapped_stage, mapping, refined_stage, road, settled_stage
+from jaxsfm.sfm import mapped_stage, mapping, refined_stage, road, selected_stage
 from jaxsfm.sfm.check.check_model import Checked
 from jaxsfm.sfm.checker import Checker
 from jaxsfm.sfm.mapped_stage import StageCache
@@ -30,7 +30,7 @@ from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refined_models import RefinedModels
 from jaxsfm.sfm.refined_stage import Reconstructed
 from jaxsfm.sfm.road import Watch, walk
-from jaxsfm.sfm.settled_stage import Parts
+from jaxsfm.sfm.selected_stage import SplitModels
 
 PASS = PassFigures(
     accepted=True,
@@ -42,7 +42,7 @@ PASS = PassFigures(
     points=40,
     reprojection_error_px=0.25,
 )
-REFINED = RefinementFigures(passes=[PASS], placed=[])
+REFINED = RefinementFigures(passes=[PASS], registrations=[])
 Views = Sequence[int]
 
 
@@ -68,7 +68,7 @@ class Walker:
         self.drafts: list[bool] = []
         """For each mapping, whether the mapper made a draft."""
         self.left: list[tuple[Views, Checked]] = []
-        self.second_places: Callable[[], Any] = lambda: None
+        self.find_pose_ambiguities: Callable[[], Any] = lambda: None
         self._now: tuple[Views, Checked] = ((), right(()))
 
         def counted(owner: Any, name: str) -> None:
@@ -83,8 +83,8 @@ class Walker:
         counted(mapped_stage, "verify")
         monkeypatch.setattr(mapping, "run_mapper", self._run_mapper)
         monkeypatch.setattr(Checker, "check", lambda *_: [self._now[1]] if self._now[0] else [])
-        monkeypatch.setattr(Checker, "with_second_places", self._with_second_places)
-        monkeypatch.setattr(settled_stage, "told_apart", self._told_apart)
+        monkeypatch.setattr(Checker, "with_pose_ambiguities", self._with_pose_ambiguities)
+        monkeypatch.setattr(selected_stage, "split_inconsistent", self._split_groups)
         monkeypatch.setattr(refined_stage, "refine_models", self._refine_models)
         monkeypatch.setattr(road, "register_lost", self._register_lost)
 
@@ -112,21 +112,21 @@ class Walker:
             on_image()
         return [model_with(self._scene, self._now[0])] if self._now[0] else []
 
-    def _with_second_places(self, model, done, check):
+    def _with_pose_ambiguities(self, model, done, check):
         self.asked.append("second places")
-        self.second_places()
+        self.find_pose_ambiguities()
         return check
 
-    def _told_apart(self, models, checks, *_) -> Parts:
+    def _split_groups(self, models, checks, *_) -> SplitModels:
         self.asked.append("split")
-        return Parts(models, checks, checks[0].parts)
+        return SplitModels(models, checks, checks[0].components)
 
     def _refine_models(self, models, *_, on_pass, **__) -> RefinedModels:
         self.asked.append("refine")
         on_pass()
         return RefinedModels(models, [REFINED for _ in models], [*range(len(models))])
 
-    def _register_lost(self, given, settled, made, *_) -> Reconstructed:
+    def _register_lost(self, given, selected, made, *_) -> Reconstructed:
         self.asked.append("register")
         return made
 
@@ -190,9 +190,9 @@ EVERY = ["verify", "map", "map", "split", "second places", "refine", "register"]
     ("step", "left"),
     [
         (None, EVERY),
-        ("map-again", ["verify", "map", "split", "second places", "refine", "register"]),
+        ("remap", ["verify", "map", "split", "second places", "refine", "register"]),
         ("split", ["verify", "map", "map", "second places", "refine", "register"]),
-        ("second-places", ["verify", "map", "map", "split", "refine", "register"]),
+        ("pose-ambiguity", ["verify", "map", "map", "split", "refine", "register"]),
         ("refine", EVERY[:-1]),
         ("register", EVERY[:-1]),
     ],
@@ -214,7 +214,7 @@ def test_stages_that_exist_are_not_made_again(walker):
     assert walker.asked == ["register"]  # it has a stage of its own
     assert [*map(fingerprint, two.models)] == [*map(fingerprint, one.models)]
     assert (two.mapping, two.refinement) == (one.mapping, one.refinement)
-    walker.walk(without=["second-places"])
+    walker.walk(without=["pose-ambiguity"])
     assert walker.asked == ["refine", "register"]
 
 
@@ -232,15 +232,14 @@ def test_a_question_about_second_places_that_fails_leaves_the_model_and_one_line
     def fails() -> None:
         raise ArithmeticError("no surface")
 
-    walker.second_places = fails
+    walker.find_pose_ambiguities = fails
     with caplog.at_level(logging.WARNING):
         made = walker.walk(ALL)
     assert registered(made.models[0]) == {*NAMES}
     (check,) = made.mapping.checks
-    assert check is not None and check.verdict == "green" and not check.other_places
+    assert check is not None and check.verdict == "green" and not check.pose_ambiguities
     assert [record.getMessage() for record in caplog.records] == [
-        "it is not known whether photos fit into the model in a second place: no surface "
-        "(ArithmeticError)"
+        "it is not known whether the poses of photos are ambiguous: no surface (ArithmeticError)"
     ]
 
 

@@ -11,7 +11,7 @@ from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine.fixed_structure import FixedStructure
-from jaxsfm.sfm.refine.pose_doubt import PoseDoubt
+from jaxsfm.sfm.refine.pose_uncertainty import PoseUncertainty
 from jaxsfm.sfm.register import locate_view
 from jaxsfm.sfm.register.locate_view import Localization, locate
 
@@ -63,9 +63,9 @@ def test_doubt_counts_patches_of_the_octave_that_the_photo_was_aligned_in(render
 
     def doubt(view, points, xy, error_px, side, *, focal):
         sides.append(side)
-        return PoseDoubt(0.1, 0.2)
+        return PoseUncertainty(0.1, 0.2)
 
-    monkeypatch.setattr(locate_view, "pose_doubt", doubt)
+    monkeypatch.setattr(locate_view, "pose_uncertainty", doubt)
     located = found(rendered)
     assert located.octave_px
     assert sides == [located.octave_px * (2 * Refinement().radius + 1)]
@@ -74,7 +74,10 @@ def test_doubt_counts_patches_of_the_octave_that_the_photo_was_aligned_in(render
 
 @pytest.mark.parametrize(
     ("on_surface", "why"),
-    [(locate_view.MIN_POINTS - 1, "a pose needs"), (locate_view.MIN_POINTS, "no pose agrees")],
+    [
+        (locate_view.MIN_RESECTION_POINTS - 1, "a pose needs"),
+        (locate_view.MIN_RESECTION_POINTS, "no pose agrees"),
+    ],
 )
 def test_a_photo_without_a_pose_is_told_what_was_missing(rendered, on_surface, why):
     matches = night_matches(rendered, right=6, wrong=18).matches
@@ -86,13 +89,13 @@ def test_a_photo_without_a_pose_is_told_what_was_missing(rendered, on_surface, w
     ("best", "share", "why"),
     [
         (0.5, 0.001, "at most 0.1 % of the points that it would show there (needed: 5 %)"),
-        (2.5, 0.9, "leaves 2.50 px of doubt (at most 1)"),
+        (2.5, 0.9, "leaves 2.50 px of uncertainty (at most 1)"),
     ],
 )
 def test_a_small_photos_pose_that_is_not_trusted_says_what_was_missing(best, share, why):
     """It is not searched around."""
     pose = SimpleNamespace(
-        best=SimpleNamespace(doubt_px=best), stands_out=None, searched=False, share=share
+        best=SimpleNamespace(uncertainty_px=best), stands_out=None, searched=False, share=share
     )
     assert why in locate_view._doubtful(pose, 12, 30)  # pyright: ignore[reportArgumentType]
 
@@ -106,12 +109,12 @@ def test_a_small_photos_pose_that_is_not_trusted_says_what_was_missing(best, sha
             None,
             "does not stand out (needed: 5 times as many points as beside it, in 20 patches)",
         ),
-        (0.5, 2.5, "leaves 2.50 px of doubt (at most 2)"),
+        (0.5, 2.5, "leaves 2.50 px of uncertainty (at most 2)"),
         (0.5, 1.5, "alignment finds another pose, which most of these matches contradict"),
     ],
 )
 def test_a_pose_that_is_not_trusted_says_what_was_missing(best, stands_out, why):
-    first, second = (each and SimpleNamespace(doubt_px=each) for each in (best, stands_out))
+    first, second = (each and SimpleNamespace(uncertainty_px=each) for each in (best, stands_out))
     pose = SimpleNamespace(
         best=first, stands_out=second, searched=True, agreed=3, candidates=40, share=0.0
     )
@@ -126,8 +129,8 @@ def test_an_unknown_focal_length_is_found_and_leaves_more_doubt(rendered):
     assert sure.centre_error and unsure.centre_error
     assert sure.centre_error < unsure.centre_error < 0.05
     assert errors(unsure, rendered)[0] < 5 * unsure.centre_error
-    assert sure.doubt_px and unsure.doubt_px
-    assert 1.05 * sure.doubt_px < unsure.doubt_px
+    assert sure.uncertainty_px and unsure.uncertainty_px
+    assert 1.05 * sure.uncertainty_px < unsure.uncertainty_px
 
 
 def test_a_pose_that_the_photo_does_not_show_is_not_trusted(rendered):

@@ -18,7 +18,7 @@ from jaxsfm.sfm.mapped_stage import VerificationFigures
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.one_pass import PassFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refine.weak_views import RegistrationAttempt
 from jaxsfm.sfm.refined_stage import RefinedFigures
 from jaxsfm.sfm.view_graph import Verdict
 
@@ -32,10 +32,10 @@ texts = st.text(max_size=12)
 verdicts = st.builds(
     Verdict,
     trusted=st.booleans(),
-    strength=numbers,
+    edge_weight=numbers,
     rotation_error_deg=st.none() | numbers,
     reason=texts,
-    refuted=st.booleans(),
+    rejected=st.booleans(),
 )
 attempts = st.builds(
     Attempt,
@@ -47,7 +47,7 @@ two = dataclasses.replace(
     check_of("green"),
     alternative=OTHER,
     apart=[NAMES[:2]],
-    told_apart=[NAMES[:3]],
+    split_groups=[NAMES[:3]],
 )
 checks = st.none() | st.sampled_from([check_of("green"), check_of("amber"), check_of("red"), two])
 mappings = st.builds(
@@ -72,16 +72,16 @@ def test_figures_of_mapping_survive_a_file(tmp_path_factory, figures):
 
 
 def test_checks_of_a_mapping_survive_a_file(tmp_path):
-    refuted = dict(zip(PAIRS, check_of("red").contradictions, strict=False))
+    rejected = dict(zip(PAIRS, check_of("red").contradictions, strict=False))
     found = Checked(
         check=check_of("red"),
-        refuted=refuted,
-        suspected={},
+        rejected=rejected,
+        rejection_candidates={},
         explained={PAIRS[1]},
         against={PAIRS[2], PAIRS[0]},
         parts=[NAMES[:2], NAMES[2:]],
     )
-    assert refuted
+    assert rejected
     assert written_and_read(tmp_path, [found, None], list[Checked | None]) == [found, None]
 
 
@@ -104,15 +104,17 @@ def test_figures_of_refinement_survive_a_file_with_the_order_of_the_models(tmp_p
         points=40,
         reprojection_error_px=0.25,
     )
-    placed = Placement(
+    placed = RegistrationAttempt(
         name=NAMES[1], registered=True, octave_px=4, candidates=7, agreed=5, error_px=1.5, held=None
     )
     models = [
-        RefinementFigures(passes=[one, dataclasses.replace(one, accepted=False)], placed=[placed]),
+        RefinementFigures(
+            passes=[one, dataclasses.replace(one, accepted=False)], registrations=[placed]
+        ),
         None,
         RefinementFigures(
             passes=[],
-            placed=[],
+            registrations=[],
             camera=OtherCamera(model="PINHOLE", params=[9.0] * 4, distance_px=4.5, halves_px=0.5),
         ),
     ]

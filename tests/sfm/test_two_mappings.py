@@ -19,7 +19,7 @@ from jaxsfm.sfm.check.model_check import Contradiction
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.mapping import MappedModels, Mapper, MappingFigures, Trust
-from jaxsfm.sfm.view_graph import Verdict, strengths
+from jaxsfm.sfm.view_graph import Verdict, edge_weights
 
 LETTERS = [*"abcdefghij"]
 TURNED = np.diag([-1.0, 1.0, -1.0])
@@ -124,11 +124,13 @@ def test_of_two_mappings_that_are_equally_good_none_is_better():
 
 
 def test_pairs_whose_own_photos_contradict_each_other_are_rejected_before_suspected_ones():
-    opposed, suspected = ("a", "b"), ("c", "d")
-    one = whole("ab")._replace(refuted={opposed: contradiction(opposed)})
-    two = whole("cd")._replace(suspected={suspected: contradiction(suspected)})
+    opposed, rejection_candidates = ("a", "b"), ("c", "d")
+    one = whole("ab")._replace(rejected={opposed: contradiction(opposed)})
+    two = whole("cd")._replace(
+        rejection_candidates={rejection_candidates: contradiction(rejection_candidates)}
+    )
     assert [*mapped("ab", "cd", checks=[one, two]).rejected()] == [opposed]
-    assert [*mapped("ab", "cd", checks=[whole("ab"), two]).rejected()] == [suspected]
+    assert [*mapped("ab", "cd", checks=[whole("ab"), two]).rejected()] == [rejection_candidates]
     assert mapped("ab", "cd").rejected() == {}
 
 
@@ -141,24 +143,24 @@ def test_without_the_view_graph_the_first_mapping_trusts_all_pairs():
 
 def test_there_is_no_second_mapping_without_rejected_pairs_and_without_numbered_names():
     given = views(dict.fromkeys(chain(LETTERS), 500))
-    assert mapper(given).trust_again(mapped(LETTERS, checks=[whole(LETTERS)])) is None
+    assert mapper(given).trust_for_remapping(mapped(LETTERS, checks=[whole(LETTERS)])) is None
 
 
-def test_rejected_pairs_are_refuted_in_the_second_mapping_and_say_why():
+def test_rejected_pairs_are_rejected_in_the_second_mapping_and_say_why():
     false = ("a", "c")
     given = views(dict.fromkeys([*chain("abcde"), false], 500))
-    check = whole("abcde")._replace(refuted={false: contradiction(false, 42)})
-    trust = mapper(given).trust_again(mapped("abcde", checks=[check]))
+    check = whole("abcde")._replace(rejected={false: contradiction(false, 42)})
+    trust = mapper(given).trust_for_remapping(mapped("abcde", checks=[check]))
     assert trust is not None and trust.basis == "pairs" and trust.dropped() == {false}
     verdict = trust.verdicts[false]
-    assert verdict.refuted and not verdict.trusted and "of 100 points" in verdict.reason
-    assert verdict.strength == 0
+    assert verdict.rejected and not verdict.trusted and "of 100 points" in verdict.reason
+    assert verdict.edge_weight == 0
     assert "42 are missing" in verdict.reason
-    assert not any(each.refuted for pair, each in trust.verdicts.items() if pair != false)
+    assert not any(each.rejected for pair, each in trust.verdicts.items() if pair != false)
 
 
 @pytest.mark.parametrize(
-    ("trusted", "refuted", "basis", "misleads"),
+    ("trusted", "rejected", "basis", "misleads"),
     [
         (False, True, "pairs", True),
         (False, False, "pairs", False),  # it may only be weak
@@ -167,8 +169,8 @@ def test_rejected_pairs_are_refuted_in_the_second_mapping_and_say_why():
         (True, True, "pairs", False),
     ],
 )
-def test_pairs_that_were_found_to_be_false_mislead(trusted, refuted, basis, misleads):
-    verdict = Verdict(trusted=trusted, refuted=refuted, strength=1.0, rotation_error_deg=None)
+def test_pairs_that_were_found_to_be_false_mislead(trusted, rejected, basis, misleads):
+    verdict = Verdict(trusted=trusted, rejected=rejected, edge_weight=1.0, rotation_error_deg=None)
     pair = ("a", "b")
     figures = MappingFigures(verdicts={pair: verdict}, attempts=[], checks=[], basis=basis)
     assert figures.misleading() == ({pair} if misleads else set())
@@ -178,9 +180,9 @@ def test_a_rejected_pair_has_no_vote_on_the_others():
     """The strongest pair says that b is turned by half a turn; the rest says that it is not."""
     false, right = ("a", "b"), [("a", "c"), ("b", "c")]
     given = views({false: 1000, **dict.fromkeys(right, 400)}, turned=[false])
-    check = whole("abc")._replace(refuted={false: contradiction(false)})
+    check = whole("abc")._replace(rejected={false: contradiction(false)})
     assert not mapper(given).trust_votes().dropped() & {false}
-    trust = mapper(given).trust_again(mapped("abc", checks=[check]))
+    trust = mapper(given).trust_for_remapping(mapped("abc", checks=[check]))
     assert trust is not None and trust.dropped() == {false}
 
 
@@ -201,16 +203,16 @@ def test_pairs_of_photos_that_follow_each_other_come_first_in_the_second_mapping
     false = ("0.jpg", "5.jpg")
     given = mapper(contested(NUMBERED, false))
     assert given.trust_votes().verdicts[false].trusted
-    trust = given.trust_again(mapped(NUMBERED, checks=[whole(NUMBERED)]))
+    trust = given.trust_for_remapping(mapped(NUMBERED, checks=[whole(NUMBERED)]))
     assert trust is not None and trust.basis == "order"
-    assert trust.dropped() == {false} and not trust.verdicts[false].refuted
+    assert trust.dropped() == {false} and not trust.verdicts[false].rejected
 
 
 def test_without_numbers_the_strongest_pairs_come_first_in_the_second_mapping():
     false, rejected = ("a", "f"), ("b", "d")
-    check = whole("abcdef")._replace(refuted={rejected: contradiction(rejected)})
+    check = whole("abcdef")._replace(rejected={rejected: contradiction(rejected)})
     given = mapper(contested([*"abcdef"], false) | views({rejected: 700}))
-    trust = given.trust_again(mapped("abcdef", checks=[check]))
+    trust = given.trust_for_remapping(mapped("abcdef", checks=[check]))
     assert trust is not None and trust.basis == "pairs"
     assert trust.dropped() == {rejected, ("a", "b"), ("a", "c")}
 
@@ -226,7 +228,7 @@ def test_the_mapper_makes_more_effort_if_more_than_a_tenth_is_left_out(registere
 
 def test_photos_that_no_trusted_pair_connects_call_for_no_effort():
     given = mapper(views(dict.fromkeys(chain(LETTERS), 500)))
-    dropped = Verdict(trusted=False, strength=0.0, rotation_error_deg=None)
+    dropped = Verdict(trusted=False, edge_weight=0.0, rotation_error_deg=None)
     trust = Trust(verdicts={("e", "f"): dropped})
     assert given.trust_thoroughly(mapped(LETTERS[:5], trust=trust)) is None
     assert given.trust_thoroughly(mapped(LETTERS[:5])) == Trust(thorough=True)
@@ -241,6 +243,6 @@ def test_weak_neighbours_say_nothing():
     """Where a photographer walks on to another place, two photos have hardly a match."""
     pairs = {**dict.fromkeys(chain(NUMBERED), 700), ("2.jpg", "3.jpg"): 20, ("0.jpg", "2.jpg"): 700}
     given = views(pairs)
-    strength = strengths({pair: view.geometry for pair, view in given.items()})
-    assert strength["2.jpg", "3.jpg"] < TRUST.strong < strength["1.jpg", "2.jpg"]
+    edge_weight = edge_weights({pair: view.geometry for pair, view in given.items()})
+    assert edge_weight["2.jpg", "3.jpg"] < TRUST.strong < edge_weight["1.jpg", "2.jpg"]
     assert mapper(given).following() == {*chain(NUMBERED)} - {("2.jpg", "3.jpg")}

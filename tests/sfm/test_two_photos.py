@@ -1,4 +1,4 @@
-"""Laws of two photos: evidence, views from one place, turns, and what closer looks bring."""
+"""Laws of two photos: significance, views from one place, turns, and what further passes bring."""
 
 import dataclasses
 import math
@@ -21,17 +21,17 @@ from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photos import PhotoView, read_view
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
-from jaxsfm.sfm.two_photos import further_looks, look, pair_looks
-from jaxsfm.sfm.two_photos.common_view import (
+from jaxsfm.sfm.two_photos import further_passes, matching_pass, pair_passes
+from jaxsfm.sfm.two_photos.further_passes import MOST_PROPOSALS, proposals
+from jaxsfm.sfm.two_photos.matching_pass import MatchingPass, moved
+from jaxsfm.sfm.two_photos.pair_passes import HALF_SURE, POWER, confidence, match_photos
+from jaxsfm.sfm.two_photos.rectification import (
     Located,
     affine_between,
-    common_views,
-    mapped,
+    rectified_views,
+    transformed,
     view_change,
 )
-from jaxsfm.sfm.two_photos.further_looks import MOST_PROPOSALS, proposals
-from jaxsfm.sfm.two_photos.look import Look, moved
-from jaxsfm.sfm.two_photos.pair_looks import HALF_SURE, POWER, confidence, match_photos
 
 
 def photo(size: tuple[int, int], orientation: int = 1) -> ImageFile:
@@ -52,32 +52,32 @@ def affine(rng: np.random.Generator, scale: float = 1.0) -> np.ndarray:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(5, 60), st.integers(60, 900), st.floats(1e-4, 0.3))
-def test_evidence_is_the_expected_number_of_such_planes_by_chance(members, candidates, chance):
+def test_significance_is_the_expected_number_of_such_planes_by_chance(members, candidates, chance):
     """Counted with whole numbers: n C(n, k) C(k, 4) p^(k - 4)."""
     ways = candidates * math.comb(candidates, members) * math.comb(members, 4)
     expected = -(math.log10(ways) + (members - 4) * math.log10(chance))
-    assert look.evidence_of_plane(members, candidates, chance) == pytest.approx(expected)
+    assert matching_pass.neg_log10_nfa(members, candidates, chance) == pytest.approx(expected)
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(20, 90), st.integers(200, 900), st.floats(1e-4, 1e-2))
-def test_evidence_grows_with_members_and_falls_with_what_was_tried(members, candidates, chance):
-    ours = look.evidence_of_plane(members, candidates, chance)
-    assert look.evidence_of_plane(members + 1, candidates, chance) > ours
-    assert look.evidence_of_plane(members, candidates, chance * 2) < ours
+def test_significance_grows_with_members_and_falls_with_what_was_tried(members, candidates, chance):
+    ours = matching_pass.neg_log10_nfa(members, candidates, chance)
+    assert matching_pass.neg_log10_nfa(members + 1, candidates, chance) > ours
+    assert matching_pass.neg_log10_nfa(members, candidates, chance * 2) < ours
     if members < candidates / 2:
-        assert look.evidence_of_plane(members, 2 * candidates, chance) < ours
+        assert matching_pass.neg_log10_nfa(members, 2 * candidates, chance) < ours
 
 
-def test_four_matches_are_no_evidence():
-    assert look.evidence_of_plane(4, 100, 1e-3) == -math.inf
-    assert look.total(np.asarray([-math.inf, look.BY_CHANCE, 0.0])) == 0
-    assert look.total(np.asarray([look.BY_CHANCE + 3, 2.0])) == 3
+def test_four_matches_are_no_significance():
+    assert matching_pass.neg_log10_nfa(4, 100, 1e-3) == -math.inf
+    assert matching_pass.total(np.asarray([-math.inf, matching_pass.BY_CHANCE, 0.0])) == 0
+    assert matching_pass.total(np.asarray([matching_pass.BY_CHANCE + 3, 2.0])) == 3
 
 
 def test_cells_of_an_enlarged_photo_are_counted_in_larger_cells():
     cells = np.arange(64)  # 8 x 8 fine cells are 4 x 4 coarse ones, and 2 x 2 of twice their size
-    assert [look._coarse_cells(cells, 8, times) for times in (1.0, 2.0)] == [16, 4]
+    assert [matching_pass._coarse_cells(cells, 8, times) for times in (1.0, 2.0)] == [16, 4]
 
 
 def test_confidence_grows_from_none_to_certainty():
@@ -85,7 +85,7 @@ def test_confidence_grows_from_none_to_certainty():
     assert values == sorted(values) and values[0] < 0.05 and values[-1] > 0.99
 
 
-def test_the_odds_of_a_pair_grow_with_a_power_of_its_evidence():
+def test_the_odds_of_a_pair_grow_with_a_power_of_its_significance():
     odds = [c / (1 - c) for c in map(confidence, (HALF_SURE, 2 * HALF_SURE, 8 * HALF_SURE))]
     assert odds == pytest.approx([1, 2**POWER, 8**POWER])
     assert confidence(633.0) == pytest.approx(0.9, abs=0.001)  # docs/decisions/hard-pairs.md
@@ -97,11 +97,11 @@ def test_an_affine_map_is_found_among_false_matches(seed, scale):
     rng = rng_of(seed)
     truth = affine(rng, scale)
     xy0 = rng.uniform(0, 500, (120, 2))
-    xy1 = mapped(truth, xy0)
+    xy1 = transformed(truth, xy0)
     xy1[:30] = rng.uniform(0, 500, (30, 2))
     found = affine_between(Located(xy0, xy1))
     assert found is not None
-    np.testing.assert_allclose(mapped(found, xy0), mapped(truth, xy0), atol=1.0)
+    np.testing.assert_allclose(transformed(found, xy0), transformed(truth, xy0), atol=1.0)
 
 
 @settings(max_examples=60, deadline=None)
@@ -126,7 +126,7 @@ def test_matches_that_determine_no_view_give_none():
     line = np.column_stack([np.arange(9.0), np.zeros(9)])
     mirrored = rng_of(0).uniform(0, 300, (40, 2))
     for xy0, xy1 in ((line[:2], line[:2]), (line, line), (mirrored, mirrored * [-1, 1])):
-        assert common_views(Located(xy0, xy1), photo((400, 300)), photo((400, 300))) is None
+        assert rectified_views(Located(xy0, xy1), photo((400, 300)), photo((400, 300))) is None
 
 
 @settings(max_examples=40, deadline=None)
@@ -135,10 +135,10 @@ def test_matching_points_lie_at_one_pixel_of_the_common_view(seed, scale):
     rng = rng_of(seed)
     truth = affine(rng, scale)
     xy0 = rng.uniform([100, 100], [300, 250], (60, 2))
-    both = Located(xy0, mapped(truth, xy0))
-    views = common_views(both, photo((800, 600)), photo((2000, 2000)), size=500)
+    both = Located(xy0, transformed(truth, xy0))
+    views = rectified_views(both, photo((800, 600)), photo((2000, 2000)), size=500)
     assume(views is not None)  # photo 1 may not show the points
-    at0, at1 = (mapped(view.matrix, xy) for view, xy in zip(views, both, strict=True))
+    at0, at1 = (transformed(view.matrix, xy) for view, xy in zip(views, both, strict=True))
     np.testing.assert_allclose(at0, at1, atol=1e-6)
     assert views[0].size == views[1].size and max(views[0].size) == 500
     frame = views[int(np.linalg.det(truth[:2, :2]) > 1)]
@@ -150,9 +150,9 @@ def test_matching_points_lie_at_one_pixel_of_the_common_view(seed, scale):
 def test_the_common_view_does_not_depend_on_the_order_of_the_photos(seed):
     rng = rng_of(seed)
     xy0 = rng.uniform([100, 100], [300, 250], (60, 2))
-    xy1 = mapped(affine(rng, 1.5), xy0)
+    xy1 = transformed(affine(rng, 1.5), xy0)
     a, b = photo((800, 600)), photo((900, 900))
-    one, other = common_views(Located(xy0, xy1), a, b), common_views(Located(xy1, xy0), b, a)
+    one, other = rectified_views(Located(xy0, xy1), a, b), rectified_views(Located(xy1, xy0), b, a)
     assume(one is not None and other is not None)
     assert one is not None and other is not None
     np.testing.assert_allclose(one[0].matrix, other[1].matrix, atol=1e-6)
@@ -201,7 +201,7 @@ def test_a_reduced_view_has_the_photos_means(pictures):
 
 @pytest.mark.parametrize("quarters", range(4))
 def test_a_turned_view_is_the_photo_after_quarter_turns(pictures, quarters):
-    view = further_looks.turned_view(pictures["whole"], quarters)
+    view = further_passes.turned_view(pictures["whole"], quarters)
     whole = read_image(pictures["whole"], max_size=4096).rgb
     np.testing.assert_array_equal(
         read_view(pictures["whole"], view).rgb, np.rot90(whole, -quarters)
@@ -210,7 +210,7 @@ def test_a_turned_view_is_the_photo_after_quarter_turns(pictures, quarters):
 
 def result(xy0: np.ndarray, h: np.ndarray, plane: np.ndarray) -> PairResult:
     """Matches on planes h (p, 3, 3), without noise."""
-    on_plane = np.stack([mapped(h[p], xy[None])[0] for p, xy in zip(plane, xy0, strict=True)])
+    on_plane = np.stack([transformed(h[p], xy[None])[0] for p, xy in zip(plane, xy0, strict=True)])
     return PairResult(
         pair=("a", "b"),
         cells=np.zeros((len(xy0), 2), np.int32),
@@ -239,13 +239,15 @@ def test_moved_matches_stay_on_their_planes_and_come_back():
     np.testing.assert_allclose(back.keypoints1, found.keypoints1, atol=1e-3)
 
 
-def test_proposals_are_ordered_by_evidence_and_none_is_made_twice():
+def test_proposals_are_ordered_by_significance_and_none_is_made_twice():
     rng = rng_of(5)
     h = np.stack([affine(rng, s) for s in (0.5, 1.0, 2.0)])
     a, b = photo((800, 600)), photo((800, 600))
     looks = [
-        Look(result(rng.uniform(0, 400, (60, 2)), h, np.arange(60) % 3), np.asarray(evidence))
-        for evidence in ([20.0, 90.0, 5.0], [30.0, 80.0, 10.0])
+        MatchingPass(
+            result(rng.uniform(0, 400, (60, 2)), h, np.arange(60) % 3), np.asarray(significance)
+        )
+        for significance in ([20.0, 90.0, 5.0], [30.0, 80.0, 10.0])
     ]
     made = [affine_between(each) for each in proposals(looks, (a, b))]
     assert len(made) <= MOST_PROPOSALS
@@ -258,13 +260,13 @@ def test_proposals_are_ordered_by_evidence_and_none_is_made_twice():
 @pytest.fixture
 def few_sizes(monkeypatch):
     """No enlarging and views of one size: each size of a picture is a program to compile."""
-    monkeypatch.setattr(pair_looks, "MOST_ENLARGED", 1.0)
-    monkeypatch.setattr(pair_looks, "SIZE", pair_looks.SMALL_SIZE)
-    monkeypatch.setattr(further_looks, "SIZES", (pair_looks.SMALL_SIZE,))
+    monkeypatch.setattr(pair_passes, "MOST_ENLARGED", 1.0)
+    monkeypatch.setattr(pair_passes, "SIZE", pair_passes.SMALL_SIZE)
+    monkeypatch.setattr(further_passes, "SIZES", (pair_passes.SMALL_SIZE,))
 
 
 @pytest.mark.slow
-def test_a_turned_part_is_matched_by_closer_looks(weights, pictures, few_sizes):
+def test_a_turned_part_is_matched_by_further_passes(weights, pictures, few_sizes):
     # Each further octave would be some nine programs to compile.
     config = dataclasses.replace(preset("default"), octaves=1)
     first, other = (
@@ -275,10 +277,12 @@ def test_a_turned_part_is_matched_by_closer_looks(weights, pictures, few_sizes):
     # np.rot90 turns counterclockwise: (x, y) becomes (y, width - 1 - x).
     at = np.column_stack([at[:, 1], 415 - at[:, 0]])
     error = np.linalg.norm(found.aligned.keypoints1 - at, axis=1)
-    assert found.looks > 1 and found.confidence > 0.9
+    assert found.passes > 1 and found.confidence > 0.9
     assert np.median(error) < 1.5 and (error < 10).mean() > 0.9
-    once = match_photos(weights, first, other, config=dataclasses.replace(config, closer_looks=0))
-    assert once.looks == 1 and once.evidence < found.evidence / 2
+    once = match_photos(
+        weights, first, other, config=dataclasses.replace(config, max_rectified_planes=0)
+    )
+    assert once.passes == 1 and once.significance < found.significance / 2
 
 
 @pytest.mark.slow
@@ -289,43 +293,43 @@ def test_photos_of_different_things_stay_without_confidence(weights, pictures, f
 
 
 @pytest.mark.slow
-def test_a_strong_pair_is_looked_at_once(weights, pictures):
+def test_a_strong_pair_is_matched_once(weights, pictures):
     config = dataclasses.replace(preset("default"), octaves=1)
     features = image_features(weights, pictures["part"], config=config)
     found = match_photos(weights, features, features, config=config)
-    assert found.looks == 1 and found.evidence > 1.05 * pair_looks.STRONG
+    assert found.passes == 1 and found.significance > 1.05 * pair_passes.STRONG
 
 
-def fake_look(evidence: float) -> SimpleNamespace:
+def fake_pass(significance: float) -> SimpleNamespace:
     counts = SimpleNamespace(num_inliers=0, num_tentative=100)
-    return SimpleNamespace(evidence=evidence, result=counts)
+    return SimpleNamespace(significance=significance, result=counts)
 
 
-@pytest.mark.parametrize(("evidence", "closer"), [(14.9, False), (15.1, True)])
-def test_if_a_pair_must_be_worth_it_closer_looks_follow_a_sign_at_some_scale(
-    monkeypatch, evidence, closer
+@pytest.mark.parametrize(("significance", "closer"), [(14.9, False), (15.1, True)])
+def test_if_a_pair_must_be_worth_it_further_passes_follow_a_sign_at_some_scale(
+    monkeypatch, significance, closer
 ):
     """`jaxsfm match` looks closer at any weak pair; runs do not."""
     features = SimpleNamespace(image=photo((8, 8)))
-    weak, found, asked = (fake_look(e) for e in (2.0, evidence, 99.0))
-    monkeypatch.setattr(pair_looks, "is_settled", lambda first: False)
-    monkeypatch.setattr(pair_looks, "look", lambda *_, **__: weak)
-    monkeypatch.setattr(pair_looks, "at_other_scales", lambda *_, **__: [found])
-    monkeypatch.setattr(pair_looks, "_look_closer", lambda *given, **__: [*given[2], asked])
+    weak, found, asked = (fake_pass(e) for e in (2.0, significance, 99.0))
+    monkeypatch.setattr(pair_passes, "is_conclusive", lambda first: False)
+    monkeypatch.setattr(pair_passes, "match_once", lambda *_, **__: weak)
+    monkeypatch.setattr(pair_passes, "at_other_scales", lambda *_, **__: [found])
+    monkeypatch.setattr(pair_passes, "_search_further", lambda *given, **__: [*given[2], asked])
     planes: list[float] = []
 
-    def looks_at_planes(_, __, best: Any, **___: object) -> further_looks.PlaneLooks:
-        planes.append(best.evidence)
-        return further_looks.PlaneLooks([], 0)
+    def match_planes_rectified(_, __, best: Any, **___: object) -> further_passes.PlanePasses:
+        planes.append(best.significance)
+        return further_passes.PlanePasses([], 0)
 
-    monkeypatch.setattr(pair_looks, "looks_at_planes", looks_at_planes)
+    monkeypatch.setattr(pair_passes, "match_planes_rectified", match_planes_rectified)
     nothing = AlignedMatches(np.empty((0, 2)), np.empty(0, bool))
-    monkeypatch.setattr(pair_looks, "_aligned", lambda *_: nothing)
-    monkeypatch.setattr(pair_looks, "seen_alike", lambda *_: True)
+    monkeypatch.setattr(pair_passes, "_aligned", lambda *_: nothing)
+    monkeypatch.setattr(pair_passes, "seen_alike", lambda *_: True)
     given: Any = (None, features, features)
     config = preset("default")
-    least = match_photos(*given, config=config, worth_closer=pair_looks.HOPELESS)
-    assert (least.looks == 3) == closer == bool(planes)
+    least = match_photos(*given, config=config, worth_further=pair_passes.HOPELESS)
+    assert (least.passes == 3) == closer == bool(planes)
     planes.clear()
-    assert match_photos(*given, config=config, worth_closer=15.2).looks == 2 and not planes
-    assert match_photos(*given, config=config).looks == 3
+    assert match_photos(*given, config=config, worth_further=15.2).passes == 2 and not planes
+    assert match_photos(*given, config=config).passes == 3

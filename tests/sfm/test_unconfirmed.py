@@ -11,13 +11,13 @@ from jaxsfm.config import preset
 from jaxsfm.sfm import refined_stage
 from jaxsfm.sfm.mapping import MappingFigures
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refined_stage import check_refined, refine_settled
+from jaxsfm.sfm.refined_stage import check_refined, refine_selected
 
 
 def refined(*accepted: bool) -> RefinementFigures:
     """A refinement with these passes."""
     passes: list[Any] = [SimpleNamespace(accepted=each) for each in accepted]
-    return RefinementFigures(passes=passes, placed=[])
+    return RefinementFigures(passes=passes, registrations=[])
 
 
 @pytest.mark.parametrize(
@@ -50,15 +50,15 @@ def test_each_model_of_a_run_has_the_check_that_follows_from_its_own_refinement(
     done = [refined(True), refined(False)]
     monkeypatch.setattr(refined_stage, "read_figures", lambda *_: (done, [1, 0]))
     monkeypatch.setattr(refined_stage, "read_models", lambda *_: ["part", "whole"])
-    (tmp_path / "settled.db").touch()
-    settled: Any = SimpleNamespace(
+    (tmp_path / "selected.db").touch()
+    selected: Any = SimpleNamespace(
         figures=MappingFigures(verdicts={}, attempts=[], checks=[whole, part]),
-        database=tmp_path / "settled.db",
+        database=tmp_path / "selected.db",
         key="",
         models=lambda _: [],
     )
     verified: Any = SimpleNamespace(figures=None)
     given: Any = SimpleNamespace(config=preset("default"), matches={})
     kept: Any = SimpleNamespace(folder=SimpleNamespace(stage=lambda *_: tmp_path))
-    made = refine_settled(given, verified, settled, tmp_path / "database.db", kept)
+    made = refine_selected(given, verified, selected, tmp_path / "database.db", kept)
     assert made.mapping.checks == [part, dataclasses.replace(whole, unconfirmed=True)]

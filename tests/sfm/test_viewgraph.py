@@ -14,7 +14,7 @@ from jaxsfm.colmap.two_views import PairGeometry, spread
 from jaxsfm.io.pairs import component_of
 from jaxsfm.sfm import view_graph
 from jaxsfm.sfm.limits import TRUST
-from jaxsfm.sfm.view_graph import mean_rotation, rotation_angle_deg, strengths, trusted_pairs
+from jaxsfm.sfm.view_graph import edge_weights, mean_rotation, rotation_angle_deg, trusted_pairs
 
 
 def ring(rng, count=8, *, noise_deg=0.5):
@@ -168,8 +168,8 @@ def test_a_strong_pair_needs_a_right_rotation_only_where_it_is_asked_for():
     strict, default = trusted_pairs(pairs, strict=True), trusted_pairs(pairs)
     assert all(verdict.trusted for verdict in default.values())
     assert [pair for pair, verdict in strict.items() if not verdict.trusted] == [false]
-    assert strict[false].strength > TRUST.strong and "deg" in strict[false].reason
-    assert not any(verdict.refuted for verdict in strict.values())
+    assert strict[false].edge_weight > TRUST.strong and "deg" in strict[false].reason
+    assert not any(verdict.rejected for verdict in strict.values())
 
 
 def test_pairs_for_which_something_else_speaks_are_joined_first():
@@ -247,21 +247,21 @@ def test_pairs_without_a_pose_are_not_trusted_and_say_so():
     assert trusted_pairs({}) == {}
 
 
-def test_strength_is_relative_to_the_best_pairs_of_both_images_and_of_all_others():
+def test_edge_weight_is_relative_to_the_best_pairs_of_both_images_and_of_all_others():
     pairs = {
         ("a", "b"): PairGeometry(num_inliers=400, rotation=np.eye(3)),
         ("b", "c"): PairGeometry(num_inliers=100, rotation=np.eye(3)),
         ("c", "d"): PairGeometry(num_inliers=100, rotation=np.eye(3), spread=0.25),
     }
-    got = strengths(pairs)
+    got = edge_weights(pairs)
     half = TRUST.weak * np.median([400, 400, 100, 50])
     for pair, (weight, best) in zip(
         pairs, ((400, 400), (100, 200), (50, 50 * 2**0.5)), strict=True
     ):
         assert got[pair] == pytest.approx(weight / best / (1 + (half / weight) ** TRUST.steepness))
-    assert strengths({}) == {}
+    assert edge_weights({}) == {}
     nothing = PairGeometry(num_inliers=0, rotation=None)
-    more = strengths({**pairs, ("e", "f"): nothing, ("g", "h"): nothing, ("i", "j"): nothing})
+    more = edge_weights({**pairs, ("e", "f"): nothing, ("g", "h"): nothing, ("i", "j"): nothing})
     assert more == {**got, ("e", "f"): 0.0, ("g", "h"): 0.0, ("i", "j"): 0.0}
 
 
@@ -270,7 +270,7 @@ def test_the_best_pair_of_an_image_is_weak_if_all_of_its_pairs_are():
     _, _, pairs = ring(rng_of(0))
     alone = ("0.jpg", "night.jpg")
     for inliers, strong in ((250, False), (1500, True)):
-        got = strengths(pairs | {alone: PairGeometry(num_inliers=inliers, rotation=np.eye(3))})
+        got = edge_weights(pairs | {alone: PairGeometry(num_inliers=inliers, rotation=np.eye(3))})
         assert (got[alone] > TRUST.strong) == strong
 
 

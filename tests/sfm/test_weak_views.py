@@ -28,13 +28,18 @@ from jaxsfm.config import Refinement
 from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.refine import one_pass, passes, plane_geometry, weak_views
 from jaxsfm.sfm.refine.candidates import may_be_candidates
-from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, Evidence, FixedStructure, matched_points
+from jaxsfm.sfm.refine.fixed_structure import (
+    NO_MATCHES,
+    FixedStructure,
+    ResectionMatches,
+    matched_points,
+)
 from jaxsfm.sfm.refine.octave_pose import PoseHypothesis, follow
 from jaxsfm.sfm.refine.one_pass import run_pass
 from jaxsfm.sfm.refine.passes import refine_model
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import align_blocks
-from jaxsfm.sfm.refine.weak_views import place_weak_views
+from jaxsfm.sfm.refine.weak_views import register_weak_views
 
 NIGHT, NIGHT_NAME = 2, "2.png"
 PHOTONS = 0.02
@@ -72,20 +77,20 @@ def place(
     *,
     weak=(NIGHT_NAME,),
     refine_intrinsics=False,
-    evidence=NO_EVIDENCE,
+    resection=NO_MATCHES,
     **config,
 ):
-    """The COLMAP model with its weak views placed; the same object if nothing changed."""
+    """The COLMAP model with its weak views registered; the same object if nothing changed."""
     before = arrays(model, scene)
-    after, placed = place_weak_views(
+    after, registered = register_weak_views(
         before,
         weak,
         images_of(scene),
         refinement=Refinement(**config),
         refine_intrinsics=refine_intrinsics,
-        evidence=evidence,
+        resection=resection,
     )
-    return (model if after is before else after.to_colmap()), placed
+    return (model if after is before else after.to_colmap()), registered
 
 
 def night_error(model, scene: Room) -> tuple[float, float]:
@@ -99,8 +104,10 @@ def night_error(model, scene: Room) -> tuple[float, float]:
 def test_a_view_of_photons_is_placed_where_it_is(rendered, turn_deg, shift):
     """Two photons at a bright pixel, and the pose up to 10 px off."""
     night = by_night(rendered)
-    model, (placed,) = place(lost_view(night, turn_deg=turn_deg, shift=shift), night)
-    assert placed.octave_px in (2, 4, 8) and placed.agreed >= 100 and placed.error_px < 4
+    model, (registered,) = place(lost_view(night, turn_deg=turn_deg, shift=shift), night)
+    assert (
+        registered.octave_px in (2, 4, 8) and registered.agreed >= 100 and registered.error_px < 4
+    )
     position, rotation = night_error(model, night)
     assert position < 0.01 and rotation < 0.15
 
@@ -108,9 +115,9 @@ def test_a_view_of_photons_is_placed_where_it_is(rendered, turn_deg, shift):
 def test_an_octave_is_repeated_until_the_view_stands_still(rendered):
     """One step each leaves 0.004 and 0.055 deg: the first finds half of the points."""
     night = by_night(rendered)
-    model, (placed,) = place(lost_view(night, turn_deg=0.5), night, weak_octaves=2)
+    model, (registered,) = place(lost_view(night, turn_deg=0.5), night, weak_octaves=2)
     position, rotation = night_error(model, night)
-    assert placed.octave_px == 2 and position < 0.002 and rotation < 0.035
+    assert registered.octave_px == 2 and position < 0.002 and rotation < 0.035
 
 
 def test_refinement_places_a_view_that_it_cannot_align(rendered):
@@ -120,11 +127,11 @@ def test_refinement_places_a_view_that_it_cannot_align(rendered):
     noise = sigma * np.random.default_rng(1).normal(size=tracks.xy.shape)
     before = Model(night.views, tracks._replace(xy=tracks.xy + noise)).to_colmap()
     after, figures = refine(before, night)
-    assert [p.name for p in figures.placed] == [NIGHT_NAME] == figures.passes[-1].weak_views
+    assert [p.name for p in figures.registrations] == [NIGHT_NAME] == figures.passes[-1].weak_views
     without, old = refine(before, night, weak_octaves=0)
-    assert old.placed[0].octave_px is None and old.passes == figures.passes
-    placed, kept = night_error(after, night), night_error(without, night)
-    assert placed[0] < 0.01 and placed[0] < 0.7 * kept[0]
+    assert old.registered[0].octave_px is None and old.passes == figures.passes
+    registered, kept = night_error(after, night), night_error(without, night)
+    assert registered[0] < 0.01 and registered[0] < 0.7 * kept[0]
 
 
 def test_the_other_views_and_their_observations_stay(rendered):
@@ -147,15 +154,17 @@ def test_the_other_views_and_their_observations_stay(rendered):
 def test_a_view_of_something_else_stays_as_it_was(rendered):
     elsewhere = rendered._replace(images=rendered.images | {NIGHT_NAME: other_scene(0)})
     before = lost_view(elsewhere)
-    after, (placed,) = place(before, elsewhere)
-    assert placed.octave_px is None and placed.error_px is None and placed.candidates > 100
+    after, (registered,) = place(before, elsewhere)
+    assert (
+        registered.octave_px is None and registered.error_px is None and registered.candidates > 100
+    )
     assert after is before
 
 
 def test_a_model_of_weak_views_alone_stays_as_it_was(rendered):
     before = lost_view(rendered)
-    after, placed = place(before, rendered, weak=list(rendered.images))
-    assert after is before and all(p.octave_px is None and not p.candidates for p in placed)
+    after, registered = place(before, rendered, weak=list(rendered.images))
+    assert after is before and all(p.octave_px is None and not p.candidates for p in registered)
 
 
 def without(visible: np.ndarray, view: int) -> np.ndarray:
@@ -172,7 +181,7 @@ def without_night(scene: Room) -> pycolmap.Reconstruction:
     return Model(views, shifted).to_colmap()
 
 
-def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
+def night_matches(scene: Room, *, right: int, wrong: int) -> ResectionMatches:
     """With every other view so many matches, keypoints 3 px off at night."""
     rng = np.random.default_rng(0)
     results = {}
@@ -186,7 +195,7 @@ def night_matches(scene: Room, *, right: int, wrong: int) -> Evidence:
         night[right:] = rng.uniform((0, 0), SIZE, night[right:].shape)
         result = matched((view.name, NIGHT_NAME), day, night)
         results[result.pair] = result
-    return Evidence(results, 0)
+    return ResectionMatches(results, 0)
 
 
 def test_matches_bring_a_lost_view_back(rendered):
@@ -194,8 +203,8 @@ def test_matches_bring_a_lost_view_back(rendered):
     night = by_night(rendered)
     before = lost_view(night, turn_deg=25.0, shift=0.3)
     assert place(before, night)[1][0].octave_px is None
-    after, (placed,) = place(before, night, evidence=night_matches(night, right=20, wrong=20))
-    assert placed.registered and night_error(after, night)[0] < 0.01
+    after, (registered,) = place(before, night, resection=night_matches(night, right=20, wrong=20))
+    assert registered.registered and night_error(after, night)[0] < 0.01
 
 
 def with_night_camera(model, scene: Room, alone: pycolmap.Camera) -> pycolmap.Reconstruction:
@@ -216,8 +225,8 @@ def test_only_a_camera_of_its_own_gets_another_focal_length(rendered, own, refin
         alone.camera_id = 2
         alone.focal_length_x = alone.focal_length_y = 1.03 * right
         before = with_night_camera(before, night, alone)
-    after, (placed,) = place(before, night, refine_intrinsics=True)
-    assert placed.octave_px is not None
+    after, (registered,) = place(before, night, refine_intrinsics=True)
+    assert registered.octave_px is not None
     found = after.image(NIGHT + 1).camera
     if refined:
         assert abs(found.focal_length_x / right - 1) < 0.01
@@ -320,11 +329,11 @@ def test_a_view_that_stands_in_a_point_does_not_see_it(rendered):
 
 def test_matches_give_the_surface_under_them_whichever_image_comes_first(rendered):
     before = without_night(rendered)
-    evidence = night_matches(rendered, right=30, wrong=0)
-    assert {pair[0] == NIGHT_NAME for pair in evidence.matches} == {True, False}
+    resection = night_matches(rendered, right=30, wrong=0)
+    assert {pair[0] == NIGHT_NAME for pair in resection.matches} == {True, False}
     model = arrays(before, rendered)
     normal = plane_geometry.normals(model, neighbours=16)
-    xy, points = matched_points(rendered.views[NIGHT], model, normal, evidence.matches)
+    xy, points = matched_points(rendered.views[NIGHT], model, normal, resection.matches)
     off = np.linalg.norm(rendered.views[NIGHT].project(points)[0] - xy, axis=1)
     assert len(off) > 60 and np.median(off) < 6 and np.quantile(off, 0.9) < 12
 
@@ -362,7 +371,7 @@ def test_a_view_that_is_doubtful_in_the_last_pass_is_placed_as_a_weak_one(
     after, figures = refine_model(before, read_of(rendered), settings_of())
     assert calls == [1, 1]
     assert (max(night_error(after, rendered)) < 0.1) == last
-    assert [(at.name, at.registered, at.octave_px) for at in figures.placed] == (
+    assert [(at.name, at.registered, at.octave_px) for at in figures.registrations] == (
         [(NIGHT_NAME, True, 1)] if last else []
     )
 
@@ -377,4 +386,7 @@ def test_a_view_is_doubtful_if_it_shows_little_of_what_it_should_show(rendered, 
 
 def test_no_view_is_doubtful_where_all_poses_are_right(rendered):
     _, figures = refine(noisy_model(rendered, 0.7), rendered)
-    assert [done.doubtful_views for done in figures.passes] == [[], []] and not figures.placed
+    assert [done.doubtful_views for done in figures.passes] == [
+        [],
+        [],
+    ] and not figures.registrations

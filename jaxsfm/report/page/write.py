@@ -20,7 +20,7 @@ from jaxsfm.report.page.photos import photo_table
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.summary import component_lines, georeference_lines, words_of
 from jaxsfm.report.verdict import model_verdicts
-from jaxsfm.sfm.georeference.placement import AnchorRow
+from jaxsfm.sfm.georeference.model_georeference import AnchorRow
 
 MAX_FINDINGS = 5
 """The number of findings of each kind that the page lists for each model. Fifteen second places of

@@ -1,7 +1,7 @@
 """The check of one model after mapping: do its photos, its pairs and its depths agree with it?
 
 It is asked of some of the model's points (`thinned`). Whether photos fit into the model in a second
-place takes longer to say, and is asked of models that are kept (`jaxsfm.sfm.check.other_places`).
+place takes longer to say, and is asked of models that are kept (`jaxsfm.sfm.check.pose_ambiguity`).
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -17,9 +17,9 @@ from jaxsfm.sfm.check.grouping import (
     CURVE,
     MAX_CONTRADICTED,
     Grouping,
+    consistent_components,
     disagreement,
     group_views,
-    parts,
     share,
 )
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, Contradiction, ModelCheck
@@ -28,7 +28,7 @@ from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.fixed_structure import MATCH_ERROR_PX, matched_points
 
-MIN_POINTS = 30
+MIN_CHECKED_POINTS = 30
 """A model with fewer points is not checked."""
 CHECKED_BY = (
     "radius",
@@ -77,16 +77,16 @@ class Checked(NamedTuple):
     """The outcome of a check."""
 
     check: ModelCheck
-    refuted: dict[Pair, Contradiction]
+    rejected: dict[Pair, Contradiction]
     """Pairs that agree with the model and whose two photos contradict each other there."""
-    suspected: dict[Pair, Contradiction]
+    rejection_candidates: dict[Pair, Contradiction]
     """Pairs that agree with the model and join groups that contradict each other. Some of them may
     be right: then the groups were joined wrongly elsewhere."""
     explained: set[Pair]
     """Pairs that agree with the model and join no groups that contradict each other."""
     against: set[Pair]
     """Pairs that do not agree with the model."""
-    parts: list[list[str]]
+    components: list[list[str]]
     """The photos in parts in which no groups contradict each other and something holds the groups
     together, the largest first. Right models of ordinary photos are one part."""
 
@@ -96,7 +96,7 @@ def check_model(
 ) -> Checked | None:
     """Check a model.
 
-    If groups of its photos contradict each other, the pairs that joined them are refuted. Second
+    If groups of its photos contradict each other, the pairs that joined them are rejected. Second
     places are not looked for.
 
     Args:
@@ -109,9 +109,9 @@ def check_model(
     Raises:
       ImageError: an image of the model cannot be read any more.
     """
-    if len(model.views) < MIN_VIEWS or len(model.tracks.points) < MIN_POINTS:
+    if len(model.views) < MIN_VIEWS or len(model.tracks.points) < MIN_CHECKED_POINTS:
         return None
-    seen, near = model.tracks, shrunk(model)
+    seen, near = model.tracks, scale_drift(model)
     model = thinned(model)
     names = [view.name for view in model.views]
     found = agreement(model, images, refinement)
@@ -119,48 +119,48 @@ def check_model(
     contradictions = _named(grouping, names)
     normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     fits = pair_fits(model, normal, given.matches, given.pairs)
-    refuted, suspected = {}, {}
+    rejected, rejection_candidates = {}, {}
     for least in (CHECK.fit, *CHECK.lower_fits) if contradictions else ():
         fitting = [p for p, fit in fits.items() if fit >= least]
-        refuted = _refuted(found, names, fitting)
-        suspected = {
+        rejected = _rejected(found, names, fitting)
+        rejection_candidates = {
             pair: each
             for pair in fitting
             for each in contradictions
-            if each.joined_by(pair) and pair not in refuted
+            if each.joined_by(pair) and pair not in rejected
         }
-        if refuted or suspected:
+        if rejected or rejection_candidates:
             break
     groups = [sorted(names[k] for k in group) for group in grouping.groups]
     check = ModelCheck(
         groups=groups,
         contradictions=contradictions,
-        other_places=[],
-        shrunk=near,
+        pose_ambiguities=[],
+        scale_drift=near,
         doubt=CURVE.probability(disagreement(found)),
     )
     agreeing = {pair for pair, fit in fits.items() if fit >= CHECK.fit}
     explained = {p for p in agreeing if not any(each.joined_by(p) for each in contradictions)}
-    whole = parts(grouping, seen.view, seen.point)
+    whole = consistent_components(grouping, seen.view, seen.point)
     apart = [sorted(names[k] for k in part) for part in whole]
-    return Checked(check, refuted, suspected, explained, fits.keys() - agreeing, apart)
+    return Checked(check, rejected, rejection_candidates, explained, fits.keys() - agreeing, apart)
 
 
-def _refuted(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pair, Contradiction]:
+def _rejected(found: Agreement, names: list[str], fitting: list[Pair]) -> dict[Pair, Contradiction]:
     """The pairs whose two photos contradict each other."""
     index = {name: k for k, name in enumerate(names)}
     against = found.beyond_light()
     shares = share(found.tested, against)
-    refuted = {}
+    rejected = {}
     for pair in fitting:
         a, b = (index[name] for name in pair)
         counts = [(against[i, j], found.tested[i, j]) for i, j in ((a, b), (b, a))]
         least, tested = min(counts)
         if shares[a, b] > MAX_CONTRADICTED and least >= CHECK.least_contradicted:
-            refuted[pair] = Contradiction(
+            rejected[pair] = Contradiction(
                 images=[pair[0]], others=[pair[1]], tested=int(tested), contradicted=int(least)
             )
-    return refuted
+    return rejected
 
 
 def _named(grouping: Grouping, names: list[str]) -> list[Contradiction]:
@@ -224,7 +224,7 @@ def median_depths(model: Model) -> np.ndarray:
     )
 
 
-def shrunk(model: Model) -> list[str]:
+def scale_drift(model: Model) -> list[str]:
     """The photos that see their points so much nearer than most that a part of the model has
     shrunk, sorted by name; none if all photos see them at similar distances.
 

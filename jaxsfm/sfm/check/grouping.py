@@ -156,7 +156,9 @@ def disagreement(agreement: Agreement) -> float:
     return group_views(agreement, most=float("inf")).largest_share
 
 
-def parts(grouping: Grouping, view: np.ndarray, point: np.ndarray) -> list[list[int]]:
+def consistent_components(
+    grouping: Grouping, view: np.ndarray, point: np.ndarray
+) -> list[list[int]]:
     """Parts of a model in which no groups contradict each other.
 
     Groups are joined if they see `CHECK.least_shared` of the same points, those first that share

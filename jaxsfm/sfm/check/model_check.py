@@ -34,7 +34,7 @@ class Contradiction:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class OtherPlace:
+class PoseAmbiguity:
     """A second place of a photo in the model, which pairs give that the model does not agree with.
 
     Nothing in the photo speaks against this place.
@@ -74,7 +74,7 @@ class Alternative:
     model itself does not follow."""
 
 
-def repeats(told_apart: Sequence[Sequence[str]]) -> bool:
+def repeats(split_groups: Sequence[Sequence[str]]) -> bool:
     """Whether groups of photos that were told apart say that the scene repeats itself, so that it
     may do so elsewhere, too.
 
@@ -82,7 +82,7 @@ def repeats(told_apart: Sequence[Sequence[str]]) -> bool:
     places that were taken for one. A photo that contradicts all others was put down badly, and it
     has lost its place.
     """
-    return sum(len(group) > 1 for group in told_apart) > 1
+    return sum(len(group) > 1 for group in split_groups) > 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,19 +93,19 @@ class ModelCheck:
     """Photos that agree with each other, the largest group first. Groups that have nothing in
     common do not contradict each other."""
     contradictions: list[Contradiction]
-    other_places: list[OtherPlace]
+    pose_ambiguities: list[PoseAmbiguity]
     """Sorted by the photo's name."""
     alternative: Alternative | None = None
     apart: list[list[str]] = dataclasses.field(default_factory=list)
     """Pairs of photos that follow each other by their names and were matched, but whose matches do
     not agree with the model. Sorted."""
-    told_apart: list[list[str]] = dataclasses.field(default_factory=list)
+    split_groups: list[list[str]] = dataclasses.field(default_factory=list)
     """Groups of photos, the largest first, that were in one model with others which they
     contradict. Each group of three photos or more is in a model without the others now. They are
     the same for all models of a run (`repeats`)."""
-    shrunk: list[str] = dataclasses.field(default_factory=list)
+    scale_drift: list[str] = dataclasses.field(default_factory=list)
     """Photos that see their points so much nearer than others that a part of the model has shrunk
-    (`jaxsfm.sfm.check.check_model.shrunk`). Sorted."""
+    (`jaxsfm.sfm.check.check_model.scale_drift`). Sorted."""
     doubt: float = 0.0
     """How probable it is that the model is wrong, from how far its photos contradict each other
     (`jaxsfm.sfm.check.grouping`). Nothing else that speaks against a model is part of it."""
@@ -123,8 +123,8 @@ class ModelCheck:
 
     def doubted(self) -> bool:
         """Whether more speaks against the model than photos that follow each other (`apart`)."""
-        elsewhere = self.other_places, self.alternative, repeats(self.told_apart)
-        return any((self.contradictions, *elsewhere, self.shrunk))
+        elsewhere = self.pose_ambiguities, self.alternative, repeats(self.split_groups)
+        return any((self.contradictions, *elsewhere, self.scale_drift))
 
     def photos(self) -> set[str]:
         """The photos of the model."""

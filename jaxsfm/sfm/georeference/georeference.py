@@ -13,7 +13,11 @@ from jaxsfm.colmap.view import View
 from jaxsfm.io.photos import Pixels
 from jaxsfm.io.position_tables import ControlPoint, Position
 from jaxsfm.sfm.georeference.coordinate_system import CoordinateSystem, Frame
-from jaxsfm.sfm.georeference.placement import NamedAnchors, Placement, placement
+from jaxsfm.sfm.georeference.model_georeference import (
+    ModelGeoreference,
+    NamedAnchors,
+    georeferenced,
+)
 from jaxsfm.sfm.georeference.robust_similarity import Anchors
 
 if TYPE_CHECKING:
@@ -187,7 +191,7 @@ class Georeference:
     file: str | None = None
     frame: Frame | None
     """None if no position has a height."""
-    models: list[Placement]
+    models: list[ModelGeoreference]
     """One for each model."""
 
 
@@ -198,7 +202,7 @@ def move_models(
     frame, placed = measured.frame(), []
     for model in models:
         given = measured.anchors(model, frame)
-        figures, similarity = placement(given, _WORDS[measured.source], sure=measured.sure)
+        figures, similarity = georeferenced(given, _WORDS[measured.source], sure=measured.sure)
         if similarity is not None:
             move_model(model, *similarity)
         placed.append(figures)

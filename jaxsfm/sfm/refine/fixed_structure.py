@@ -1,5 +1,5 @@
-"""The structure that further views are placed on, and where they show its points: by their matches,
-and found by alignment.
+"""The structure that further views are registered on, and where they show its points: by their
+matches, and found by alignment.
 
 Neither its points nor its views move, however many poses of further views are tried.
 """
@@ -31,7 +31,7 @@ MAX_SIGMA_PX = 1.0
 refinement, because hundreds of observations determine one pose."""
 
 
-class Evidence(NamedTuple):
+class ResectionMatches(NamedTuple):
     """Facts that refinement uses besides the model."""
 
     matches: Mapping[Pair, PairResult]
@@ -40,7 +40,7 @@ class Evidence(NamedTuple):
     """For RANSAC in the resection from matches."""
 
 
-NO_EVIDENCE = Evidence({}, 0)
+NO_MATCHES = ResectionMatches({}, 0)
 
 
 def matched_points(

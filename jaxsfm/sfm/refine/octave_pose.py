@@ -18,7 +18,7 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
-from jaxsfm.sfm.refine.pose_doubt import distinct_patches, projection_doubt
+from jaxsfm.sfm.refine.pose_uncertainty import distinct_patches, projected_uncertainty
 
 MIN_COUNT = 30
 """An octave's pose counts only if at least so many points agree."""
@@ -26,11 +26,11 @@ MIN_SHARE = 0.05
 """At one octave at least, this share of the points that a view could show must agree, or the pose
 is searched around (`jaxsfm.sfm.refine.pose_search`). At wrong poses up to 7 % agree, at right ones
 8 to 70 % at an eighth of the size (docs/decisions/weak-views.md)."""
-MAX_DOUBT_PX = 1.0
+MAX_UNCERTAINTY_PX = 1.0
 """Largest doubt about a trusted pose, working pixels. Right poses have 0.2 to 0.7. Of 24 poses
 followed from wrong starts (castle-P19 0016) one ends at 0.95, with 1.5 % of the points agreeing,
 and the others end above 1.6 or without any point."""
-MAX_SEARCHED_DOUBT_PX = 2.0
+MAX_SEARCHED_UNCERTAINTY_PX = 2.0
 """Largest doubt about a pose that stands out after a search, working pixels. Of right ones, which
 are 0.5 to 3.3 px off (nights of fountain-P11 and castle-P19), the doubt is 0.4 to 1.9; wrong ones
 that are 16, 40 and 78 px off have 1.9, 2.5 and 4.2."""
@@ -54,9 +54,9 @@ class OctavePose(NamedTuple):
     agreed: int
     error_px: float
     """Median distance of where points agree from where the pose puts them, working pixels."""
-    doubt_px: float
+    uncertainty_px: float
     """How far off the view's projections are expected to be, working pixels
-    (`jaxsfm.sfm.refine.pose_doubt.projection_doubt`)."""
+    (`jaxsfm.sfm.refine.pose_uncertainty.projected_uncertainty`)."""
     patches: int
     """How many patches without overlap the points that agreed amount to."""
 
@@ -86,7 +86,7 @@ class PoseHypothesis:
     @property
     def best(self) -> OctavePose | None:
         """The pose of least doubt among those of the octaves."""
-        return min(self.octaves.values(), key=lambda each: each.doubt_px, default=None)
+        return min(self.octaves.values(), key=lambda each: each.uncertainty_px, default=None)
 
 
 def trusted(pose: PoseHypothesis) -> OctavePose | None:
@@ -94,9 +94,11 @@ def trusted(pose: PoseHypothesis) -> OctavePose | None:
     for it is not enough."""
     if pose.searched:
         found = pose.stands_out
-        return found if found and found.doubt_px <= MAX_SEARCHED_DOUBT_PX else None
+        return found if found and found.uncertainty_px <= MAX_SEARCHED_UNCERTAINTY_PX else None
     best = pose.best
-    enough = best is not None and pose.share >= MIN_SHARE and best.doubt_px <= MAX_DOUBT_PX
+    enough = (
+        best is not None and pose.share >= MIN_SHARE and best.uncertainty_px <= MAX_UNCERTAINTY_PX
+    )
     return best if enough else None
 
 
@@ -124,7 +126,7 @@ def _step(
     errors = np.where(np.isfinite(errors), errors, np.inf)
     error_px = float(np.median(errors))
     side = refinement.patch_side
-    doubt_px = px * projection_doubt(
+    uncertainty_px = px * projected_uncertainty(
         moved,
         seen.points,
         seen.xy,
@@ -134,7 +136,7 @@ def _step(
         focal=pose.own_camera,
     )
     before = pose.octaves.get(px)
-    if before is None or doubt_px < before.doubt_px:
+    if before is None or uncertainty_px < before.uncertainty_px:
         near = errors <= refinement.max_error_px
         xy = Pixels.octave(px).to_original(seen.xy[near])
         points = AlignedPoints(seen.rows[near], seen.points[near], xy, seen.candidates)
@@ -144,7 +146,7 @@ def _step(
             points=points,
             agreed=pose.agreed,
             error_px=error_px * px,
-            doubt_px=doubt_px,
+            uncertainty_px=uncertainty_px,
             patches=distinct_patches(seen.xy, side),
         )
     way = moved.project(seen.points)[0] - view.project(seen.points)[0]
@@ -164,16 +166,16 @@ def follow(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None:
         for pose in unsure:
             pose.view = pose.best.view if pose.best else pose.view
         _descend(unsure, structure)
-        unsure = [pose for pose in unsure if pose.best and pose.best.doubt_px > SURE_PX]
+        unsure = [pose for pose in unsure if pose.best and pose.best.uncertainty_px > SURE_PX]
 
 
 def _descend(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None:
     """From the coarsest octave to the finest, in place."""
     for octave in reversed(range(structure.refinement.weak_octaves)):
-        settle(poses, structure, 2**octave)
+        converge(poses, structure, 2**octave)
 
 
-def settle(poses: Sequence[PoseHypothesis], structure: FixedStructure, px: int) -> None:
+def converge(poses: Sequence[PoseHypothesis], structure: FixedStructure, px: int) -> None:
     """Move poses at one octave until they stand still, in place.
 
     Args:

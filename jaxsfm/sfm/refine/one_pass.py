@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
-from jaxsfm.colmap.mapper import MIN_POINTS
+from jaxsfm.colmap.mapper import MIN_MODEL_POINTS
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.colmap.view import View
@@ -103,7 +103,7 @@ def run_pass(
     if adjusted is not None and px > 1:
         model = Model.from_colmap(adjusted.reconstruction, before.model.sizes)
         adjusted = adjusted._replace(model=model)
-    enough = max(MIN_POINTS, MIN_POINT_SHARE * len(before.model.tracks.points))
+    enough = max(MIN_MODEL_POINTS, MIN_POINT_SHARE * len(before.model.tracks.points))
     accepted = adjusted is not None and adjusted.reconstruction.num_points3D() >= enough
     after = adjusted if adjusted is not None and accepted else before
     agrees = np.concatenate([block.agrees for block in blocks])
@@ -203,7 +203,7 @@ def _adjust(
                 model = straight
                 continue
         reconstruction = model.to_colmap()
-        if reconstruction.num_points3D() < MIN_POINTS:
+        if reconstruction.num_points3D() < MIN_MODEL_POINTS:
             return None
         bundle_adjust(
             reconstruction,

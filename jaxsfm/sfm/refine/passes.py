@@ -6,8 +6,8 @@ are dropped. Bundle adjustment and filtering follow.
 
 The reference keypoint stays where it is, because it defines the point. So the spread of relocalized
 keypoints over the views (1-2 px) goes, and a track reaches every view that shows its surface. Views
-that show too little to be aligned in this way are placed at the end, on the structure of the others
-(`jaxsfm.sfm.refine.weak_views`).
+that show too little to be aligned in this way are registered at the end, on the structure of the
+others (`jaxsfm.sfm.refine.weak_views`).
 
 A few hundred points for each view make the poses good, so all passes but the last one are done with
 the points of the matches that the mapper was given. Then all others return.
@@ -17,12 +17,12 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from jaxsfm.colmap.mapper import MIN_POINTS
+from jaxsfm.colmap.mapper import MIN_MODEL_POINTS
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.fixed_structure import NO_EVIDENCE, Evidence
+from jaxsfm.sfm.refine.fixed_structure import NO_MATCHES, ResectionMatches
 from jaxsfm.sfm.refine.one_pass import (
     PassFigures,
     PassSettings,
@@ -30,7 +30,7 @@ from jaxsfm.sfm.refine.one_pass import (
     run_pass,
 )
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
-from jaxsfm.sfm.refine.weak_views import Placement, place_weak_views
+from jaxsfm.sfm.refine.weak_views import RegistrationAttempt, register_weak_views
 
 if TYPE_CHECKING:
     import pycolmap
@@ -41,14 +41,14 @@ class RefinementFigures:
     """The result of the refinement of a model."""
 
     passes: list[PassFigures]
-    placed: list[Placement]
+    registrations: list[RegistrationAttempt]
     """One for each view that was weak in any pass, and for each photo without a place that was to
     be registered."""
     camera: OtherCamera | None = None
     """The camera that the photos speak for, if it is not the one that was held."""
     holds: bool = True
     """Whether confirmed points hold three views together or more
-    (`jaxsfm.sfm.refined_models.held_parts`)."""
+    (`jaxsfm.sfm.refined_models.covisibility_components`)."""
 
     @property
     def confirmed(self) -> bool:
@@ -60,7 +60,9 @@ class RefinementFigures:
         """The views that nothing confirms: the last pass has not aligned their observations, and
         no octave has given them a pose. What looks alike has given the mapper's poses to them."""
         weak = {name for done in _accepted(self.passes)[-1:] for name in done.weak_views}
-        return {each.name for each in self.placed if each.octave_px is None and each.name in weak}
+        return {
+            each.name for each in self.registrations if each.octave_px is None and each.name in weak
+        }
 
 
 def _as_arrays(reconstruction: "pycolmap.Reconstruction", sizes: Sizes) -> Refined:
@@ -88,7 +90,7 @@ def refine_model(
     read: Reader,
     settings: PassSettings,
     *,
-    evidence: Evidence = NO_EVIDENCE,
+    resection: ResectionMatches = NO_MATCHES,
     with_all_points: "Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction] | None" = None,
     described_px: int = 1,
     on_pass: Callable[[], None] = lambda: None,
@@ -96,16 +98,16 @@ def refine_model(
     """Refine a model.
 
     Thresholds are in pixels of the working images. An image where too little agrees keeps its old
-    observations, with four times the error limit, until it is placed on the refined structure.
+    observations, with four times the error limit, until it is registered on the refined structure.
     Images that show far less of what they should show than others do may have a wrong pose of the
-    mapper. They are placed in the same way. A pass that would lose most of the points is taken
+    mapper. They are registered in the same way. A pass that would lose most of the points is taken
     back.
 
     Args:
       reconstruction: from the mapper; not changed.
       read: intensities by image name; may be called several times per image.
       settings: of the passes. With one thread the model is repeatable to the last byte.
-      evidence: matches to place weak views by.
+      resection: matches to place weak views by.
       with_all_points: gives a model the points of all matches, before the last of the `passes`.
         None: it has them already.
       described_px: the size of a pixel in which the keypoints were found, a power of two of working
@@ -128,7 +130,7 @@ def refine_model(
         if with_all_points is not None and number == refinement.passes - 1:
             now, with_all_points = _as_arrays(with_all_points(now.reconstruction), sizes), None
             limits = AlignmentLimits.of(refinement)  # the keypoints of new points are not aligned
-        if len(now.model.tracks.points) < MIN_POINTS or len(now.model.views) < 2:
+        if len(now.model.tracks.points) < MIN_MODEL_POINTS or len(now.model.views) < 2:
             break
         now, done = run_pass(now, images, px, limits, settings)
         on_pass()
@@ -137,26 +139,26 @@ def refine_model(
             break
     if with_all_points is not None:  # the passes ended early
         now = _as_arrays(with_all_points(now.reconstruction), sizes)
-    reconstruction, placed = now.reconstruction, list[Placement]()
-    if wanted := _to_place(figures):
-        model, placed = place_weak_views(
+    reconstruction, attempts = now.reconstruction, list[RegistrationAttempt]()
+    if wanted := _to_register(figures):
+        model, attempts = register_weak_views(
             now.model,
             wanted,
             images,
             refinement=refinement,
             refine_intrinsics=settings.refine_intrinsics,
-            evidence=evidence,
+            resection=resection,
         )
         if model is not now.model:
             reconstruction = model.to_colmap()
-    return reconstruction, RefinementFigures(passes=figures, placed=placed)
+    return reconstruction, RefinementFigures(passes=figures, registrations=attempts)
 
 
 def _accepted(figures: Sequence[PassFigures]) -> list[PassFigures]:
     return [done for done in figures if done.accepted]
 
 
-def _to_place(figures: Sequence[PassFigures]) -> list[str]:
+def _to_register(figures: Sequence[PassFigures]) -> list[str]:
     """The images that were weak in any pass, or doubtful in the last one.
 
     What little agreed in the first pass looks like much in the next (58 of 153 observations after

@@ -20,8 +20,8 @@ from jaxsfm.sfm.refine.octave_pose import (
     MIN_COUNT,
     OctavePose,
     PoseHypothesis,
+    converge,
     follow,
-    settle,
 )
 
 DIRECTIONS, REACH = 8, 0.4
@@ -91,7 +91,7 @@ def _climb(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> list[P
             ]
             for pose in climbing
         ]
-        settle([each for own in tried for each in own], structure, coarsest)
+        converge([each for own in tried for each in own], structure, coarsest)
         higher = []
         for pose, own in zip(climbing, tried, strict=True):
             best = max(own, key=lambda each: each.agreed)
@@ -125,7 +125,7 @@ def _compare(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None
         if ground is not None and ground.patches >= MIN_PATCHES:
             near_px = ground.octave_px * side
             there = [each for each in found if _apart_px(each, ground) <= near_px]
-            pose.stands_out = min(there, key=lambda each: each.doubt_px)
+            pose.stands_out = min(there, key=lambda each: each.uncertainty_px)
 
 
 def _stands_out(pose: OctavePose, beside: Sequence[AlignedPoints]) -> bool:

@@ -3,7 +3,7 @@
 It works in rounds. In a round, each view is looked for in every model that has views like it, and
 gets its place in the model of which it shows most points (`jaxsfm.sfm.register.locate_view`). A
 place that too few points hold, or that the view itself or its neighbours contradict, is given up
-(`doubts`). What it shows beyond the model's points becomes new points
+(`objections`). What it shows beyond the model's points becomes new points
 (`jaxsfm.sfm.register.triangulate`), in which the next round locates further views.
 """
 
@@ -16,7 +16,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.check_model import pair_fits
-from jaxsfm.sfm.check.other_places import Surface, shown_by
+from jaxsfm.sfm.check.pose_ambiguity import Surface, shown_by
 from jaxsfm.sfm.limits import CHECK, REGISTER
 from jaxsfm.sfm.photo_order import neighbours
 from jaxsfm.sfm.refine import plane_geometry
@@ -24,10 +24,10 @@ from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
 from jaxsfm.sfm.register.locate_view import (
     Localization,
-    Place,
+    LocatedView,
     UnregisteredView,
-    best_place,
-    place_in,
+    best_location,
+    locate_in,
 )
 from jaxsfm.sfm.register.triangulate import new_points
 
@@ -38,7 +38,7 @@ class ExtendedModels(NamedTuple):
     models: list[Model]
     """In the order in which they were given. The old views of each come first, and so do its old
     points."""
-    placed: dict[str, int]
+    registered: dict[str, int]
     """The new views in the order of their rounds, and the index of the model of each."""
     located: dict[str, Localization]
     """For every unregistered view, the outcome of its last attempt, in the model where most speaks
@@ -66,18 +66,18 @@ def grow(
       refinement: that of the models; None: they were not refined.
       on_view: called for every view that is registered.
     """
-    models, placed = list(models), dict[str, int]()
-    tried: dict[str, dict[int, Place | None]] = {name: {} for name in unregistered}
+    models, registered = list(models), dict[str, int]()
+    tried: dict[str, dict[int, LocatedView | None]] = {name: {} for name in unregistered}
     rounds, latest = 0, set[str]()
     while True:
-        fresh: dict[str, Place] = {}
+        fresh: dict[str, LocatedView] = {}
         now = [latest & {view.name for view in model.views} for model in models]
-        for name in sorted(unregistered.keys() - placed.keys()):
+        for name in sorted(unregistered.keys() - registered.keys()):
             each, known = unregistered[name], tried[name]
             for k in range(len(models)):
                 if k in known and not now[k].intersection(each.shortlist):
                     continue  # nothing new since the last attempt
-                place = place_in(
+                place = locate_in(
                     models,
                     k,
                     each,
@@ -87,17 +87,17 @@ def grow(
                     seed=seed,
                 )
                 known[k] = place and place._replace(found=_held(place.found))
-            best = best_place(known.values())
+            best = best_location(known.values())
             if best.found.trusted:
                 fresh[name] = best
         if not fresh:
-            located = {name: best_place(known.values()).found for name, known in tried.items()}
-            return ExtendedModels(models, placed, located, rounds)
-        stay = dict[str, Place]()
+            located = {name: best_location(known.values()).found for name, known in tried.items()}
+            return ExtendedModels(models, registered, located, rounds)
+        stay = dict[str, LocatedView]()
         for k in sorted({place.model for place in fresh.values()}):
             own = {name: place for name, place in fresh.items() if place.model == k}
-            against = doubts(
-                _with_placed(models[k], own),
+            against = objections(
+                _with_registered(models[k], own),
                 images,
                 refinement or Refinement(),
                 {name: place.found.rests_on_details for name, place in own.items()},
@@ -108,12 +108,12 @@ def grow(
                 place = own.pop(name)
                 tried[name][k] = place._replace(found=place.found.refused(why))
             if own:
-                model = _with_placed(models[k], own)
+                model = _with_registered(models[k], own)
                 more = new_points(model, own, matches, images, refinement=refinement)
                 models[k] = model.with_tracks(model.tracks.joined(more))
             stay |= own
         rounds, latest = rounds + 1, set(stay)
-        placed |= {name: place.model for name, place in stay.items()}
+        registered |= {name: place.model for name, place in stay.items()}
         for _ in stay:
             on_view()
 
@@ -134,7 +134,7 @@ def _held(located: Localization) -> Localization:
     )
 
 
-def doubts(
+def objections(
     model: Model,
     images: DeviceImages,
     refinement: Refinement,
@@ -145,15 +145,15 @@ def doubts(
     """What speaks against the places of new views in a model, in words, by the name of the view.
 
     Where a photo shows a copy of what the model shows, alignment confirms a wrong place. The check
-    of the mapper's model has not seen this photo. All points of a placed view come from other
+    of the mapper's model has not seen this photo. All points of a registered view come from other
     views. So it can only contradict them, and they cannot contradict it.
 
     Args:
-      model: with the placed views.
+      model: with the registered views.
       images: those of the views, in the model's pixels.
       refinement: how patches are aligned, and when they agree.
-      details: by the name of each placed view, whether its place rests on details at full size. If
-        not, noise hides them there, and what the view does not show says nothing.
+      details: by the name of each registered view, whether its place rests on details at full size.
+        If not, noise hides them there, and what the view does not show says nothing.
       following: pairs of photos that follow each other and that COLMAP verified.
       matches: of these pairs at least, original pixels.
     """
@@ -177,8 +177,8 @@ def doubts(
     return found
 
 
-def _with_placed(model: Model, fresh: Mapping[str, Place]) -> Model:
-    """The model with views that have been placed in it, and what they show of its points."""
+def _with_registered(model: Model, fresh: Mapping[str, LocatedView]) -> Model:
+    """The model with views that have been registered in it, and what they show of its points."""
     views, parts = list(model.views), [model.tracks.observations]
     for _, place in sorted(fresh.items()):
         found = place.found

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsfm.colmap.model import Model
-from jaxsfm.colmap.resection import MIN_POINTS, find_view
+from jaxsfm.colmap.resection import MIN_RESECTION_POINTS, find_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
@@ -25,16 +25,16 @@ from jaxsfm.sfm.refine.fixed_structure import (
     matched_points,
 )
 from jaxsfm.sfm.refine.octave_pose import (
-    MAX_DOUBT_PX,
-    MAX_SEARCHED_DOUBT_PX,
+    MAX_SEARCHED_UNCERTAINTY_PX,
+    MAX_UNCERTAINTY_PX,
     MIN_COUNT,
     MIN_SHARE,
     PoseHypothesis,
     follow,
     trusted,
 )
-from jaxsfm.sfm.refine.pose_doubt import pose_doubt
 from jaxsfm.sfm.refine.pose_search import MIN_PATCHES, STANDS_OUT, search
+from jaxsfm.sfm.refine.pose_uncertainty import pose_uncertainty
 
 LEAVES = 2.0
 """A match counts as left if it is off by more than this many times the error of an inlier."""
@@ -64,8 +64,8 @@ class Localization:
     """Working pixels per pixel of the octave that gives the pose; None: it is not trusted."""
     error_px: float | None = None
     """Median distance of what determines the pose from where the pose puts it, working pixels."""
-    doubt_px: float | None = None
-    """How far off projections are expected to be, working pixels (`OctavePose.doubt_px`)."""
+    uncertainty_px: float | None = None
+    """How far off projections are expected to be, working pixels (`OctavePose.uncertainty_px`)."""
     centre_error: float | None = None
     """Expected error of the centre, units of the model. The model's own error comes on top."""
     rotation_error_deg: float | None = None
@@ -129,7 +129,7 @@ def locate(
         return nowhere(len(xy), matches)
     errors = np.linalg.norm(found.project(points)[0] - xy, axis=1)
     near = np.isfinite(errors) & (errors <= MATCH_ERROR_PX)
-    if near.sum() < MIN_POINTS:  # the camera has been refined since RANSAC counted
+    if near.sum() < MIN_RESECTION_POINTS:  # the camera has been refined since RANSAC counted
         return nowhere(len(xy), matches)
     pose = PoseHypothesis(view=found, own_camera=own_camera)
     if structure.refinement.weak_octaves:
@@ -154,7 +154,7 @@ def locate(
         error_px, view = best.error_px, best.view
         seen = best.points.points, best.points.xy
         side = best.octave_px * structure.refinement.patch_side
-    doubt = pose_doubt(view, *seen, error_px, side, focal=own_camera)
+    uncertainty = pose_uncertainty(view, *seen, error_px, side, focal=own_camera)
     return Localization(
         view=view,
         trusted=best is not None,
@@ -165,9 +165,9 @@ def locate(
         agreed=best.agreed if best else pose.agreed,
         octave_px=best.octave_px if best else None,
         error_px=error_px,
-        doubt_px=best.doubt_px if best else None,
-        centre_error=doubt.centre,
-        rotation_error_deg=doubt.rotation_deg,
+        uncertainty_px=best.uncertainty_px if best else None,
+        centre_error=uncertainty.centre,
+        rotation_error_deg=uncertainty.rotation_deg,
         points=best.points if best else None,
     )
 
@@ -189,10 +189,10 @@ def nowhere(on_surface: int, matches: Mapping[Pair, PairResult]) -> Localization
     if most == 0:
         tentative = max((result.num_tentative for result in matches.values()), default=0)
         why = f"no plane in common with a photo of the model (at most {tentative} matches of cells)"
-    elif on_surface < MIN_POINTS:
+    elif on_surface < MIN_RESECTION_POINTS:
         why = (
-            f"{on_surface} matches lie on the surface of the model, a pose needs {MIN_POINTS} "
-            f"({most} matches with its best photo)"
+            f"{on_surface} matches lie on the surface of the model, a pose needs "
+            f"{MIN_RESECTION_POINTS} ({most} matches with its best photo)"
         )
     else:
         why = f"no pose agrees with enough of the {on_surface} matches on the model's surface"
@@ -220,9 +220,10 @@ def _doubtful(pose: PoseHypothesis, inliers: int, on_surface: int) -> str:
             f"show there (needed: {100 * MIN_SHARE:.0f} %)"
         )
     judged = pose.stands_out or pose.best
-    most = MAX_SEARCHED_DOUBT_PX if pose.searched else MAX_DOUBT_PX
+    most = MAX_SEARCHED_UNCERTAINTY_PX if pose.searched else MAX_UNCERTAINTY_PX
     return (
-        f"{start}what alignment finds leaves {judged.doubt_px:.2f} px of doubt (at most {most:g})"
+        f"{start}what alignment finds leaves {judged.uncertainty_px:.2f} px of uncertainty "
+        f"(at most {most:g})"
     )
 
 
@@ -237,7 +238,7 @@ class UnregisteredView(NamedTuple):
     """Names of the views that it is matched with."""
 
 
-class Place(NamedTuple):
+class LocatedView(NamedTuple):
     """The outcome of an attempt to find a view's place in a model."""
 
     model: int
@@ -248,7 +249,7 @@ class Place(NamedTuple):
     that point in the model."""
 
 
-def place_in(
+def locate_in(
     models: Sequence[Model],
     k: int,
     wanted: UnregisteredView,
@@ -257,7 +258,7 @@ def place_in(
     *,
     refinement: Refinement,
     seed: int,
-) -> Place | None:
+) -> LocatedView | None:
     """Look for a view in one of the models, from its matches with the views of its shortlist.
 
     Args:
@@ -281,15 +282,15 @@ def place_in(
         own_camera=wanted.own_camera,
         seed=seed,
     )
-    return Place(k, found, rows)
+    return LocatedView(k, found, rows)
 
 
-def best_place(places: Iterable[Place | None]) -> Place:
+def best_location(places: Iterable[LocatedView | None]) -> LocatedView:
     """The place with most support; of equals, the one in the first model.
 
     Without any place, it is nowhere, and its model is the first one.
     """
     tried = [place for place in places if place is not None]
     if not tried:
-        return Place(0, nowhere(0, {}), np.zeros(0, int))
+        return LocatedView(0, nowhere(0, {}), np.zeros(0, int))
     return max(tried, key=lambda place: (place.found.support, -place.model))

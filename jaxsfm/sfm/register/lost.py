@@ -27,7 +27,7 @@ from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.mapped_stage import FIGURES, SPARSE, MatchedPhotos, StageCache
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement
+from jaxsfm.sfm.refine.weak_views import RegistrationAttempt
 from jaxsfm.sfm.refined_models import RefinedModels
 from jaxsfm.sfm.refined_stage import (
     Reconstructed,
@@ -38,7 +38,7 @@ from jaxsfm.sfm.refined_stage import (
 )
 from jaxsfm.sfm.register.grow import grow
 from jaxsfm.sfm.register.locate_view import Localization, UnregisteredView
-from jaxsfm.sfm.settled_stage import SettledModels
+from jaxsfm.sfm.selected_stage import SelectedModels
 
 if TYPE_CHECKING:
     import pycolmap
@@ -52,15 +52,15 @@ class MatchLost(Protocol):
     def __call__(
         self,
         lost: Collection[str],
-        placed: Collection[str],
+        registered: Collection[str],
         false: Collection[Pair],
         *,
-        closer: bool,
+        further: bool,
     ) -> Mapping[Pair, PairResult]:
         """The matches, original pixels. Pairs that were found to be false are left out.
 
         Args:
-          closer: whether photos are also matched at other scales, turned, and as seen from one
+          further: whether photos are also matched at other scales, turned, and as seen from one
             place, which takes up to a minute for a pair. Otherwise they are matched as they are.
         """
         ...
@@ -68,7 +68,7 @@ class MatchLost(Protocol):
 
 def register_lost(
     given: MatchedPhotos,
-    settled: SettledModels,
+    selected: SelectedModels,
     made: Reconstructed,
     kept: StageCache,
     match_lost: MatchLost | None,
@@ -85,21 +85,21 @@ def register_lost(
         return made
 
     def compute(folder: Path) -> None:
-        found = _Registration(given, settled, made)
-        found.register(believed_matches(given, settled))
+        found = _Registration(given, selected, made)
+        found.register(believed_matches(given, selected))
         if match_lost is not None:
-            false = settled.figures.misleading()
-            for closer in (False, True):
+            false = selected.figures.misleading()
+            for further in (False, True):
                 more = True
                 while more and (lost := found.lost()):
                     # A photo that was registered may be the partner of another one.
-                    matches = match_lost(lost, found.placed(), false, closer=closer)
+                    matches = match_lost(lost, found.registered(), false, further=further)
                     more = found.register(matches)
         write_refined(folder, found.outcome())
 
     models = [fingerprint(model) for model in made.models]
     settings = [*refinement_settings(given.config), match_lost is not None]
-    key = digest(settled.key, *settings, given.config.closer_looks, models)
+    key = digest(selected.key, *settings, given.config.max_rectified_planes, models)
     try:
         folder = kept.folder.stage("registered", key, compute)
     except ImageError as error:  # a photo of a model is gone; perhaps it is back next time
@@ -110,7 +110,7 @@ def register_lost(
     return dataclasses.replace(
         made,
         mapping=dataclasses.replace(made.mapping, checks=checks),
-        models=read_models(folder / SPARSE, settled.database),
+        models=read_models(folder / SPARSE, selected.database),
         refinement=refinement,
     )
 
@@ -118,33 +118,33 @@ def register_lost(
 class _Registration:
     """Refined models that take up photos. Models that were not refined take up none."""
 
-    def __init__(self, given: MatchedPhotos, settled: SettledModels, made: Reconstructed) -> None:
+    def __init__(self, given: MatchedPhotos, selected: SelectedModels, made: Reconstructed) -> None:
         self._given, self._made = given, made
         self._photos = Photos(given.images, given.config)
-        self._cameras = read_images(settled.database)
+        self._cameras = read_images(selected.database)
         self._refined = [k for k, done in enumerate(made.refinement) if done is not None]
         self._models: list[Model] = [opened(made.models[k], self._photos)[0] for k in self._refined]
         self._images = DeviceImages(self._photos.gray)
         self._outcomes: dict[str, Localization] = {}
-        self._placed: dict[str, int] = {}
+        self._registered: dict[str, int] = {}
         self._unreadable: set[str] = set()
 
-    def placed(self) -> set[str]:
+    def registered(self) -> set[str]:
         """The photos with a place."""
-        return registered_in_any(self._made.models) | self._placed.keys()
+        return registered_in_any(self._made.models) | self._registered.keys()
 
     def lost(self) -> set[str]:
         """The photos without a place that can be read."""
         names = {image.name for image in self._given.images}
-        return names - self.placed() - self._unreadable
+        return names - self.registered() - self._unreadable
 
     def register(self, matches: Mapping[Pair, PairResult]) -> bool:
         """Register lost photos by these matches, original pixels; says whether any was."""
-        placed = self.placed()
+        registered = self.registered()
         wanted = {
             name: view
             for name in sorted(self.lost())
-            if (view := self._unregistered(name, placed, matches)) is not None
+            if (view := self._unregistered(name, registered, matches)) is not None
         }
         own = {name for each in wanted.values() for name in each.shortlist} | wanted.keys()
         pairs = [p for p in matches if wanted.keys() & set(p) and own >= set(p)]
@@ -160,16 +160,16 @@ class _Registration:
         )
         self._models = grown.models
         self._outcomes |= grown.located
-        self._placed |= {name: self._refined[k] for name, k in grown.placed.items()}
-        return bool(grown.placed)
+        self._registered |= {name: self._refined[k] for name, k in grown.registered.items()}
+        return bool(grown.registered)
 
     def _unregistered(
-        self, name: str, placed: Collection[str], matches: Mapping[Pair, PairResult]
+        self, name: str, registered: Collection[str], matches: Mapping[Pair, PairResult]
     ) -> UnregisteredView | None:
         """A lost photo with the camera that it has in each model; None if it cannot be used.
 
         Args:
-          placed: the photos with a place.
+          registered: the photos with a place.
         """
         partners = {
             other: matches[pair].num_inliers
@@ -192,14 +192,16 @@ class _Registration:
             shared |= camera.camera_id in cameras
             refined = cameras.get(camera.camera_id, camera)
             views.append(View.without_pose(name, image_id, refined, size, Pixels(scale)))
-        ranked = sorted(partners, key=lambda other: (other not in placed, -partners[other], other))
+        ranked = sorted(
+            partners, key=lambda other: (other not in registered, -partners[other], other)
+        )
         own_camera = self._given.options.refine_intrinsics and not shared
         return UnregisteredView(views, own_camera, sorted(ranked[: REGISTER.shortlist]))
 
     def outcome(self) -> RefinedModels:
         """The models with the photos that were registered, the one with most photos first."""
         models: list[pycolmap.Reconstruction] = list(self._made.models)
-        for k in sorted({*self._placed.values()}):
+        for k in sorted({*self._registered.values()}):
             models[k] = self._models[self._refined.index(k)].to_colmap()
             colour_points(models[k], self._photos.rgb)
         order = sorted(range(len(models)), key=lambda k: -models[k].num_reg_images())
@@ -212,22 +214,22 @@ class _Registration:
         done = self._made.refinement[k]
         if done is None:
             return None
-        rows = {row.name: row for row in done.placed}
+        rows = {row.name: row for row in done.registrations}
         for name, found in self._outcomes.items():
-            if self._placed.get(name, self._refined[0]) == k:
+            if self._registered.get(name, self._refined[0]) == k:
                 own = _row(name, found)
                 # A photo without a place keeps the reason for which it was taken out.
                 rows[name] = own if found.trusted else rows.get(name, own)
-        return dataclasses.replace(done, placed=[*rows.values()])
+        return dataclasses.replace(done, registrations=[*rows.values()])
 
 
-def _row(name: str, found: Localization) -> Placement:
-    return Placement(
+def _row(name: str, found: Localization) -> RegistrationAttempt:
+    return RegistrationAttempt(
         name=name,
         registered=False,
         octave_px=found.octave_px,
         candidates=found.candidates,
         agreed=found.agreed,
         error_px=found.error_px,
-        doubt="" if found.trusted else found.why or "",
+        reason="" if found.trusted else found.why or "",
     )

@@ -19,7 +19,7 @@ TAKEN_PX = 4.0
 """A keypoint this near to an observation is on that point, working pixels: half a fine cell."""
 MATCH_ERROR_PX = 4.0
 """Largest reprojection error of a matched keypoint, working pixels: COLMAP's limit for mapping."""
-MIN_POINTS = 10
+MIN_NEW_POINTS = 10
 """Fewer new points are not aligned, because they determine no planes."""
 
 
@@ -131,7 +131,7 @@ def new_points(
         were. None: they stay where they were matched.
     """
     found = _agreeing(model.with_tracks(matched_tracks(model, fresh, matches)), MATCH_ERROR_PX)
-    if refinement is None or len(found.tracks.points) < MIN_POINTS:
+    if refinement is None or len(found.tracks.points) < MIN_NEW_POINTS:
         return found.tracks
     limits = AlignmentLimits.of(refinement)
     blocks = align_blocks(found, images, refinement, limits)

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 def run(scene: Path, out: Path, *args: str) -> dict:
     known = ["--intrinsics", str(scene / "K.txt"), "--threads", "1"]
-    look = ["--first-look", str(FIRST_PX)]
+    look = ["--low-resolution", str(FIRST_PX)]
     images = str(scene / "images")
     assert main(["reconstruct", images, "--out", str(out), *known, *look, *args]) == 0
     return json.loads((out / "report.json").read_text())
@@ -45,7 +45,7 @@ def looked(scene, tmp_path_factory) -> tuple[Path, dict]:
 def test_where_all_photos_find_a_place_none_is_described_at_full_size(looked):
     out, report = looked
     assert report["models"][0]["registered"] == 3
-    assert report["looks"] == {"first_px": FIRST_PX, "whole": False}
+    assert report["low_resolution"] == {"px": FIRST_PX, "whole": False}
     # One pass more than the preset has, at full size.
     assert len(report["refinement"][0]["passes"]) == 3
     assert len(list((out / "matches").rglob("*.safetensors"))) == 3
@@ -97,7 +97,7 @@ def test_photos_that_give_no_model_at_a_small_size_are_matched_at_full_size(
     monkeypatch.setattr(run_stages, "walk", no_model_at_first)
     report = run(scene, out)
     assert sizes == [FIRST_PX, preset("default").max_size]
-    assert report["looks"] == {"first_px": FIRST_PX, "whole": True}
+    assert report["low_resolution"] == {"px": FIRST_PX, "whole": True}
     assert report["pairs"] == plain[1]["pairs"] and report["models"] == plain[1]["models"]
     for name in MODEL:
         one, two = (folder / "sparse" / "0" / name for folder in (plain[0], out))

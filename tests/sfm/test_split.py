@@ -9,9 +9,9 @@ from verdicts import outcome
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.reconstruction import registered
-from jaxsfm.sfm import settled_stage as module
+from jaxsfm.sfm import selected_stage as module
 from jaxsfm.sfm.check.check_model import Checked
-from jaxsfm.sfm.settled_stage import told_apart
+from jaxsfm.sfm.selected_stage import split_inconsistent
 
 NAMES = [f"{k}.png" for k in range(5)]
 OPTIONS = MapOptions(refine_intrinsics=False, threads=1)
@@ -33,7 +33,7 @@ class FakeChecker:
 
 
 def taken_apart(models, checks, checker):
-    return told_apart(models, checks, checker, OPTIONS)
+    return split_inconsistent(models, checks, checker, OPTIONS)
 
 
 def bent(rendered) -> pycolmap.Reconstruction:
@@ -54,7 +54,7 @@ def test_a_part_is_no_longer_bent_by_the_photos_that_were_joined_to_it_wrongly(r
     assert registered(left) == {*NAMES[:3]} and registered(model) == {*NAMES}
     after = errors(left, rendered)
     assert max(after) < 0.01 * max(before) and min(before) > 0.005
-    assert found.told_apart == [NAMES[:3], NAMES[3:]]
+    assert found.split_groups == [NAMES[:3], NAMES[3:]]
     (done,) = found.checks
     assert done is not None and done.check.groups == [NAMES[:3]]
 
@@ -64,7 +64,7 @@ def test_large_errors_count_for_less_in_pixels_of_the_described_photos(rendered,
     monkeypatch.setattr(module, "bundle_adjust", lambda _, **given: asked.append(given["loss_px"]))
     parts = outcome(NAMES[:3], NAMES[3:])
     options = MapOptions(refine_intrinsics=False, threads=1, scale=4.0)
-    told_apart([noisy_model(rendered, 0.0)], [parts], FakeChecker(), options)
+    split_inconsistent([noisy_model(rendered, 0.0)], [parts], FakeChecker(), options)
     assert asked == [4.0 * module.LOSS_PX]
 
 
@@ -72,7 +72,7 @@ def test_models_without_contradictions_stay_as_they_are_and_are_not_checked_agai
     model, checker = noisy_model(rendered, 0.0), FakeChecker()
     found = taken_apart([model, model], [outcome(NAMES), None], checker)
     assert found.models == [model, model] and found.checks == [outcome(NAMES), None]
-    assert found.told_apart == [] == checker.asked
+    assert found.split_groups == [] == checker.asked
 
 
 def test_every_part_is_a_model_the_largest_first_among_all(rendered, monkeypatch):
@@ -86,9 +86,9 @@ def test_every_part_is_a_model_the_largest_first_among_all(rendered, monkeypatch
         [noisy_model(rendered, 0.0), whole], [parts, outcome(NAMES[2:])], FakeChecker()
     )
     sizes = [model.num_reg_images() for model in found.models]
-    assert sizes == [3, 3, 2] and found.told_apart == parts.parts
+    assert sizes == [3, 3, 2] and found.split_groups == parts.components
     groups = [done.check.groups[0] if done else [] for done in found.checks]
-    assert sorted(groups) == sorted([*parts.parts, NAMES[2:]])
+    assert sorted(groups) == sorted([*parts.components, NAMES[2:]])
     for model, group in zip(found.models, groups, strict=True):
         assert registered(model) == set(group)
 
@@ -100,7 +100,7 @@ def test_a_part_in_which_photos_still_contradict_each_other_is_taken_apart_again
     checker = FakeChecker((NAMES[:2], NAMES[2:4]))
     found = taken_apart([noisy_model(rendered, 0.0)], [outcome(NAMES[:4], NAMES[4:])], checker)
     assert [registered(model) for model in found.models] == [{*NAMES[:2]}, {*NAMES[2:4]}]
-    assert found.told_apart == [NAMES[:2], NAMES[2:4], NAMES[4:]]
+    assert found.split_groups == [NAMES[:2], NAMES[2:4], NAMES[4:]]
     assert all(done and not done.check.contradictions for done in found.checks)
 
 
@@ -110,7 +110,7 @@ def test_a_model_of_which_nothing_would_be_left_stays_whole(rendered, unchecked)
     model, checker = noisy_model(rendered, 0.0), FakeChecker(unchecked=unchecked)
     parts = [NAMES[:2], NAMES[2:4], NAMES[4:]] if unchecked is None else [NAMES[:3], NAMES[3:]]
     found = taken_apart([model], [outcome(*parts)], checker)
-    assert found.models == [model] and found.told_apart == []
+    assert found.models == [model] and found.split_groups == []
     (done,) = found.checks
     assert done is not None and done.check.verdict == "red"
 
@@ -123,4 +123,4 @@ def test_a_part_is_named_also_if_another_model_has_some_of_its_photos_in_a_small
     first, second = [NAMES[:3], NAMES[3:]], [NAMES[:2], NAMES[2:]]
     model = noisy_model(rendered, 0.0)
     found = taken_apart([model, model], [outcome(*first), outcome(*second)], FakeChecker())
-    assert sorted(found.told_apart) == sorted([*first, *second])
+    assert sorted(found.split_groups) == sorted([*first, *second])

@@ -44,7 +44,7 @@ LOSS_PX = 2.0
 one or two pixels off, and false matches of the former model much further."""
 
 
-class SettledModels(NamedTuple):
+class SelectedModels(NamedTuple):
     """The models that a run goes on with, in the folder of their stage."""
 
     figures: MappingFigures
@@ -62,7 +62,7 @@ class SettledModels(NamedTuple):
         return read_models(self.folder / name, self.database)
 
 
-class _Settled(NamedTuple):
+class _Selected(NamedTuple):
     """Models before they are written."""
 
     models: "list[pycolmap.Reconstruction]"
@@ -70,14 +70,14 @@ class _Settled(NamedTuple):
     alternative: "list[pycolmap.Reconstruction]"
 
 
-def settle(
+def select_models(
     given: MatchedPhotos,
     verified: VerifiedStage,
     made: tuple[MappedModels, MappedModels | None],
     kept: StageCache,
     *,
     without: Collection[Step] = (),
-) -> SettledModels:
+) -> SelectedModels:
     """Keep the better of two mappings, split it where photos do not agree, and look for second
     places of its photos.
 
@@ -97,7 +97,7 @@ def settle(
 
     def compute(folder: Path) -> None:
         shutil.copyfile(best.database, folder / DATABASE)
-        found = _settled(given, mapper, best, other, without)
+        found = _selected(given, mapper, best, other, without)
         figures = MappingFigures(
             verdicts=best.trust.verdicts,
             attempts=attempts,
@@ -110,47 +110,47 @@ def settle(
 
     models = [fingerprint(model) for each in made if each is not None for model in each.models]
     key = digest(verified.key, *mapping_settings(given), models, sorted(without))
-    folder = kept.folder.stage("settled", key, compute)
-    return SettledModels(read_figures(folder / FIGURES, MappingFigures), folder, key)
+    folder = kept.folder.stage("selected", key, compute)
+    return SelectedModels(read_figures(folder / FIGURES, MappingFigures), folder, key)
 
 
-def _settled(
+def _selected(
     given: MatchedPhotos,
     mapper: Mapper,
     best: MappedModels,
     other: MappedModels | None,
     without: Collection[Step],
-) -> _Settled:
+) -> _Selected:
     checker, parts = mapper.checker(best.database), list[list[str]]()
     whole = best
-    if best.in_parts() and "split" not in without:
-        found = told_apart(best.models, best.checks, checker, given.options)
+    if best.is_inconsistent() and "split" not in without:
+        found = split_inconsistent(best.models, best.checks, checker, given.options)
         best = dataclasses.replace(best, models=found.models, checks=found.checks)
-        parts = found.told_apart
+        parts = found.split_groups
     apart = best.apart(mapper.following())
     checks: list[ModelCheck | None] = [
         done
         and dataclasses.replace(
             done.check,
             apart=[list(pair) for pair in sorted(apart) if done.check.photos() >= set(pair)],
-            told_apart=parts,
+            split_groups=parts,
         )
         for done in best.checks
     ]
-    if "second-places" not in without:
-        checks = _with_second_places(checker, best, checks)
+    if "pose-ambiguity" not in without:
+        checks = _with_pose_ambiguities(checker, best, checks)
     if not checks or checks[0] is None:
-        return _Settled(best.models, checks, [])
+        return _Selected(best.models, checks, [])
     split = repeats(parts)
     shown = whole if split else other
     told = _alternative(shown, whole=split, check=checks[0], best=best)
     if shown is None or told is None:
-        return _Settled(best.models, checks, [])
+        return _Selected(best.models, checks, [])
     checks[0] = dataclasses.replace(checks[0], alternative=told)
-    return _Settled(best.models, checks, mapper.with_points_for_good(shown))
+    return _Selected(best.models, checks, mapper.with_points_for_good(shown))
 
 
-def _with_second_places(
+def _with_pose_ambiguities(
     checker: Checker, best: MappedModels, checks: Sequence[ModelCheck | None]
 ) -> list[ModelCheck | None]:
     """The checks with the second places of photos."""
@@ -159,8 +159,8 @@ def _with_second_places(
         and check
         and (
             remark(
-                "whether photos fit into the model in a second place",
-                functools.partial(checker.with_second_places, model, done, check),
+                "whether the poses of photos are ambiguous",
+                functools.partial(checker.with_pose_ambiguities, model, done, check),
             )
             or check
         )
@@ -202,23 +202,23 @@ def _alternative(
     )
 
 
-class Parts(NamedTuple):
+class SplitModels(NamedTuple):
     """Models and their checks, and what they were made from."""
 
     models: "list[pycolmap.Reconstruction]"
     """The one with most images first."""
     checks: list[Checked | None]
-    told_apart: list[list[str]]
+    split_groups: list[list[str]]
     """The photos of each part that was taken out of a model with photos that they contradict, the
     largest first."""
 
 
-def told_apart(
+def split_inconsistent(
     models: "Sequence[pycolmap.Reconstruction]",
     checks: Sequence[Checked | None],
     checker: Checker,
     options: MapOptions,
-) -> Parts:
+) -> SplitModels:
     """Take models apart whose photos do not all agree, until all do.
 
     Photos of two parts contradict each other, or next to nothing holds them together: they do not
@@ -232,19 +232,19 @@ def told_apart(
     made: list[CheckedModel] = []
     groups: list[list[str]] = []
     for each in zip(models, checks, strict=True):
-        parts, names = _parts(each, checker, options)
+        parts, names = _components(each, checker, options)
         made += parts
         groups += names
     if groups:
         made.sort(key=lambda each: -each[0].num_reg_images())
-    return Parts(
+    return SplitModels(
         [model for model, _ in made],
         [done for _, done in made],
         sorted(groups, key=lambda group: (-len(group), group)),
     )
 
 
-def _parts(
+def _components(
     whole: CheckedModel, checker: Checker, options: MapOptions
 ) -> tuple[list[CheckedModel], list[list[str]]]:
     """The parts of a model, and the photos of each part, also of those that are too small.
@@ -254,13 +254,15 @@ def _parts(
     model, done = whole
     made: list[CheckedModel] = []
     groups: list[list[str]] = []
-    for part in done.parts if done is not None and len(done.parts) > 1 else ():
+    for part in done.components if done is not None and len(done.components) > 1 else ():
         names: list[list[str]] = []
         if len(part) >= MIN_VIEWS:
-            alone = adjusted_part(model, part, loss_px=LOSS_PX * options.scale, options=options)
+            alone = adjusted_component(
+                model, part, loss_px=LOSS_PX * options.scale, options=options
+            )
             (again,) = checker.check([alone])
             if again is not None:
-                parts, names = _parts((alone, again), checker, options)
+                parts, names = _components((alone, again), checker, options)
                 made += parts
         groups += names or [part]
     if not made:
@@ -269,7 +271,7 @@ def _parts(
     return made, groups if contradicted else []
 
 
-def adjusted_part(
+def adjusted_component(
     model: "pycolmap.Reconstruction",
     names: Sequence[str],
     *,

@@ -11,7 +11,7 @@ from room_scene import exact_model
 from verdicts import outcome
 
 from jaxsfm.sfm.check.model_check import repeats
-from jaxsfm.sfm.settled_stage import _alternative
+from jaxsfm.sfm.selected_stage import _alternative
 
 NAMES = [f"{k}.png" for k in range(5)]
 CHECK = outcome(NAMES).check
@@ -46,7 +46,7 @@ def test_photos_that_the_other_mapping_lacks_say_nothing(rendered):
     assert _alternative(other, whole=False, check=CHECK, best=mapping(rendered)) is None
 
 
-def test_the_model_that_was_told_apart_counts_although_its_photos_contradict_each_other(rendered):
+def test_the_model_that_was_split_off_counts_although_its_photos_contradict_each_other(rendered):
     whole = mapping(rendered, contradicted=7)
     check = outcome(NAMES[:3]).check
     found = _alternative(whole, whole=True, check=check, best=mapping(rendered))
@@ -62,6 +62,6 @@ def test_without_another_mapping_there_is_no_alternative(rendered):
 
 
 @given(st.lists(st.integers(1, 5)))
-def test_a_scene_repeats_itself_if_two_groups_of_two_photos_were_told_apart(sizes):
+def test_a_scene_repeats_itself_if_two_groups_of_two_photos_were_split_off(sizes):
     groups = [["photo"] * size for size in sizes]
     assert repeats(groups) == (len([size for size in sizes if size >= 2]) >= 2)

@@ -13,71 +13,71 @@ from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.two_photos import further_looks
-from jaxsfm.sfm.two_photos.further_looks import SIZES, looks_at_planes
-from jaxsfm.sfm.two_photos.look import BY_CHANCE, Look
-from jaxsfm.sfm.two_photos.pair_looks import as_one, one_match_each
+from jaxsfm.sfm.two_photos import further_passes
+from jaxsfm.sfm.two_photos.further_passes import SIZES, match_planes_rectified
+from jaxsfm.sfm.two_photos.matching_pass import BY_CHANCE, MatchingPass
+from jaxsfm.sfm.two_photos.pair_passes import as_one, one_match_each
 
 IMAGES: Any = ("photo 0", "photo 1")
 
 
 @pytest.fixture
 def looked_at(monkeypatch):
-    """The planes and sizes that are looked at; each look has the evidence that `seen` says."""
+    """The planes and sizes that are looked at; each look has the significance that `seen` says."""
     log: list[tuple[int, int]] = []  # planes and sizes
     seen: dict[tuple[int, int], float] = {}
 
     def closer(_, __, plane: int, *, size: int, **___: object) -> Any:
         log.append((plane, size))
         value = seen.get((plane, size))
-        return None if value is None else SimpleNamespace(evidence=value, at=(plane, size))
+        return None if value is None else SimpleNamespace(significance=value, at=(plane, size))
 
-    monkeypatch.setattr(further_looks, "closer_look", closer)
+    monkeypatch.setattr(further_passes, "match_rectified", closer)
 
     def looks(
-        evidence: list[float], most: int = 4, whole: float = 1.0, **found: float
+        significance: list[float], most: int = 4, whole: float = 1.0, **found: float
     ) -> list[tuple[int, int]]:
         log.clear()
         seen.clear()
         seen.update({tuple(map(int, key[1:].split("_"))): e for key, e in found.items()})  # type: ignore[misc]
         best: Any = SimpleNamespace(
-            evidence=whole,
-            plane_evidence=np.asarray(evidence),
+            significance=whole,
+            plane_significance=np.asarray(significance),
             on_planes=lambda planes, *_: int(planes[0]),
         )
-        config = dataclasses.replace(preset("default"), closer_looks=most)
+        config = dataclasses.replace(preset("default"), max_rectified_planes=most)
         weights: Any = None
-        chosen = looks_at_planes(weights, IMAGES, best, config=config, seed=0)
+        chosen = match_planes_rectified(weights, IMAGES, best, config=config, seed=0)
         assert chosen.taken == len([at for at in log if at in seen])
         return [each.at for each in chosen.confirmed]  # type: ignore[attr-defined]
 
-    return SimpleNamespace(looks=looks, log=log)
+    return SimpleNamespace(passes=looks, log=log)
 
 
-def test_the_strongest_planes_are_looked_at_and_none_that_may_be_chance(looked_at):
-    assert looked_at.looks([20.0, 90.0, 14.9, 40.0]) == []
+def test_the_strongest_planes_are_matched_and_none_that_may_be_chance(looked_at):
+    assert looked_at.passes([20.0, 90.0, 14.9, 40.0]) == []
     assert looked_at.log == [(1, SIZES[0]), (3, SIZES[0]), (0, SIZES[0])]
-    looked_at.looks([20.0, 90.0, 14.9, 40.0], most=2)
+    looked_at.passes([20.0, 90.0, 14.9, 40.0], most=2)
     assert looked_at.log == [(1, SIZES[0]), (3, SIZES[0])]
-    assert preset("default").closer_looks == preset("robust").closer_looks == 4
+    assert preset("default").max_rectified_planes == preset("robust").max_rectified_planes == 4
 
 
 def test_a_plane_counts_if_it_is_at_least_as_strong_as_seen_from_one_place(looked_at):
-    assert looked_at.looks([30.0, 50.0], p0_600=30.0, p1_600=49.9) == [(0, 600)]
-    assert (1, 1000) not in looked_at.log  # what is not confirmed is not looked at again
+    assert looked_at.passes([30.0, 50.0], p0_600=30.0, p1_600=49.9) == [(0, 600)]
+    assert (1, 1000) not in looked_at.log  # what is not confirmed is not matched again
 
 
-def test_a_confirmed_plane_is_seen_larger_and_the_stronger_look_counts(looked_at):
-    assert looked_at.looks([30.0], p0_600=80.0, p0_1000=90.0) == [(0, 1000)]
-    assert looked_at.looks([30.0], p0_600=80.0, p0_1000=70.0) == [(0, 600)]
-    assert looked_at.looks([30.0], p0_600=80.0, p0_1000=20.0) == [(0, 600)]
-    assert looked_at.looks([30.0], p0_600=80.0) == [(0, 600)]
+def test_a_confirmed_plane_is_seen_larger_and_the_stronger_pass_counts(looked_at):
+    assert looked_at.passes([30.0], p0_600=80.0, p0_1000=90.0) == [(0, 1000)]
+    assert looked_at.passes([30.0], p0_600=80.0, p0_1000=70.0) == [(0, 600)]
+    assert looked_at.passes([30.0], p0_600=80.0, p0_1000=20.0) == [(0, 600)]
+    assert looked_at.passes([30.0], p0_600=80.0) == [(0, 600)]
 
 
-def test_the_looks_count_if_one_is_as_strong_as_the_look_that_led_to_them(looked_at):
+def test_the_passes_count_if_one_is_as_strong_as_the_pass_that_led_to_them(looked_at):
     both = {"p0_600": 60.0, "p1_600": 80.0}
-    assert looked_at.looks([30.0, 40.0], whole=80.0, **both) == [(1, 600), (0, 600)]
-    assert looked_at.looks([30.0, 40.0], whole=80.1, **both) == []
+    assert looked_at.passes([30.0, 40.0], whole=80.0, **both) == [(1, 600), (0, 600)]
+    assert looked_at.passes([30.0, 40.0], whole=80.1, **both) == []
 
 
 def result(rng: np.random.Generator, planes: int, matches: int) -> PairResult:
@@ -94,7 +94,7 @@ def result(rng: np.random.Generator, planes: int, matches: int) -> PairResult:
     )
 
 
-def test_the_matches_of_several_looks_stay_on_their_planes_and_keep_their_own_cells():
+def test_the_matches_of_several_passes_stay_on_their_planes_and_keep_their_own_cells():
     rng = rng_of(7)
     several = [result(rng, planes, 40 + planes) for planes in (2, 1, 3)]
     whole = as_one(several)
@@ -108,7 +108,7 @@ def test_the_matches_of_several_looks_stay_on_their_planes_and_keep_their_own_ce
         assert len(np.unique(side)) == whole.num_inliers
 
 
-def test_one_look_is_as_it_was():
+def test_one_pass_is_as_it_was():
     only = result(rng_of(8), 2, 30)
     assert as_one([only]) is only
 
@@ -126,13 +126,15 @@ def test_a_square_of_either_photo_keeps_its_first_match():
 
 
 def test_a_plane_must_grow_by_what_is_due_to_chance(monkeypatch):
-    """The evidence of a look is what its planes have beyond chance."""
+    """The significance of a pass is what its planes have beyond chance."""
     one = result(rng_of(10), 1, 30)
-    best = Look(one, np.asarray([100.0]))
+    best = MatchingPass(one, np.asarray([100.0]))
     weights: Any = None
     photo = ImageFile(name="a", path=Path("a"), size=(400, 300), sha256="0")
-    for evidence, counts in ((100.0 + BY_CHANCE, 1), (99.9 + BY_CHANCE, 0)):
-        seen = Look(one, np.asarray([evidence]))
-        monkeypatch.setattr(further_looks, "closer_look", lambda *_, seen=seen, **__: seen)
-        found = looks_at_planes(weights, (photo, photo), best, config=preset("default"), seed=0)
+    for significance, counts in ((100.0 + BY_CHANCE, 1), (99.9 + BY_CHANCE, 0)):
+        seen = MatchingPass(one, np.asarray([significance]))
+        monkeypatch.setattr(further_passes, "match_rectified", lambda *_, seen=seen, **__: seen)
+        found = match_planes_rectified(
+            weights, (photo, photo), best, config=preset("default"), seed=0
+        )
         assert len(found.confirmed) == counts and found.taken == 1 + counts

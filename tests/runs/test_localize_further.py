@@ -1,4 +1,4 @@
-"""Laws of closer looks at photos that are to be localized."""
+"""Laws of further passes over photos that are to be localized."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +10,7 @@ from pair_results import result
 from jaxsfm.config import preset
 from jaxsfm.runs import localize
 from jaxsfm.runs.localize_report import LocalizedPhoto
-from jaxsfm.sfm.register.locate_view import Localization, Place
+from jaxsfm.sfm.register.locate_view import Localization, LocatedView
 
 SOME_VIEW: Any = SimpleNamespace(centre=None)
 LOST = Localization(why="lost", on_surface=5)
@@ -22,7 +22,7 @@ TRUSTED = Localization(view=SOME_VIEW, trusted=True, why=None, on_surface=90, in
 @pytest.fixture
 def localized(monkeypatch):
     """What becomes of a photo, by its first and its second localization; with the pairs that were
-    looked at closer."""
+    matched further."""
 
     def of(first: Localization, second: Localization, *, likely: bool = True, looks: int = 2):
         asked: list = []
@@ -31,7 +31,7 @@ def localized(monkeypatch):
 
         def locate_photo(query: Any, models: Any, matches: dict, images: Any):
             found = second if matches["b", "q"].num_inliers == 30 else first
-            return Place(0, found, np.zeros(0, int))
+            return LocatedView(0, found, np.zeros(0, int))
 
         def look(pairs: Any) -> dict:
             asked.extend(pairs)
@@ -58,13 +58,13 @@ def localized(monkeypatch):
 
 
 @pytest.mark.parametrize("first", [LOST, DOUBTFUL])
-def test_a_photo_without_a_sure_pose_is_looked_at_closer(localized, first):
+def test_a_photo_without_a_sure_pose_is_matched_further(localized, first):
     found, asked = localized(first, TRUSTED)
     assert found.found is TRUSTED and asked == [("b", "q"), ("a", "q")]
     assert found.matches == 33  # those that gave the pose
 
 
-def test_a_pose_that_closer_looks_do_not_confirm_replaces_none_but_no_other(localized):
+def test_a_pose_that_further_passes_do_not_confirm_replaces_none_but_no_other(localized):
     assert localized(LOST, DOUBTFUL)[0].found is DOUBTFUL
     found, _ = localized(DOUBTFUL, MANY)
     assert found.found is DOUBTFUL and found.matches == 7  # those that gave this pose
@@ -82,6 +82,6 @@ def test_a_sure_pose_and_one_with_many_matches_are_not_looked_for_again(localize
     assert found.found is first and not asked
 
 
-def test_the_paper_looks_at_nothing_closer(localized):
+def test_the_paper_has_no_further_passes(localized):
     found, asked = localized(LOST, TRUSTED, looks=0)
     assert found.found is LOST and not asked

@@ -1,6 +1,6 @@
 """Both photos as seen from one place.
 
-A first look finds a rough geometry, if only from a few matches. With it, the part that both photos
+A first pass finds a rough geometry, if only from a few matches. With it, the part that both photos
 show is cut out of them, at one size, and one photo is turned and slanted by the affine map that
 leads to the other. The network, which knows neither scale nor rotation, then sees twice the same.
 """
@@ -22,7 +22,7 @@ SMALL_SIZE = 600
 MOST_ENLARGED = 4.0
 """No photo is enlarged more than this to fill the view; beyond, there is nothing to see."""
 GROWN = 0.3
-"""The view shows the box of the matches and so much of its sides more on each side: the first look
+"""The view shows the box of the matches and so much of its sides more on each side: the first pass
 may have seen only a part of what both photos show."""
 MARGIN = 0.025
 """The box grows by this share of the photo's longer side, too, so that a small one does not stay
@@ -48,11 +48,11 @@ class Located(NamedTuple):
 
 def upright(xy: np.ndarray, image: ImageFile) -> np.ndarray:
     """Points (n, 2) of the stored photo, in pixels of the upright one, float64."""
-    return mapped(np.linalg.inv(to_stored(image.size, image.orientation)), xy)
+    return transformed(np.linalg.inv(to_stored(image.size, image.orientation)), xy)
 
 
-def mapped(matrix: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Points (n, 2) mapped by an affine matrix (3, 3), float64."""
+def transformed(matrix: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Points (n, 2) transformed by an affine matrix (3, 3), float64."""
     return xy.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2]
 
 
@@ -98,7 +98,7 @@ def view_change(affine: np.ndarray) -> ViewChange:
     return ViewChange(float(max(stretch[0], 1 / stretch[1])), angle)
 
 
-def common_views(
+def rectified_views(
     matches: Located, image0: ImageFile, image1: ImageFile, *, size: int = SIZE
 ) -> tuple[PhotoView, PhotoView] | None:
     """A view of each photo in which matching points lie at about the same pixel; None if the

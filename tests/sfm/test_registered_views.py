@@ -13,11 +13,11 @@ from wall_scene import (
 )
 
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.check.other_places import Surface
+from jaxsfm.sfm.check.pose_ambiguity import Surface
 from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.refine.plane_geometry import normals
 from jaxsfm.sfm.register import grow
-from jaxsfm.sfm.register.grow import doubts
+from jaxsfm.sfm.register.grow import objections
 
 NEW = 3
 NAMES = [f"{k}.png" for k in range(4)]
@@ -42,7 +42,7 @@ def placed_before(own: int, others: int) -> Scene:
 def doubted(seen: Scene, *pairs: PairResult, full_size: bool = True) -> dict[str, str]:
     matches = {each.pair: each for each in pairs}
     details = {NAMES[NEW]: full_size}
-    return doubts(seen.model, seen.images, REFINEMENT, details, matches.keys(), matches)
+    return objections(seen.model, seen.images, REFINEMENT, details, matches.keys(), matches)
 
 
 @pytest.fixture(scope="module")

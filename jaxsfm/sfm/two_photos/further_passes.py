@@ -1,13 +1,14 @@
-"""Further looks at two photos: at other scales, turned, as seen from one place, and at each plane.
+"""Further passes over two photos: at other scales, turned, as seen from one place, and at each
+plane.
 
 The network knows neither scale nor rotation. Features are made at several sizes of a photo anyway,
 so a photo that shows things twice as large is matched at half its size, without describing anything
 again. Turned photos have to be described again; half the size is enough to see whether they match.
 
-For a closer look both photos are described again as seen from one place. A weak look may have a
-true plane among false ones, or two looks may have different ones. So each plane is a proposal of
-its own, and a look at a small common view tells which of them is true: under a true geometry the
-photos look alike and the evidence grows, under a false one it goes.
+For a rectified pass both photos are described again as seen from one place. A weak pass may have a
+true plane among false ones, or two passes may have different ones. So each plane is a proposal of
+its own, and a pass at a small common view tells which of them is true: under a true geometry the
+photos look alike and the significance grows, under a false one it goes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,17 +23,17 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photos import PhotoView, read_view
 from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import describe_pixels
-from jaxsfm.sfm.two_photos.common_view import (
+from jaxsfm.sfm.two_photos.matching_pass import BY_CHANCE, MatchingPass, match_once
+from jaxsfm.sfm.two_photos.rectification import (
     SMALL_SIZE,
     Located,
     affine_between,
-    common_views,
-    mapped,
+    rectified_views,
+    transformed,
 )
-from jaxsfm.sfm.two_photos.look import BY_CHANCE, Look, look
 
 MOST_PROPOSALS = 5
-"""So many proposals are looked at, the strongest first."""
+"""So many proposals are matched, the strongest first."""
 SAME = 0.1
 """Two affine maps that put the points of one of them closer than this share of their extent are one
 proposal."""
@@ -61,7 +62,7 @@ def at_octave(features: ImageFeatures, octave: int, *, config: Config) -> ImageF
 
 def at_other_scales(
     features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int
-) -> Iterator[Look]:
+) -> Iterator[MatchingPass]:
     """Looks at two photos at other relative scales; none if the features have a single octave."""
     images = (features0.image, features1.image)
     for octave0, octave1 in OCTAVES:
@@ -70,7 +71,7 @@ def at_other_scales(
         side0 = at_octave(features0, octave0, config=config)
         side1 = at_octave(features1, octave1, config=config)
         if all(min(side.dense.coarse_grid) >= LEAST_CELLS for side in (side0, side1)):
-            yield look(side0, side1, images, config=config, seed=seed)
+            yield match_once(side0, side1, images, config=config, seed=seed)
 
 
 def turned_view(image: ImageFile, quarters: int) -> PhotoView:
@@ -88,7 +89,7 @@ def turned_view(image: ImageFile, quarters: int) -> PhotoView:
 
 def turned(
     weights: Weights, features0: ImageFeatures, image1: ImageFile, *, config: Config, seed: int
-) -> Iterator[Look]:
+) -> Iterator[MatchingPass]:
     """Looks at two photos, the second one turned by one, two and three quarter turns."""
     for quarters in (1, 2, 3):
         view = turned_view(image1, quarters)
@@ -97,7 +98,7 @@ def turned(
             side = at_octave(features0, octave, config=config)
             if min(side.dense.coarse_grid) >= LEAST_CELLS:
                 images = (features0.image, image1)
-                yield look(side, seen, images, views=(None, view), config=config, seed=seed)
+                yield match_once(side, seen, images, views=(None, view), config=config, seed=seed)
 
 
 def describe_view(
@@ -107,7 +108,7 @@ def describe_view(
     return describe_pixels(weights, view.as_photo(image), read_view(image, view), config=config)
 
 
-def closer_look(
+def match_rectified(
     weights: Weights,
     images: tuple[ImageFile, ImageFile],
     matches: Located,
@@ -115,33 +116,33 @@ def closer_look(
     size: int,
     config: Config,
     seed: int,
-) -> Look | None:
-    """A look at both photos as seen from one place; None if the matches determine no place.
+) -> MatchingPass | None:
+    """A pass over both photos as seen from one place; None if the matches determine no place.
 
     Args:
       size: the longer side of the common view, pixels.
     """
-    views = common_views(matches, *images, size=size)
+    views = rectified_views(matches, *images, size=size)
     if views is None:
         return None
     seen0, seen1 = (
         describe_view(weights, image, view, config=config)
         for image, view in zip(images, views, strict=True)
     )
-    return look(seen0, seen1, images, views=views, config=config, seed=seed)
+    return match_once(seen0, seen1, images, views=views, config=config, seed=seed)
 
 
-def proposals(looks: Sequence[Look], images: tuple[ImageFile, ImageFile]) -> list[Located]:
-    """The matches that may show the true geometry: of whole looks and of single planes.
+def proposals(passes: Sequence[MatchingPass], images: tuple[ImageFile, ImageFile]) -> list[Located]:
+    """The matches that may show the true geometry: of whole passes and of single planes.
 
-    They are ordered by their evidence, and those that lead to the same view are left out.
+    They are ordered by their significance, and those that lead to the same view are left out.
     """
     found: list[tuple[float, Located]] = []
-    for each in looks:
-        found.append((each.evidence, each.located(*images)))
+    for each in passes:
+        found.append((each.significance, each.located(*images)))
         found += [
-            (float(evidence), each.on_planes(np.asarray([plane]), *images))
-            for plane, evidence in enumerate(each.plane_evidence)
+            (float(significance), each.on_planes(np.asarray([plane]), *images))
+            for plane, significance in enumerate(each.plane_significance)
         ]
     chosen: list[tuple[Located, np.ndarray]] = []
     for _, matches in sorted(found, key=lambda item: -item[0]):
@@ -156,54 +157,59 @@ def proposals(looks: Sequence[Look], images: tuple[ImageFile, ImageFile]) -> lis
 
 def _same(matches: Located, affine: np.ndarray, other: np.ndarray) -> bool:
     """Whether two affine maps lead to nearly the same view of the matches."""
-    ours, theirs = mapped(affine, matches.xy0), mapped(other, matches.xy0)
+    ours, theirs = transformed(affine, matches.xy0), transformed(other, matches.xy0)
     extent = float(np.ptp(ours, axis=0).max())
     return float(np.median(np.linalg.norm(ours - theirs, axis=1))) < SAME * extent
 
 
-class PlaneLooks(NamedTuple):
+class PlanePasses(NamedTuple):
     """Looks at the planes of a pair."""
 
-    confirmed: list[Look]
+    confirmed: list[MatchingPass]
     """Those that count, the strongest first."""
     taken: int
     """How many were taken, those included that do not count."""
 
 
-def looks_at_planes(
-    weights: Weights, images: tuple[ImageFile, ImageFile], best: Look, *, config: Config, seed: int
-) -> PlaneLooks:
-    """A look at each of the strongest planes of a look, as seen from one place.
+def match_planes_rectified(
+    weights: Weights,
+    images: tuple[ImageFile, ImageFile],
+    best: MatchingPass,
+    *,
+    config: Config,
+    seed: int,
+) -> PlanePasses:
+    """A pass over each of the strongest planes of a pass, as seen from one place.
 
     A common view of the whole scene fits one plane at best: other surfaces are shifted, stretched
     and slanted in it. In a view that fits their own plane they look alike in both photos, and their
     matches are more and nearer. The epipolar geometry of a pair depends on matches of several
     planes.
 
-    A look counts if what its planes have beyond chance is as much as the plane that led to it had
+    A pass counts if what its planes have beyond chance is as much as the plane that led to it had
     with chance, so it must grow a little: what is seen alike is confirmed, and a false plane goes.
-    Such a plane is seen once more, larger, and the stronger look counts. The looks find other
+    Such a plane is seen once more, larger, and the stronger pass counts. The passes find other
     planes nearby, too.
 
-    None counts if none is as strong as the look that led to them: under a true geometry at least
+    None counts if none is as strong as the pass that led to them: under a true geometry at least
     one is (docs/decisions/hard-pairs.md).
 
     Args:
-      best: the look whose planes are looked at, as many as `config.closer_looks` says.
+      best: the pass whose planes are matched, as many as `config.max_rectified_planes` says.
     """
-    strongest = np.argsort(-best.plane_evidence, kind="stable")[: config.closer_looks]
+    strongest = np.argsort(-best.plane_significance, kind="stable")[: config.max_rectified_planes]
     found, taken = [], 0
-    for plane in strongest[best.plane_evidence[strongest] > BY_CHANCE]:
+    for plane in strongest[best.plane_significance[strongest] > BY_CHANCE]:
         place = best.on_planes(np.asarray([plane]), *images)
         confirmed = []
         for size in SIZES:
-            nearer = closer_look(weights, images, place, size=size, config=config, seed=seed)
+            nearer = match_rectified(weights, images, place, size=size, config=config, seed=seed)
             taken += nearer is not None
-            if nearer is None or nearer.evidence < best.plane_evidence[plane]:
+            if nearer is None or nearer.significance < best.plane_significance[plane]:
                 break
             confirmed.append(nearer)
         if confirmed:
-            found.append(max(confirmed, key=lambda each: each.evidence))
-    found.sort(key=lambda each: -each.evidence)
-    counts = bool(found) and found[0].evidence >= best.evidence
-    return PlaneLooks(found if counts else [], taken)
+            found.append(max(confirmed, key=lambda each: each.significance))
+    found.sort(key=lambda each: -each.significance)
+    counts = bool(found) and found[0].significance >= best.significance
+    return PlanePasses(found if counts else [], taken)

@@ -74,7 +74,7 @@ def _covariance(own: np.ndarray, xy: np.ndarray, error_px: float, side: float) -
     return variance * np.linalg.inv(information)
 
 
-def projection_doubt(
+def projected_uncertainty(
     view: View,
     points: np.ndarray,
     xy: np.ndarray,
@@ -107,7 +107,7 @@ def projection_doubt(
     return float(np.sqrt(np.einsum("nia,ab,nib->n", others, covariance, others).mean() / 2))
 
 
-class PoseDoubt(NamedTuple):
+class PoseUncertainty(NamedTuple):
     """How far off a pose is expected to be: root mean square, infinite if nothing determines it."""
 
     centre: float
@@ -115,16 +115,16 @@ class PoseDoubt(NamedTuple):
     rotation_deg: float
 
 
-def pose_doubt(
+def pose_uncertainty(
     view: View, points: np.ndarray, xy: np.ndarray, error_px: float, side: float, *, focal: bool
-) -> PoseDoubt:
+) -> PoseUncertainty:
     """The expected error of a pose. Errors of the model itself come on top.
 
     Args:
-      points, xy, error_px, side, focal: as in `projection_doubt`.
+      points, xy, error_px, side, focal: as in `projected_uncertainty`.
     """
     covariance = _covariance(_jacobian(view, points, focal=focal), xy, error_px, side)
     if covariance is None:
-        return PoseDoubt(np.inf, np.inf)
+        return PoseUncertainty(np.inf, np.inf)
     turn, shift = (float(np.sqrt(np.trace(covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
-    return PoseDoubt(_reach(view, points) * shift, float(np.degrees(turn)))
+    return PoseUncertainty(_reach(view, points) * shift, float(np.degrees(turn)))

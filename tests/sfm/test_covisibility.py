@@ -19,8 +19,8 @@ from jaxsfm.config import Config, Refinement
 from jaxsfm.sfm import refined_models
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
 from jaxsfm.sfm.refine.passes import RefinementFigures
-from jaxsfm.sfm.refine.weak_views import Placement, taken_out
-from jaxsfm.sfm.refined_models import Believed, held_parts, refine_models
+from jaxsfm.sfm.refine.weak_views import RegistrationAttempt, taken_out
+from jaxsfm.sfm.refined_models import Believed, covisibility_components, refine_models
 
 VIEWS = 6
 
@@ -54,7 +54,7 @@ TIMES = st.integers(MIN_COUNT // 2, MIN_COUNT)
 @given(st.lists(st.tuples(SEEN, TIMES), max_size=8))
 def test_views_are_one_part_if_a_chain_of_shared_points_of_three_views_joins_them(groups):
     points = [views for views, times in groups for _ in range(times)]
-    assert held_parts(tracks_of(points), VIEWS) == slow_parts(points)
+    assert covisibility_components(tracks_of(points), VIEWS) == slow_parts(points)
 
 
 @pytest.mark.parametrize(
@@ -66,10 +66,10 @@ def test_views_are_one_part_if_a_chain_of_shared_points_of_three_views_joins_the
     ],
 )
 def test_a_third_view_must_show_enough_points(views, times, parts):
-    assert held_parts(tracks_of([views] * times), 4) == parts
+    assert covisibility_components(tracks_of([views] * times), 4) == parts
 
 
-DONE = RefinementFigures(passes=[], placed=[taken_out("gone", 3)])
+DONE = RefinementFigures(passes=[], registrations=[taken_out("gone", 3)])
 
 
 @pytest.fixture
@@ -99,15 +99,15 @@ def test_a_model_that_holds_together_stays_as_it_is(held):
     made = held({*range(5)})
     assert [registered(model) for model in made.models] == [{*NAMES}] and made.order == [0]
     (done,) = made.figures
-    assert done.holds and [row.name for row in done.placed] == ["gone"]
+    assert done.holds and [row.name for row in done.registrations] == ["gone"]
 
 
 def test_views_that_only_pairs_hold_lose_their_places(held):
     made = held({0, 1, 2}, {3, 4})
     assert [registered(model) for model in made.models] == [{*NAMES[:3]}] and made.order == [0]
     (done,) = made.figures
-    assert done.holds and [row.name for row in done.placed] == ["gone", *NAMES[3:]]
-    assert all(row.held is not None and row.held > 0 for row in done.placed)
+    assert done.holds and [row.name for row in done.registrations] == ["gone", *NAMES[3:]]
+    assert all(row.held is not None and row.held > 0 for row in done.registrations)
 
 
 def test_a_model_of_which_nothing_holds_stays_and_is_not_confirmed(held):
@@ -121,7 +121,7 @@ def test_a_model_of_which_nothing_holds_stays_and_is_not_confirmed(held):
 
 def weak_in(*passes: bool, octave_px: int | None) -> RefinementFigures:
     """The figures of passes, in some of which the third view is weak, and of its placing."""
-    view = Placement(
+    view = RegistrationAttempt(
         name=NAMES[2],
         registered=True,
         octave_px=octave_px,
@@ -133,7 +133,7 @@ def weak_in(*passes: bool, octave_px: int | None) -> RefinementFigures:
         type("Pass", (), {"accepted": True, "weak_views": [NAMES[2]] if weak else []})
         for weak in passes
     ]
-    return RefinementFigures(passes=each, placed=[view])
+    return RefinementFigures(passes=each, registrations=[view])
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_the_observations_of_a_view_that_nothing_confirms_hold_nothing(
     made = held({*range(5)}, done=done, weak_octaves=weak_octaves)
     gone = set() if stays else {NAMES[2]}
     assert [registered(model) for model in made.models] == [{*NAMES} - gone]
-    (row,) = made.figures[0].placed
+    (row,) = made.figures[0].registrations
     assert (row.name, row.candidates, row.agreed) == (NAMES[2], 230, 11)
     assert (row.held is None) == stays
 
@@ -170,15 +170,18 @@ def test_the_refinement_takes_out_a_photo_of_another_place(rendered, monkeypatch
         options=MapOptions(refine_intrinsics=False, threads=1),
     )
     assert [registered(model) for model in made.models] == [{*NAMES} - {NAMES[2]}]
-    (row,) = made.figures[0].placed
+    (row,) = made.figures[0].registrations
     assert row.name == NAMES[2] and row.held is not None and row.held >= MIN_COUNT
 
 
 def test_each_part_that_is_large_enough_is_a_model_of_its_own(held, monkeypatch):
     monkeypatch.setattr(refined_models, "MIN_VIEWS", 2)
-    monkeypatch.setattr(refined_models, "held_parts", lambda *_: [[0, 1], [3, 4], [2]])
+    monkeypatch.setattr(refined_models, "covisibility_components", lambda *_: [[0, 1], [3, 4], [2]])
     made = held({0, 1}, {3, 4}, {2, 3})
     sizes = [registered(model) for model in made.models]
     assert sizes == [{*NAMES[:2]}, {*NAMES[3:]}] and made.order == [0, 0]
     first, second = made.figures
-    assert [row.name for row in first.placed] == ["gone", NAMES[2]] and second.placed == []
+    assert [row.name for row in first.registrations] == [
+        "gone",
+        NAMES[2],
+    ] and second.registrations == []

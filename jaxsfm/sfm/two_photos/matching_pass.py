@@ -1,4 +1,4 @@
-"""One look at two photos: their matches, how strong they are, and how the photos were seen."""
+"""One pass over two photos: their matches, how strong they are, and how the photos were seen."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photos import PhotoView
 from jaxsfm.matching.pair_matching import match_features
-from jaxsfm.sfm.two_photos.common_view import Located, mapped, upright
+from jaxsfm.sfm.two_photos.rectification import Located, transformed, upright
 
 Views = tuple[PhotoView | None, PhotoView | None]
 """How both photos were seen; None stands for the whole photo."""
@@ -28,8 +28,8 @@ ENLARGED = 2.0
 counted in larger cells. In a thermal photo that is enlarged four times, false matches agree with
 their neighbours."""
 BY_CHANCE = 15.0
-"""Planes with less evidence than this do not count. Matches are not placed at random: repeated
-structure and neighbouring cells give false planes an evidence of up to 35 (photos of different
+"""Planes with less significance than this do not count. Matches are not placed at random: repeated
+structure and neighbouring cells give false planes a significance of up to 35 (photos of different
 places, docs/decisions/hard-pairs.md)."""
 
 
@@ -43,25 +43,25 @@ class Described(NamedTuple):
     """Working pixels per pixel of the photo."""
 
 
-class Look(NamedTuple):
+class MatchingPass(NamedTuple):
     """The outcome of matching two photos once."""
 
     result: PairResult
     """In pixels of the stored photos."""
-    plane_evidence: np.ndarray
-    """float64 (p,): the evidence of each plane (the function `plane_evidence`)."""
+    plane_significance: np.ndarray
+    """float64 (p,): the significance of each plane (the function `plane_significance`)."""
     views: Views = WHOLE
 
     @property
-    def evidence(self) -> float:
-        """The evidence of all planes."""
-        return total(self.plane_evidence)
+    def significance(self) -> float:
+        """The significance of all planes."""
+        return total(self.plane_significance)
 
     def located(self, image0: ImageFile, image1: ImageFile) -> Located:
         """The matches of the planes that are stronger than chance, or else of the strongest one."""
-        good = np.flatnonzero(self.plane_evidence > BY_CHANCE)
-        if not len(good) and len(self.plane_evidence):
-            good = np.asarray([self.plane_evidence.argmax()])
+        good = np.flatnonzero(self.plane_significance > BY_CHANCE)
+        if not len(good) and len(self.plane_significance):
+            good = np.asarray([self.plane_significance.argmax()])
         return self.on_planes(good, image0, image1)
 
     def on_planes(self, planes: np.ndarray, image0: ImageFile, image1: ImageFile) -> Located:
@@ -74,12 +74,12 @@ class Look(NamedTuple):
 
 
 def moved(result: PairResult, matrix0: np.ndarray, matrix1: np.ndarray) -> PairResult:
-    """Matches whose coordinates are mapped, in each photo by an affine matrix (3, 3)."""
+    """Matches whose coordinates are transformed, in each photo by an affine matrix (3, 3)."""
     h = matrix1 @ result.homographies @ np.linalg.inv(matrix0)
     return dataclasses.replace(
         result,
-        keypoints0=mapped(matrix0, result.keypoints0).astype(np.float32),
-        keypoints1=mapped(matrix1, result.keypoints1).astype(np.float32),
+        keypoints0=transformed(matrix0, result.keypoints0).astype(np.float32),
+        keypoints1=transformed(matrix1, result.keypoints1).astype(np.float32),
         homographies=h / np.linalg.norm(h, axis=(1, 2), keepdims=True),
     )
 
@@ -93,7 +93,7 @@ def to_stored(views: Views, images: tuple[ImageFile, ImageFile]) -> tuple[np.nda
     return first, second
 
 
-def look(
+def match_once(
     features0: ImageFeatures,
     features1: ImageFeatures,
     images: tuple[ImageFile, ImageFile],
@@ -101,7 +101,7 @@ def look(
     views: Views = WHOLE,
     config: Config,
     seed: int,
-) -> Look:
+) -> MatchingPass:
     """Match two photos.
 
     Args:
@@ -117,14 +117,14 @@ def look(
         )
         for features, view in zip((features0, features1), views, strict=True)
     )
-    evidence = plane_evidence(
+    significance = plane_significance(
         found,
         (described0, described1),
         threshold_px=config.threshold_px,
         fine_stride=config.fine_stride,
     )
-    return Look(
-        moved(found, *to_stored(views, images)) if views != WHOLE else found, evidence, views
+    return MatchingPass(
+        moved(found, *to_stored(views, images)) if views != WHOLE else found, significance, views
     )
 
 
@@ -133,7 +133,7 @@ def log10_choose(n: float, k: float) -> float:
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)) / math.log(10)
 
 
-def evidence_of_plane(members: float, candidates: float, chance: float) -> float:
+def neg_log10_nfa(members: float, candidates: float, chance: float) -> float:
     """-log10 of the expected number of planes with as many members among random matches.
 
     Args:
@@ -154,20 +154,20 @@ def _coarse_cells(cells: np.ndarray, columns: int, times: float) -> int:
     return len(np.unique(rows * columns + cols))
 
 
-def plane_evidence(
+def plane_significance(
     result: PairResult,
     described: tuple[Described, Described],
     *,
     threshold_px: float,
     fine_stride: int,
 ) -> np.ndarray:
-    """The evidence of each plane of a pair, float64 (p,).
+    """The significance of each plane of a pair, float64 (p,).
 
     It says how strongly the plane speaks for it that the two photos show the same. The number of
     inliers does not say it: a plane of thirty inliers can be true or chance. It depends on how many
-    matches were tried, how large the photos are and how near a match must be. The evidence of a
+    matches were tried, how large the photos are and how near a match must be. The significance of a
     plane is -log10 of the expected number of such planes among matches that are placed at random.
-    So it can be compared between looks at different sizes of the photos.
+    So it can be compared between passes at different sizes of the photos.
 
     Source: Moisan and Stival 2004, "A probabilistic criterion to detect rigid point matches between
     two images and estimate the fundamental matrix"; here for homographies.
@@ -182,7 +182,7 @@ def plane_evidence(
     chance = min(math.pi * threshold_px**2 / area, 0.5)
     larger = [max(zoom / ENLARGED, 1.0) for zoom in (first.zoom, second.zoom)]
     candidates = max(result.num_tentative / MATCHES_OF_A_CELL / max(larger) ** 2, 10.0)
-    evidence = []
+    significance = []
     for plane in range(len(result.homographies)):
         cells = result.cells[result.plane == plane]
         members = min(
@@ -190,10 +190,10 @@ def plane_evidence(
             _coarse_cells(cells[:, 1], second.columns, larger[1]),
             candidates,
         )
-        evidence.append(evidence_of_plane(members, candidates, chance))
-    return np.asarray(evidence, np.float64)
+        significance.append(neg_log10_nfa(members, candidates, chance))
+    return np.asarray(significance, np.float64)
 
 
-def total(evidence: np.ndarray) -> float:
-    """The evidence of a pair: what its planes have beyond chance, added up."""
-    return float(np.maximum(evidence - BY_CHANCE, 0.0).sum())
+def total(significance: np.ndarray) -> float:
+    """The significance of a pair: what its planes have beyond chance, added up."""
+    return float(np.maximum(significance - BY_CHANCE, 0.0).sum())

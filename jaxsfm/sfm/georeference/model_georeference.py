@@ -76,7 +76,7 @@ class AppliedSimilarity:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placement:
+class ModelGeoreference:
     """How one model was moved."""
 
     similarity: AppliedSimilarity | None
@@ -110,7 +110,9 @@ class NamedAnchors(NamedTuple):
     unused: dict[str, str]
 
 
-def placement(given: NamedAnchors, what: str, *, sure: bool) -> tuple[Placement, Similarity | None]:
+def georeferenced(
+    given: NamedAnchors, what: str, *, sure: bool
+) -> tuple[ModelGeoreference, Similarity | None]:
     """Find the move of a model onto measured positions.
 
     Args:
@@ -122,8 +124,8 @@ def placement(given: NamedAnchors, what: str, *, sure: bool) -> tuple[Placement,
     """
     anchors = given.anchors
 
-    def refused(why: str) -> tuple[Placement, None]:
-        return Placement(similarity=None, why_not=why, unused=given.unused), None
+    def refused(why: str) -> tuple[ModelGeoreference, None]:
+        return ModelGeoreference(similarity=None, why_not=why, unused=given.unused), None
 
     if len(given.names) < LEAST:
         return refused(f"the model has {len(given.names)} {what}; at least {LEAST} are needed")
@@ -153,7 +155,7 @@ def placement(given: NamedAnchors, what: str, *, sure: bool) -> tuple[Placement,
         )
         for k, name in enumerate(given.names)
     ]
-    found = Placement(
+    found = ModelGeoreference(
         similarity=AppliedSimilarity(
             scale=similarity.scale,
             rotation=(

@@ -1,4 +1,4 @@
-"""Closer looks at photos that found no place by their first matches.
+"""Further passes over photos that found no place by their first matches.
 
 The strongest pairs of such a photo are matched again at other scales, turned, and as seen from one
 place (`jaxsfm.sfm.two_photos`). Their matches say only where the photo may stand. Whether it stands
@@ -20,24 +20,24 @@ from jaxsfm.io.store import Store
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.runs.job import Job
 from jaxsfm.sfm.limits import REGISTER
-from jaxsfm.sfm.two_photos.pair_looks import HOPELESS, as_one, looks_at_pair, one_match_each
+from jaxsfm.sfm.two_photos.pair_passes import HOPELESS, as_one, match_in_passes, one_match_each
 
 KEPT_FEATURES = REGISTER.partners + 1
 """Photos whose features are in memory: those of one photo and of its partners."""
 
 
-def look_closer(
+def match_further(
     job: Job, images: Mapping[str, ImageFile], pairs: Iterable[Pair], *, store: Store | None = None
 ) -> dict[Pair, PairResult]:
-    """Match pairs with as many looks as they need.
+    """Match pairs with as many passes as they need.
 
-    Pairs that show no sign of a common part at any scale get no closer look.
+    Pairs that show no sign of a common part at any scale get no further pass.
 
     Args:
-      job: its config says how many planes are looked at, or that one look has to do
-        (`Config.closer_looks`); its stores may have features.
+      job: its config says how many planes are matched, or that one pass has to do
+        (`Config.max_rectified_planes`); its stores may have features.
       images: the photos of the pairs, by name.
-      store: where the results are kept, so that an interrupted run need not look again.
+      store: where the results are kept, so that an interrupted run need not match again.
 
     Returns:
       the matches of the pairs that are worth a try, original pixels. Pairs of photos that cannot
@@ -67,11 +67,11 @@ def look_closer(
 
 def _matched(job: Job, features: tuple[ImageFeatures, ImageFeatures]) -> PairResult:
     """The matches of a pair, one for each fine cell; none if they are hardly ever right."""
-    looks = looks_at_pair(
-        job.weights, features, config=job.config, seed=job.seed, worth_closer=HOPELESS
+    passes = match_in_passes(
+        job.weights, features, config=job.config, seed=job.seed, worth_further=HOPELESS
     )
-    found = as_one([each.result for each in looks.chosen])
-    if looks.evidence < REGISTER.evidence:
+    found = as_one([each.result for each in passes.chosen])
+    if passes.significance < REGISTER.significance:
         return without_matches(found)
     first, second = (job.config.fine_stride * float(np.mean(each.scale)) for each in features)
     return one_match_each(found, (first, second))
@@ -89,9 +89,9 @@ def without_matches(result: PairResult) -> PairResult:
     )
 
 
-def pairs_to_look_at(
+def pairs_to_rematch(
     lost: Iterable[str],
-    placed: Collection[str],
+    registered: Collection[str],
     counts: Mapping[Pair, PairCounts],
     *,
     least: int,
@@ -108,7 +108,7 @@ def pairs_to_look_at(
         own = [
             pair
             for pair in closest_pairs(name, counts)
-            if set(pair) - {name} <= set(placed) and counts[pair].num_tentative >= least
+            if set(pair) - {name} <= set(registered) and counts[pair].num_tentative >= least
         ]
         found |= dict.fromkeys(own[: REGISTER.partners])
     return list(found)

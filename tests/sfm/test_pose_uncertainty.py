@@ -10,7 +10,7 @@ from jaxsfm.colmap.resection import adjust_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.sfm.refine import octave_pose
-from jaxsfm.sfm.refine import pose_doubt as doubts_of_poses
+from jaxsfm.sfm.refine import pose_uncertainty as uncertainty_of_poses
 from jaxsfm.sfm.refine.fixed_structure import AlignedPoints, FixedStructure
 from jaxsfm.sfm.refine.octave_pose import (
     OctavePose,
@@ -18,7 +18,7 @@ from jaxsfm.sfm.refine.octave_pose import (
     follow,
     trusted,
 )
-from jaxsfm.sfm.refine.pose_doubt import pose_doubt, projection_doubt
+from jaxsfm.sfm.refine.pose_uncertainty import pose_uncertainty, projected_uncertainty
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 NIGHT = 2
@@ -32,8 +32,10 @@ def observed(scene: Room, rows: np.ndarray, sigma: float) -> AlignedPoints:
     return AlignedPoints(rows, points, xy + noise, scene.points[scene.visible[:, NIGHT]])
 
 
-def doubt_of(view: View, seen: AlignedPoints, error_px: float, side: float, focal=False) -> float:
-    return projection_doubt(
+def uncertainty_of(
+    view: View, seen: AlignedPoints, error_px: float, side: float, focal=False
+) -> float:
+    return projected_uncertainty(
         view, seen.points, seen.xy, seen.candidates, error_px, side, focal=focal
     )
 
@@ -57,7 +59,7 @@ def test_doubt_is_how_far_off_projections_are(rendered, sigma, focal):
         assert found is not None
         off = found.project(seen.points)[0] - seen.xy
         median = float(np.median(np.linalg.norm(off, axis=1)))
-        doubts.append(doubt_of(found, seen, median, 1, focal))
+        doubts.append(uncertainty_of(found, seen, median, 1, focal))
         errors.append(found.project(seen.candidates)[0] - view.project(seen.candidates)[0])
     true = np.sqrt(np.mean(np.square(errors)))
     assert 0.6 < np.median(doubts) / true < 1.3
@@ -75,7 +77,7 @@ def test_the_doubt_about_a_pose_is_how_far_off_it_is(rendered, focal):
         found = adjust_view(view, xy, points, refine_focal_length=focal)
         assert found is not None
         median = float(np.median(np.linalg.norm(found.project(points)[0] - xy, axis=1)))
-        doubts.append(pose_doubt(found, points, xy, median, 1, focal=focal))
+        doubts.append(pose_uncertainty(found, points, xy, median, 1, focal=focal))
         turn = rotation_angle_deg(found.rotation, view.rotation)
         errors.append((np.linalg.norm(found.centre - view.centre), turn))
     ratio = np.median(doubts, axis=0) / np.sqrt(np.mean(np.square(errors), axis=0))
@@ -84,10 +86,10 @@ def test_the_doubt_about_a_pose_is_how_far_off_it_is(rendered, focal):
 
 def test_the_doubt_about_a_pose_adds_the_variances_of_its_three_axes(rendered, monkeypatch):
     deviations = np.asarray([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) / 100  # of rotation, then of position
-    monkeypatch.setattr(doubts_of_poses, "_covariance", lambda *_: np.diag(deviations**2))
-    monkeypatch.setattr(doubts_of_poses, "_reach", lambda *_: 2.0)
+    monkeypatch.setattr(uncertainty_of_poses, "_covariance", lambda *_: np.diag(deviations**2))
+    monkeypatch.setattr(uncertainty_of_poses, "_reach", lambda *_: 2.0)
     points = rendered.points[:10]
-    found = pose_doubt(rendered.views[NIGHT], points, np.zeros((10, 2)), 1.0, 1, focal=False)
+    found = pose_uncertainty(rendered.views[NIGHT], points, np.zeros((10, 2)), 1.0, 1, focal=False)
     assert found.rotation_deg == pytest.approx(np.degrees(np.sqrt(1 + 4 + 9) / 100))
     assert found.centre == pytest.approx(2 * np.sqrt(16 + 25 + 36) / 100)
 
@@ -98,7 +100,7 @@ def test_points_in_a_corner_leave_more_doubt_than_fewer_everywhere(rendered):
     corner = rows[np.argsort(at @ [1.0, 1.0])[: len(rows) // 8]]
     spread = rows[:: len(rows) // 30]
     doubt = [
-        doubt_of(rendered.views[NIGHT], observed(rendered, some, 1.0), 1.0, 1)
+        uncertainty_of(rendered.views[NIGHT], observed(rendered, some, 1.0), 1.0, 1)
         for some in (corner, spread)
     ]
     assert len(spread) < len(corner) / 2 and doubt[0] > 2 * doubt[1]
@@ -109,24 +111,24 @@ def test_patches_that_overlap_count_once(rendered):
     seen = observed(rendered, rows, 1.0)
     twice = seen._replace(points=np.repeat(seen.points, 2, 0), xy=np.repeat(seen.xy, 2, 0))
     view = rendered.views[NIGHT]
-    assert doubt_of(view, twice, 1.0, 1) == pytest.approx(doubt_of(view, seen, 1.0, 1))
+    assert uncertainty_of(view, twice, 1.0, 1) == pytest.approx(uncertainty_of(view, seen, 1.0, 1))
 
 
 def test_one_point_determines_no_pose(rendered):
     seen = observed(rendered, np.full(40, np.flatnonzero(rendered.visible[:, NIGHT])[0]), 1.0)
-    assert doubt_of(rendered.views[NIGHT], seen, 1.0, 15) == np.inf
+    assert uncertainty_of(rendered.views[NIGHT], seen, 1.0, 15) == np.inf
 
 
 @pytest.mark.parametrize(
-    ("share", "doubt_px", "right"),
+    ("share", "uncertainty_px", "right"),
     [(0.06, 0.9, True), (0.04, 0.1, False), (0.5, 1.1, False), (0.5, np.inf, False)],
 )
 def test_a_pose_is_trusted_with_little_doubt_and_enough_that_agrees(
-    rendered, share, doubt_px, right
+    rendered, share, uncertainty_px, right
 ):
     view = rendered.views[NIGHT]
     seen = observed(rendered, np.arange(40), 1.0)
-    best = OctavePose(view, 2, seen, 40, 1.0, doubt_px, 30)
+    best = OctavePose(view, 2, seen, 40, 1.0, uncertainty_px, 30)
     pose = PoseHypothesis(view=view, own_camera=False, octaves={2: best}, share=share)
     assert trusted(pose) is (best if right else None)
     assert trusted(dataclasses.replace(pose, octaves={})) is None
@@ -145,8 +147,8 @@ def test_only_poses_that_end_in_doubt_are_followed_again_from_where_they_were_be
         names = [next(n for n, p in poses.items() if p is pose) for pose in moving]
         began.append([(name, poses[name].view) for name in names])
         for name in names:
-            doubt_px = found[name]
-            best = OctavePose(end, 2, seen, 40, 1.0, doubt_px, 30) if doubt_px else None
+            uncertainty_px = found[name]
+            best = OctavePose(end, 2, seen, 40, 1.0, uncertainty_px, 30) if uncertainty_px else None
             poses[name].view, poses[name].octaves = last, {2: best} if best else {}
 
     monkeypatch.setattr(octave_pose, "_descend", descend)

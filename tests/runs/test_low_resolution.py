@@ -7,7 +7,7 @@ import pytest
 
 from jaxsfm.config import preset
 from jaxsfm.io.images import ImageFile
-from jaxsfm.runs.job import first_look
+from jaxsfm.runs.job import low_resolution
 
 DEFAULT = preset("default")
 
@@ -33,17 +33,17 @@ def photos(*sides: int) -> list[ImageFile]:
         ([], None),
     ],
 )
-def test_the_median_photo_is_reduced_or_there_is_no_first_look(sides, size):
-    found = first_look(DEFAULT, photos(*sides))
+def test_the_median_photo_is_reduced_or_there_is_no_low_resolution(sides, size):
+    found = low_resolution(DEFAULT, photos(*sides))
     assert (found and found.max_size) == size
 
 
 def test_a_size_that_was_asked_for_is_taken():
-    asked = dataclasses.replace(DEFAULT, first_look=300, first_look_share=1.0)
-    found = first_look(asked, photos(640))
+    asked = dataclasses.replace(DEFAULT, low_resolution=300, low_resolution_share=1.0)
+    found = low_resolution(asked, photos(640))
     assert found is not None and found.max_size == 300
-    assert first_look(dataclasses.replace(asked, first_look=600), photos(640)) is None
+    assert low_resolution(dataclasses.replace(asked, low_resolution=600), photos(640)) is None
 
 
 def test_robust_describes_photos_at_full_size():
-    assert first_look(preset("robust"), photos(4000)) is None
+    assert low_resolution(preset("robust"), photos(4000)) is None

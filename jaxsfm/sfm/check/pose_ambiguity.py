@@ -18,8 +18,8 @@ from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.agreement import agreement
 from jaxsfm.sfm.check.check_model import VerifiedMatches, thinned, thinned_points
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
-from jaxsfm.sfm.check.model_check import OtherPlace
-from jaxsfm.sfm.limits import SECOND_PLACES
+from jaxsfm.sfm.check.model_check import PoseAmbiguity
+from jaxsfm.sfm.limits import POSE_AMBIGUITY
 from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import may_show
 from jaxsfm.sfm.refine.device_images import DeviceImages
@@ -45,7 +45,7 @@ class Surface(NamedTuple):
 
     def few(self) -> "Surface":
         """So many of the points as are tested in a second place."""
-        rows = thinned_points(self.model, per_view=SECOND_PLACES.tested_per_view)
+        rows = thinned_points(self.model, per_view=POSE_AMBIGUITY.tested_per_view)
         tracks = self.model.tracks.select_points(rows)
         return Surface(self.model.with_tracks(tracks), self.normal[rows])
 
@@ -59,14 +59,14 @@ class Surface(NamedTuple):
         return self._replace(model=self.model.with_views([*views[:k], view, *views[k + 1 :]]))
 
 
-def other_place(
+def pose_ambiguity(
     whole: Surface,
     few: Surface,
     images: DeviceImages,
     refinement: Refinement,
     refused: Refused,
     k: int,
-) -> OtherPlace | None:
+) -> PoseAmbiguity | None:
     """The second place of a view; None if it has none.
 
     Args:
@@ -86,25 +86,25 @@ def other_place(
         max_error_px=MATCH_ERROR_PX,
         estimate_focal_length=False,
         seed=refused.seed,
-        min_inlier_share=SECOND_PLACES.inlier_share,
+        min_inlier_share=POSE_AMBIGUITY.inlier_share,
     )
     if there is None or not _elsewhere(view, there, points):
         return None
     support = [_support(there, *part) for part in parts]
-    if sum(support) < SECOND_PLACES.least_inliers:
+    if sum(support) < POSE_AMBIGUITY.least_inliers:
         return None
     partners = [
         a if b == view.name else b
         for (a, b), count in zip(own, support, strict=True)
-        if count >= SECOND_PLACES.least_support
+        if count >= POSE_AMBIGUITY.least_support
     ]
     tested, contradicted = shown_by(few.with_view(k, there), images, refinement, k)
     if (
-        tested - contradicted < SECOND_PLACES.least_agreed
+        tested - contradicted < POSE_AMBIGUITY.least_agreed
         or contradicted > MAX_CONTRADICTED * tested
     ):
         return None
-    return OtherPlace(
+    return PoseAmbiguity(
         image=view.name,
         pairs=sorted(partners),
         agreed=tested - contradicted,
@@ -125,7 +125,7 @@ def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
     distance = np.median(np.linalg.norm(points - there.centre, axis=1))
     turned = rotation_angle_deg(there.rotation, view.rotation)
     return bool(
-        turned > SECOND_PLACES.rotation_deg or away > SECOND_PLACES.distance_share * distance
+        turned > POSE_AMBIGUITY.rotation_deg or away > POSE_AMBIGUITY.distance_share * distance
     )
 
 
@@ -153,13 +153,14 @@ def shown_by(few: Surface, images: DeviceImages, refinement: Refinement, k: int)
     return round(weight @ counts), round(weight @ found.contradicted[:, k])
 
 
-def other_places(
+def pose_ambiguities(
     surface: Surface, images: DeviceImages, refinement: Refinement, refused: Refused
-) -> list[OtherPlace]:
-    """The second places of all views of a model, sorted by name. Arguments as in `other_place`."""
+) -> list[PoseAmbiguity]:
+    """The second places of all views of a model, sorted by name. Arguments as in
+    `pose_ambiguity`."""
     named, few = {name for pair in refused.pairs for name in pair}, surface.few()
     found = [
-        other_place(surface, few, images, refinement, refused, k)
+        pose_ambiguity(surface, few, images, refinement, refused, k)
         for k, view in enumerate(surface.model.views)
         if view.name in named
     ]
@@ -167,13 +168,13 @@ def other_places(
     return sorted(places, key=lambda place: place.image)
 
 
-def second_places(
+def find_pose_ambiguities(
     model: Model,
     images: DeviceImages,
     given: VerifiedMatches,
     refinement: Refinement,
     against: Collection[Pair],
-) -> list[OtherPlace]:
+) -> list[PoseAmbiguity]:
     """The second places of the photos of a model that has been checked.
 
     Args:
@@ -186,4 +187,4 @@ def second_places(
     model = thinned(model)
     normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     refused = Refused({pair: given.matches[pair] for pair in sorted(against)}, given.seed)
-    return other_places(Surface(model, normal), images, refinement, refused)
+    return pose_ambiguities(Surface(model, normal), images, refinement, refused)
