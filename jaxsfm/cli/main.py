@@ -13,6 +13,7 @@ from jaxsfm.cli.bench_commands import bench, data
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.model_commands import evaluate, extend, localize, merge, refine, report, view
 from jaxsfm.cli.network_commands import train, weights, with_action
+from jaxsfm.cli.old_options import current
 from jaxsfm.cli.run_commands import demo, frames, match, pairs, reconstruct
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
@@ -94,7 +95,7 @@ def main(argv: list[str] | None = None) -> int:
                 COMMANDS,
                 prog="jaxsfm",
                 description=DESCRIPTION,
-                args=with_action(sys.argv[1:] if argv is None else argv),
+                args=with_action(current(sys.argv[1:] if argv is None else argv)),
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
             )
     except UserError as error:

@@ -15,7 +15,7 @@ from jaxsfm.io.pairs import Pair, exhaustive_pairs, make_pair, read_pairs
 
 FEW = 40
 """Up to so many photos, `auto` tries all pairs: at most 780, which take three minutes on two cores
-in a first look."""
+in low-resolution matching."""
 MANY = "retrieval:20+sequential:3"
 """What `auto` tries of more photos: similar ones, and neighbours by name."""
 

@@ -80,7 +80,7 @@ def _device_memory(mesh: Mesh) -> int | None:
     return stats.get("bytes_limit") if stats else None
 
 
-@functools.cache  # tracing takes a tenth of the time of a pair's looks otherwise
+@functools.cache  # tracing takes a tenth of the time of a pair's passes otherwise
 def joined_bytes(num_coarse: int, *, config: Config) -> int:
     """Bytes of one image's joined features, padded to `num_coarse` cells in the first octave.
 

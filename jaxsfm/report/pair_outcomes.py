@@ -49,8 +49,8 @@ class PairOutcomes(NamedTuple):
             return (
                 f"{row.colmap_inliers} inliers, but its rotation differs from that of stronger "
                 f"pairs by {verdict.rotation_error_deg:.0f} deg ({TRUST.rotation_deg:.0f} deg are "
-                f"allowed), and its strength is {verdict.edge_weight:.3f}"
-                + f" (a pair of strength {TRUST.strong} or more may have any rotation)"
+                f"allowed), and its edge weight is {verdict.edge_weight:.3f}"
+                + f" (with {TRUST.strong} or more, any rotation is allowed)"
                 * (verdict.edge_weight < TRUST.strong)
             )
         if row.inliers and row.handed_on:

@@ -18,6 +18,7 @@ from jaxsfm.colmap.mapper import Attempt
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json, write_atomic
 from jaxsfm.io.typed_files import read_json
+from jaxsfm.report.old_names import with_new_names
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     LowResolution,
@@ -39,8 +40,9 @@ from jaxsfm.sfm.georeference.georeference import Georeference
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 FILE = "report.json"
-FORMAT = 2
-"""The version of the format. Reports of format 1 have no key `format`."""
+FORMAT = 3
+"""The version of the format. Reports of format 1 have no key `format`. In those of format 2, some
+keys have other names (`jaxsfm.report.old_names`)."""
 T = TypeVar("T")
 _WORST_FIRST: tuple[VerdictColour, ...] = ("red", "amber", "green")
 
@@ -164,7 +166,7 @@ class RunReport:
     @classmethod
     def from_json(cls, value: object) -> "RunReport":
         """A report from plain JSON; msgspec.ValidationError if this version cannot read it."""
-        return msgspec.convert(value, cls)
+        return msgspec.convert(with_new_names(value), cls)
 
 
 def write_report(folder: Path, report: RunReport) -> None:
@@ -183,7 +185,7 @@ def read_part(folder: Path, kind: type[T], *keys: str) -> T:
     Raises:
       UserError: there is no report, or the part is damaged or of another version.
     """
-    value = read_json(folder / FILE, object)
+    value = with_new_names(read_json(folder / FILE, object))
     if value is None:
         raise UserError(f"{folder}: no finished run here ({FILE} is missing or damaged)")
     try:

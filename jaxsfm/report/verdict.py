@@ -96,7 +96,7 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
     if colour == "amber" and check.unconfirmed:
         headline = f"{colour}: the photos do not show most points of the model"
     elif colour == "amber" and check.scale_drift:
-        headline = f"{colour}: a part of the model may have shrunk"
+        headline = f"{colour}: the scale of a part of the model may have drifted"
     elif colour == "amber" and places:
         count = len({place.image for place in places})
         fit = "1 photo fits" if count == 1 else f"{count} photos fit"
@@ -164,8 +164,8 @@ def _fits(place: PoseAmbiguity) -> Finding:
 def _other_model(other: Alternative) -> Finding:
     if other.whole:
         text = (
-            f"alternative/0 has {other.images} photos in one model, as they were before they were "
-            f"told apart; photos contradict each other at {other.contradicted} of its points"
+            f"alternative/0 has {other.images} photos in one model, as it was before it was "
+            f"split; photos contradict each other at {other.contradicted} of its points"
         )
         return Finding(text, other.elsewhere)
     text = f"alternative/0 is another mapping, which follows {FOLLOWS[other.basis]}"

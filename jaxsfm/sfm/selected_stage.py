@@ -249,7 +249,7 @@ def _components(
 ) -> tuple[list[CheckedModel], list[list[str]]]:
     """The parts of a model, and the photos of each part, also of those that are too small.
 
-    If the model stays whole, it is the only part, and no photos are told apart.
+    If the model stays whole, it is the only part, and no photos are split off.
     """
     model, done = whole
     made: list[CheckedModel] = []

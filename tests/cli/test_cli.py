@@ -14,6 +14,7 @@ import pytest
 from verdicts import with_verdicts
 
 from jaxsfm import options
+from jaxsfm.cli import old_options
 from jaxsfm.cli.arguments import MatchingChoice, ModelChoice
 from jaxsfm.cli.bench_commands import BENCHMARKS
 from jaxsfm.cli.main import COMMANDS, main
@@ -464,7 +465,7 @@ def test_lost_images_are_explained(scene, tmp_path, capsys):
     report = run(scene, tmp_path / "out", images=folder)
     lost = {row["image"]: row["stage"] for row in report["lost"]}
     assert lost == {"blank.png": "too few matches"} or lost == {"blank.png": "no plane"}
-    assert "closer looks" not in report["seconds"]  # a blank photo shows nothing at any scale
+    assert "further passes" not in report["seconds"]  # a blank photo shows nothing at any scale
     (row,) = report["lost"]
     assert row["best_pair"]["tentative"] >= 0 and "--preset robust" in row["help"][0]["option"]
     groups = report["view_graph"]["components"]
@@ -747,3 +748,16 @@ def test_a_backbone_that_cannot_be_used_is_one_sentence(scene, tmp_path, capsys)
         assert main([*arguments, *more]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert "backbone" in line and word in line
+
+
+def test_an_old_option_is_read_under_its_new_name_and_told(capsys):
+    given = ["reconstruct", "PHOTOS", "--first-look", "0", "--first_look=640", "map-again"]
+    asked = [*given, "--without", "map-again", "split", "second-places", "--out", "map-again"]
+    assert old_options.current(asked) == [
+        *("reconstruct", "PHOTOS", "--low-resolution", "0", "--low-resolution=640", "map-again"),
+        *("--without", "remap", "split", "pose-ambiguity", "--out", "map-again"),
+    ]
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 4 and told[0].startswith("jaxsfm: --first-look is called --low-resolution")
+    assert old_options.current(["demo", "--seed", "1"]) == ["demo", "--seed", "1"]
+    assert capsys.readouterr().err == ""

@@ -130,7 +130,7 @@ def test_what_is_damaged_is_made_again_and_equal(weights, images, before, again,
 def test_local_descriptors_that_went_away_meanwhile_are_made_again(
     weights, images, before, again, computed, monkeypatch
 ):
-    """Between the first look and the vocabulary."""
+    """Between low-resolution matching and the vocabulary."""
     shutil.rmtree(again.path)
     real = global_descriptors._vocabulary
 

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import pytest
@@ -14,6 +14,8 @@ from verdicts import NAMES, with_verdicts
 
 from jaxsfm.core.types import Status
 from jaxsfm.errors import UserError
+from jaxsfm.report.old_names import RENAMED, with_new_names
+from jaxsfm.report.run_inputs import LowResolution
 from jaxsfm.report.run_report import FORMAT, RunReport, read_part, read_report, write_report
 from jaxsfm.report.run_results import PairStatus, ViewGraph
 from jaxsfm.report.summary import summary_lines
@@ -31,7 +33,8 @@ def old(tmp_path) -> Path:
 
 
 def test_a_report_of_the_first_format_is_read_and_loses_nothing(old):
-    plain, report = json.loads(FORMAT_1.read_text()), read_report(old)
+    plain: Any = with_new_names(json.loads(FORMAT_1.read_text()))
+    report = read_report(old)
     assert "format" not in plain and report.format == 1
     for row in plain["pairs"]["each"]:  # nothing could be rejected then
         row["view_graph"]["rejected"] = False
@@ -46,6 +49,47 @@ def test_a_report_of_the_first_format_is_read_and_loses_nothing(old):
     assert report.models[0].registered == 7 and report.pairs.each[0].status == PairStatus.VERIFIED
     assert report.options["mapper"] == "incremental"
     assert "registered       7 of 7 images" in summary_lines(report)
+
+
+def under_old_names(report: Any) -> Any:
+    """A report as format 2 named its keys."""
+
+    def back(value: Any, path: tuple[str, ...], old: str, new: str) -> None:
+        for key in path:
+            if key == "*":
+                for each in value:
+                    back(each, path[path.index("*") + 1 :], old, new)
+                return
+            value = (value or {}).get(key)
+            if value is None:
+                return
+        if value and new in value:
+            value[old] = value.pop(new)
+
+    for path, new in reversed(RENAMED):
+        back(report, path[:-1], path[-1], new)
+    return report | {"format": 2}
+
+
+def test_a_report_of_the_second_format_is_read_under_its_names(old, tmp_path):
+    report = with_verdicts(read_report(old), "amber", "red")
+    report = dataclasses.replace(report, format=2, low_resolution=LowResolution(px=800))
+    plain = under_old_names(json.loads(json.dumps(report.to_json())))
+    assert (
+        plain["looks"] == {"first_px": 800, "whole": False} and "told_apart" in plain["checks"][0]
+    )
+    assert "strength" in plain["pairs"]["each"][0]["view_graph"]
+    (tmp_path / "report.json").write_text(json.dumps(plain))
+    assert read_report(tmp_path) == report
+    assert under_old_names(report.to_json()) == plain  # what was given stays as it is
+
+
+def test_a_new_name_counts_before_an_old_one():
+    both = {"checks": [{"shrunk": ["a"], "scale_drift": ["b"]}, None, {"shrunk": ["c"]}], "lost": 3}
+    assert with_new_names(both) == {
+        "checks": [both["checks"][0], None, {"scale_drift": ["c"]}],  # type: ignore[index]
+        "lost": 3,
+    }
 
 
 def test_a_written_report_is_read_again(old, tmp_path):

@@ -106,7 +106,7 @@ def test_photos_that_were_split_off_are_amber_and_each_group_is_named():
     head, parts, advice = verdict_lines([verdict])
     assert head == "verdict          amber: two models may explain these photos"
     assert parts == (
-        "told apart       these photos were in one model, which something spoke against; each "
+        "split            these photos were in one model, which something spoke against; each "
         f"group is by itself now: {', '.join(NAMES[:3])}; {NAMES[3]}, {NAMES[4]}; {NAMES[5]}; "
         "and 3 more"
     )
@@ -119,10 +119,10 @@ def test_photos_that_were_split_off_are_amber_and_each_group_is_named():
     assert found.text.endswith(f"; {NAMES[5]}")
 
 
-def test_a_part_that_may_have_shrunk_is_amber_and_its_photos_are_named():
+def test_a_part_whose_scale_may_have_drifted_is_amber_and_its_photos_are_named():
     verdict = model_verdict(dataclasses.replace(check_of("green"), scale_drift=NAMES[:2]))
     head, scale, advice = verdict_lines([verdict])
-    assert head == "verdict          amber: a part of the model may have shrunk"
+    assert head == "verdict          amber: the scale of a part of the model may have drifted"
     assert scale == (
         f"scale            {NAMES[0]}, {NAMES[1]} see their points a hundred times nearer than "
         "other photos do, or nearer still"
@@ -150,8 +150,8 @@ def test_the_model_that_was_split_off_is_shown_as_one_way_to_join_the_groups():
     check = dataclasses.replace(check_of("green"), split_groups=groups, alternative=whole)
     lines = verdict_lines([model_verdict(check)])
     assert lines[1] == (
-        "other model      alternative/0 has 8 photos in one model, as they were before they were "
-        "told apart; photos contradict each other at 9 of its points"
+        "other model      alternative/0 has 8 photos in one model, as it was before it was "
+        "split; photos contradict each other at 9 of its points"
     )
     assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in lines[3]
     assert "look at each model by itself" in lines[3] and "alternative/0" in lines[3]

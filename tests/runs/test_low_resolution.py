@@ -1,4 +1,4 @@
-"""Laws of the size of the first look."""
+"""Laws of the size of low-resolution matching."""
 
 import dataclasses
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Laws of parts of a model that have shrunk: seen by depths only, as nothing else shows it."""
+"""Laws of scale drift in a part of a model: seen by depths only, as nothing else shows it."""
 
 import dataclasses
 
@@ -54,7 +54,7 @@ def test_depths_are_medians_along_the_axis_of_the_view():
 
 
 @pytest.mark.parametrize(("nearer", "found"), [(0.99, []), (1.01, names(0, 2, 4))])
-def test_a_part_has_shrunk_if_its_photos_see_their_points_a_hundred_times_nearer(nearer, found):
+def test_the_scale_has_drifted_if_its_photos_see_their_points_a_hundred_times_nearer(nearer, found):
     far = nearer * MOST_SPREAD
     assert scale_drift(seeing_at(1, far, 1, far, 1, far)) == found
 
@@ -108,6 +108,6 @@ def test_a_part_that_shrinks_keeps_its_pixels_and_is_found_by_the_check():
     assert found.check.verdict != "green" and found.check.doubted()
 
 
-def test_a_shrunk_part_alone_makes_a_verdict_amber():
+def test_scale_drift_alone_makes_a_verdict_amber():
     check = dataclasses.replace(check_of("green"), scale_drift=["checked0.jpg", "checked3.jpg"])
     assert check.verdict == "amber" and check.doubted()

@@ -188,7 +188,7 @@ class FakeGrow:
         ([["3.png", "4.png"]], []),
         # One photo is left, and is registered by its matches at full size.
         ([["3.png"], ["4.png"]], ["full 4.png"]),
-        # It needs closer looks.
+        # It needs further passes.
         ([["3.png"], [], ["4.png"]], ["full 4.png", "further 4.png"]),
         # They do not help, and nothing new can be its partner.
         ([["3.png"], [], []], ["full 4.png", "further 4.png"]),

@@ -136,5 +136,5 @@ def test_a_question_about_the_camera_that_fails_leaves_the_model_and_one_line(
     [(0.9, 1), (1.0, 1), (1.24, 1), (1.25, 2), (1.4, 2), (1.92, 2), (2.8, 2), (3.0, 4)],
 )
 def test_keypoints_are_aligned_from_the_nearest_power_of_two_of_their_size(ratio, px):
-    """After a first look, which reduces photos by a quarter at least, that is never one."""
+    """After low-resolution matching, which reduces photos by a quarter or more, it is never one."""
     assert module.described_px(ratio) == px

@@ -225,8 +225,8 @@ def median_depths(model: Model) -> np.ndarray:
 
 
 def scale_drift(model: Model) -> list[str]:
-    """The photos that see their points so much nearer than most that a part of the model has
-    shrunk, sorted by name; none if all photos see them at similar distances.
+    """The photos that see their points so much nearer than most that the scale of a part of the
+    model has drifted, sorted by name; none if all photos see them at similar distances.
 
     The mapper joins the parts of a scene by the points that both show. Where these are few, the
     bundle adjustment can shrink one part, cameras and points together. Its reprojection errors stay

@@ -12,9 +12,9 @@ MIN_VIEWS = 3
 VerdictColour = Literal["green", "amber", "red"]
 """Green: nothing speaks against the model. Amber: another model may explain the photos as well.
 Some fit into the model in a second place, another model was made, photos that follow each other do
-not agree with the model, groups of photos contradicted each other and were told apart, a part of
-the model has shrunk, or the photos do not show enough of its points to refine it. Red: groups of
-its photos contradict each other."""
+not agree with the model, groups of photos contradicted each other and were split, the scale of a
+part of the model has drifted, or the photos do not show enough of its points to refine it. Red:
+groups of its photos contradict each other."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,12 +70,12 @@ class Alternative:
     contradicted: int
     """Points at which its photos contradict each other."""
     whole: bool = False
-    """Whether it is the model that was told apart, as it was before. Otherwise it follows what the
+    """Whether it is the model that was split, as it was before. Otherwise it follows what the
     model itself does not follow."""
 
 
 def repeats(split_groups: Sequence[Sequence[str]]) -> bool:
-    """Whether groups of photos that were told apart say that the scene repeats itself, so that it
+    """Whether groups of photos that were split say that the scene repeats itself, so that it
     may do so elsewhere, too.
 
     Photos that agree with each other, and contradict others that agree with each other, show two
@@ -104,7 +104,7 @@ class ModelCheck:
     contradict. Each group of three photos or more is in a model without the others now. They are
     the same for all models of a run (`repeats`)."""
     scale_drift: list[str] = dataclasses.field(default_factory=list)
-    """Photos that see their points so much nearer than others that a part of the model has shrunk
+    """Photos that see their points so much nearer than others that the scale of a part has drifted
     (`jaxsfm.sfm.check.check_model.scale_drift`). Sorted."""
     doubt: float = 0.0
     """How probable it is that the model is wrong, from how far its photos contradict each other
