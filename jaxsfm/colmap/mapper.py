@@ -38,7 +38,7 @@ halves twice by itself), the mapper starts with these. Of the first 50 frames of
 all are with these, their rotations right within 1.1 deg (median) before the refinement."""
 MAX_RETRIES = 2
 """Number of further initial pairs that are tried if the mapper's own choice leaves out images."""
-MIN_POINTS = 10
+MIN_MODEL_POINTS = 10
 """A model with fewer points is not refined."""
 
 
@@ -203,8 +203,8 @@ def with_all_points(
     COLMAP triangulates the points, joins them to tracks, adjusts them, and drops observations that
     are too far off. Poses and cameras stay.
 
-    If COLMAP finds fewer than `MIN_POINTS`, the model keeps those that it has. This happens to
-    models of two to four photos with a wrong camera: a model of *statue*, in which one of three
+    If COLMAP finds fewer than `MIN_MODEL_POINTS`, the model keeps those that it has. This happens
+    to models of two to four photos with a wrong camera: a model of *statue*, in which one of three
     photos had a focal length of a million pixels, came back without its 839 points. Then nothing
     could speak against it.
 
@@ -228,6 +228,6 @@ def with_all_points(
             ),
             database,
         )
-    if whole.num_points3D() < min(MIN_POINTS, model.num_points3D()):
+    if whole.num_points3D() < min(MIN_MODEL_POINTS, model.num_points3D()):
         return pycolmap.Reconstruction(model)
     return whole

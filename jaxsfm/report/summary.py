@@ -10,7 +10,7 @@ from jaxsfm.report.run_results import EvaluationReport, LostPhoto, ViewGraph
 from jaxsfm.report.verdict import model_verdicts, verdict_lines
 from jaxsfm.sfm.georeference.coordinate_system import Frame
 from jaxsfm.sfm.georeference.georeference import Georeference
-from jaxsfm.sfm.georeference.model_georeference import MAX_TURN_DEG, RegistrationAttempt, Rms
+from jaxsfm.sfm.georeference.model_georeference import MAX_TURN_DEG, ModelGeoreference, Rms
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 MAX_GROUPS = 10
@@ -202,7 +202,7 @@ def georeference_lines(found: Georeference | None) -> list[str]:
     return lines
 
 
-def _model_lines(found: Georeference, best: RegistrationAttempt) -> list[str]:
+def _model_lines(found: Georeference, best: ModelGeoreference) -> list[str]:
     if best.similarity is None or best.residual is None or found.frame is None:
         return [f"not moved        {best.why_not}"]
     used = len(best.anchors) - len(best.outliers)
