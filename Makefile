@@ -18,11 +18,13 @@ demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare it with the
 	rm -rf demo
 	$(BIN)/jaxsfm demo --out demo
 
-test: $(VENV)/.dev ## run the quick tests: 8 to 12 minutes on two cores
+test: $(VENV)/.dev ## run the quick tests
 	$(PYTEST) -m "not slow"
+	JAXSFM_TESTS_OPTIMIZED=1 $(PYTEST) -m "optimized and not slow"
 
 test-all: $(VENV)/.dev ## run all tests, the slow ones too
 	$(PYTEST)
+	JAXSFM_TESTS_OPTIMIZED=1 $(PYTEST) -m optimized
 
 mutants: $(VENV)/.dev ## make deliberate mistakes in the core and the refinement: do tests fail?
 	$(BIN)/python tests/mutants/run.py

@@ -101,6 +101,7 @@ def whole_numbers(rng, *channels: int):
     return stack, blocks.clear_padding(x, SIZES)
 
 
+@pytest.mark.optimized
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_whole_maps_and_strips_are_equal_bit_for_bit(way, monkeypatch, bfloat16):
     stack, x = whole_numbers(rng_of(1), 3, 6, 5)
@@ -121,6 +122,7 @@ def test_whole_maps_and_strips_are_equal_bit_for_bit(way, monkeypatch, bfloat16)
         np.testing.assert_array_equal(pooled, made[0][1])
 
 
+@pytest.mark.optimized
 def test_products_of_bfloat16_are_the_cpus_bit_for_bit(way):
     """Where sums are exact in float32 in any order: small whole numbers, results past 8 bits."""
     rng = rng_of(2)

@@ -147,6 +147,7 @@ def test_of_a_cells_verified_partners_one_survives_the_first_or_the_most_similar
     assert (ours != expected).sum() < 0.01 * ours.sum() < 0.1 * (expected != other).sum()
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_a_batch_is_its_pairs_one_by_one_bit_for_bit(features_of):
     features = features_of(PRESETS["default"])

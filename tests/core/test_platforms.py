@@ -304,6 +304,7 @@ def views_of_one_wall(rng):
     return view(0), view(4)
 
 
+@pytest.mark.optimized
 def test_the_sizes_of_accelerators_give_the_cpus_matches_bit_for_bit():
     rng = rng_of(0)
     limits = Thresholds(jnp.float32(10), jnp.int32(26), jnp.float32(0.999))

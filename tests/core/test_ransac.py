@@ -133,6 +133,7 @@ def test_the_capacity_and_the_chunks_change_nothing(key):
     np.testing.assert_array_equal(chunked.plane, planes.plane)
 
 
+@pytest.mark.optimized
 def test_steps_that_are_scored_together_give_the_same_planes(key):
     """Bit for bit: also where later steps of the last turn would have found a better plane."""
     shape = dataclasses.replace(SHAPE, max_hypotheses=90, hypotheses_per_step=4)
@@ -176,6 +177,7 @@ def calls_of(run, calls, *args) -> int:
     return len(calls)
 
 
+@pytest.mark.optimized
 def test_on_a_cpu_a_batch_is_its_pairs_bit_for_bit_and_draws_no_more_samples(monkeypatch):
     pairs = pairs_of_a_batch()
     each = [run(*(x[i] for x in pairs)) for i in range(4)]

@@ -127,10 +127,12 @@ print(json.dumps([len(one), all(a == b for a, b in zip(one, three, strict=True))
 """
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_any_number_of_devices_gives_what_one_gives_bit_for_bit(folder):
     """Three devices for five images and ten pairs: the last batches are not full."""
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=3"
+    environment = os.environ | {"XLA_FLAGS": flags}
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(folder)],
         env=environment,

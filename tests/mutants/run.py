@@ -75,7 +75,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/octaves": ("tests/core/test_octaves.py", PRODUCTS),
     "core/pair_shape": ("tests/core/test_presets.py", "tests/core/test_platforms.py"),
     "core/ransac": ("tests/core/test_ransac.py", "tests/core/test_planes.py"),
-    "core/retrieval": ("tests/core/test_retrieval.py", "tests/core/test_partners.py"),
+    "core/retrieval": ("tests/core/test_core_retrieval.py", "tests/core/test_partners.py"),
     "core/sharded": (BATCHES,),
     "core/types": ("tests/core/test_presets.py", PAIR),
     "core/winograd": ("tests/core/test_winograd.py", "tests/core/test_vgg.py"),

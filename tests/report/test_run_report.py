@@ -127,7 +127,7 @@ def test_a_part_of_a_report_is_read_whatever_the_rest_is(tmp_path):
     file.write_text('{"version": 1, "view_graph": {"components": []}, "models": [{}]}')
     assert read_part(tmp_path, ViewGraph, "view_graph") == ViewGraph()
     for keys, says in [
-        (("low_resolution",), "the key 'looks' is missing"),
+        (("low_resolution",), "the key 'low_resolution' is missing"),
         (("models", "first"), "the key 'first' is missing"),
         (("version",), "Expected `object`, got `int`"),
     ]:
@@ -142,7 +142,7 @@ def test_names_that_are_not_utf8_and_numbers_that_are_not_finite_are_written_and
     report = read_report(old)
     images = dataclasses.replace(report.images, skipped={"a\udcff.jpg": "the name is not UTF-8"})
     (judged, *_) = (row for row in report.pairs.each if row.view_graph is not None)
-    verdict = dataclasses.replace(judged.view_graph, strength=math.inf)
+    verdict = dataclasses.replace(judged.view_graph, edge_weight=math.inf)
     row = dataclasses.replace(judged, view_graph=verdict)
     pairs = dataclasses.replace(report.pairs, each=[row])
     report = dataclasses.replace(report, images=images, pairs=pairs)

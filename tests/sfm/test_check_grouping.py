@@ -14,8 +14,8 @@ from jaxsfm.sfm.check.grouping import (
     MAX_CONTRADICTED,
     Grouping,
     OpposedGroups,
+    consistent_components,
     group_views,
-    parts,
     share,
 )
 from jaxsfm.sfm.limits import CHECK
@@ -175,7 +175,7 @@ def test_no_part_holds_groups_that_contradict_each_other_and_none_could_be_joine
     # All sums of these are different, so what is joined first is certain.
     shared = {pair: 2 ** int(k) for pair, k in zip(pairs, rng.permutation(len(pairs)), strict=True)}
     seen = observed({(groups[a][0], groups[b][-1]): n for (a, b), n in shared.items()})
-    found = parts(opposing(groups, *against), *seen)
+    found = consistent_components(opposing(groups, *against), *seen)
     assert sorted(v for part in found for v in part) == list(range(len(views)))
     part_of = {v: k for k, part in enumerate(found) for v in part}
     where = [{part_of[v] for v in group} for group in groups]
@@ -189,7 +189,7 @@ def test_no_part_holds_groups_that_contradict_each_other_and_none_could_be_joine
     order = rng.permutation(len(groups)).tolist()
     place = {old: new for new, old in enumerate(order)}
     turned = opposing([groups[k] for k in order], *((place[a], place[b]) for a, b in against))
-    assert parts(turned, *seen) == found
+    assert consistent_components(turned, *seen) == found
     assert [len(part) for part in found] == sorted(map(len, found), reverse=True)
 
 
@@ -200,15 +200,15 @@ def test_a_group_goes_with_the_one_that_it_shares_points_with(shared, count):
     """Group 2 contradicts nobody; groups 0 and 1 share more, but contradict each other."""
     groups = [[0, 1], [2, 3], [4]]
     seen = observed({(0, 2): 500, (3, 4): shared, (1, 4): 10})
-    assert len(parts(opposing(groups, (0, 1)), *seen)) == count
+    assert len(consistent_components(opposing(groups, (0, 1)), *seen)) == count
 
 
 def test_points_that_several_views_of_a_group_see_count_once():
     seen = observed({(0, 1, 2, 3): CHECK.least_shared - 1})
-    assert len(parts(opposing([[0, 1], [2, 3]]), *seen)) == 2
+    assert len(consistent_components(opposing([[0, 1], [2, 3]]), *seen)) == 2
 
 
 def test_a_group_joins_no_part_that_holds_what_it_contradicts():
     """Groups 0 and 1 share most and are joined; group 2 contradicts 1, so it cannot join 0."""
     seen = observed({(0, 1): 500, (0, 2): 400, (1, 2): 300})
-    assert parts(opposing([[0], [1], [2]], (1, 2)), *seen) == [[0, 1], [2]]
+    assert consistent_components(opposing([[0], [1], [2]], (1, 2)), *seen) == [[0, 1], [2]]

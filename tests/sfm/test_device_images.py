@@ -157,6 +157,7 @@ def from_the_host(scene: Room, block: AlignedBlock) -> tuple[np.ndarray, np.ndar
     return xy, agrees
 
 
+@pytest.mark.optimized
 def test_blocks_equal_alignment_from_the_host_bit_for_bit(rendered):
     (block,) = blocks_of(rendered, images_of(rendered))
     xy, agrees = from_the_host(rendered, block)
@@ -165,6 +166,7 @@ def test_blocks_equal_alignment_from_the_host_bit_for_bit(rendered):
     np.testing.assert_array_equal(block.agrees, agrees)
 
 
+@pytest.mark.optimized
 def test_the_calls_of_accelerators_give_the_cpus_keypoints_bit_for_bit(rendered, monkeypatch):
     ours = blocks_of(rendered, images_of(rendered))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

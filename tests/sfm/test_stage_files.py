@@ -79,7 +79,7 @@ def test_checks_of_a_mapping_survive_a_file(tmp_path):
         rejection_candidates={},
         explained={PAIRS[1]},
         against={PAIRS[2], PAIRS[0]},
-        parts=[NAMES[:2], NAMES[2:]],
+        components=[NAMES[:2], NAMES[2:]],
     )
     assert rejected
     assert written_and_read(tmp_path, [found, None], list[Checked | None]) == [found, None]

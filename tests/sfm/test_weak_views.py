@@ -129,7 +129,7 @@ def test_refinement_places_a_view_that_it_cannot_align(rendered):
     after, figures = refine(before, night)
     assert [p.name for p in figures.registrations] == [NIGHT_NAME] == figures.passes[-1].weak_views
     without, old = refine(before, night, weak_octaves=0)
-    assert old.registered[0].octave_px is None and old.passes == figures.passes
+    assert old.registrations[0].octave_px is None and old.passes == figures.passes
     registered, kept = night_error(after, night), night_error(without, night)
     assert registered[0] < 0.01 and registered[0] < 0.7 * kept[0]
 
