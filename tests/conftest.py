@@ -10,8 +10,6 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-OPTIMIZED = os.environ.get("JAXSFM_TESTS_OPTIMIZED") == "1"
-"""Whether XLA optimizes programs as it does for users."""
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # two workers, one GPU
 # Compiled programs are shared by the workers and the processes that tests start (a notebook takes
 # 30 s instead of 72 s). They are not shared with the user's own cache: each session has a new one.
@@ -22,7 +20,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     # Compiling is most of what tests do, and without optimization it takes a fifth of the time
     # (12 s instead of 54 s for five programs of the core). Only rounding differs. Tests of laws of
     # rounding have the mark `optimized`, and run with optimized programs.
-    if not OPTIMIZED:
+    if os.environ.get("JAXSFM_TESTS_OPTIMIZED") != "1":
         os.environ["XLA_FLAGS"] = " ".join(
             [
                 os.environ.get("XLA_FLAGS", ""),
@@ -51,9 +49,11 @@ DATA = Path(os.environ.get("JAXSFM_DATA", Path(__file__).parents[2] / "shared" /
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests with the mark `optimized` need optimized programs, and are skipped without them."""
+    if os.environ.get("JAXSFM_TESTS_OPTIMIZED") == "1":
+        return
     without = pytest.mark.skip(reason="set JAXSFM_TESTS_OPTIMIZED=1, as `make test` does")
     for item in items:
-        if not OPTIMIZED and item.get_closest_marker("optimized"):
+        if item.get_closest_marker("optimized"):
             item.add_marker(without)
 
 
