@@ -65,7 +65,7 @@ def test_nothing_is_computed_in_64_bits_where_jax_has_64_bits(name):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(k, marks=[pytest.mark.slow] if call.slow else [])
+        pytest.param(k, marks=[pytest.mark.slow, pytest.mark.optimized] if call.slow else [])
         for k, call in CALLS.items()
         if not call.traced
     ],

@@ -144,6 +144,7 @@ def test_any_number_of_devices_gives_what_one_gives_bit_for_bit(folder):
     assert count > 50 and same
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 def test_features_are_the_programs_rounded_once(weights, images):
     image, config = images[0], CONFIG

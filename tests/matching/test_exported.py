@@ -73,6 +73,7 @@ def test_programs_run_without_jaxsfm_and_give_what_it_gives(weights, photos, tmp
     assert len(wanted) > 30 and len(matched ^ wanted) <= 0.02 * len(wanted)
 
 
+@pytest.mark.optimized
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "default"])
 def test_a_program_for_any_number_of_photos_gives_what_one_photo_gives(weights, photos, name):
