@@ -12,18 +12,16 @@ def current(argv: Sequence[str]) -> list[str]:
     """Arguments with the names of this version. Each old name is told on the standard error."""
     found, option = list[str](), ""
     for given in argv:
-        name, equals, value = given.partition("=")
         if given.startswith("--"):
-            name = "--" + name[2:].replace("_", "-")
-            option = name
-        if given.startswith("--") and name in OPTIONS:
-            _tell(name, OPTIONS[name])
-            found.append(OPTIONS[name] + equals + value)
+            name, equals, value = given.partition("=")
+            option = name.replace("_", "-")
+            if option in OPTIONS:
+                _tell(option, OPTIONS[option])
+                given = OPTIONS[option] + equals + value
         elif option == "--without" and given in STEPS:
             _tell(given, STEPS[given])
-            found.append(STEPS[given])
-        else:
-            found.append(given)
+            given = STEPS[given]
+        found.append(given)
     return found
 
 

@@ -229,12 +229,14 @@ def _former(path: Path) -> Identity | None:
     record = path / RECORD
     if not record.exists():
         return None
-    old = read_json(record, dict[str, Any])
-    if old is None or read_json(record, _Photos) is None:
+    old = read_json(record, dict[str, Any]) or {}
+    try:
+        _images(old)
+    except msgspec.ValidationError as error:
         raise UserError(
             f"--out {path}: the folder holds a run whose {RECORD} is damaged; "
             "choose another folder or delete this one"
-        )
+        ) from error
     return old
 
 

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+RENAMED_IN = 3
+"""The format whose reports have the new names."""
 EACH = "*"
 """All items of a list."""
 RENAMED: tuple[tuple[tuple[str, ...], str], ...] = (
@@ -26,6 +28,8 @@ RENAMED: tuple[tuple[tuple[str, ...], str], ...] = (
 
 def with_new_names(report: object) -> object:
     """A report whose keys have the names of this version; the given one stays as it is."""
+    if isinstance(report, dict) and report.get("format") == RENAMED_IN:
+        return report  # looking through 100,000 pairs takes longer than reading them
     for path, new in RENAMED:
         report = _renamed(report, path, new)
     return report

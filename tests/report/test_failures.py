@@ -49,6 +49,19 @@ def counts(status: Status, tentative: int, inliers: int = 0) -> PairCounts:
     )
 
 
+def refused_for(reason: str, candidates: int = 0) -> RegistrationAttempt:
+    """What registration says of the photo c, which it gives no place."""
+    return RegistrationAttempt(
+        name="c",
+        registered=False,
+        octave_px=None,
+        candidates=candidates,
+        agreed=0,
+        error_px=None,
+        reason=reason,
+    )
+
+
 def verdict(trusted: bool, error: float | None = 40.0, edge_weight: float = 0.05) -> Verdict:
     return Verdict(trusted=trusted, edge_weight=edge_weight, rotation_error_deg=error)
 
@@ -263,16 +276,7 @@ def test_an_image_that_registration_refused_says_why(verified, candidates, stage
         ("b", "c"): counts(Status.VERIFIED, 90, 60),
     }
     reason = "its matches with its neighbour b do not agree with it"
-    placed = RegistrationAttempt(
-        name="c",
-        registered=False,
-        octave_px=None,
-        candidates=candidates,
-        agreed=0,
-        error_px=None,
-        reason=reason,
-    )
-    figures = RefinementFigures(passes=[], registrations=[placed])
+    figures = RefinementFigures(passes=[], registrations=[refused_for(reason, candidates)])
     found = explained(
         "abc", tried, {("a", "b"): 300, ("b", "c"): verified}, [["a", "b"]], refinement=[figures]
     )
@@ -284,15 +288,7 @@ def test_an_image_that_registration_refused_says_why(verified, candidates, stage
 def test_an_image_that_was_split_off_and_then_refused_says_both():
     tried = {("a", "b"): counts(Status.VERIFIED, 500, 400)}
     tried |= {("b", "c"): counts(Status.VERIFIED, 90, 60)}
-    refused = RegistrationAttempt(
-        name="c",
-        registered=False,
-        octave_px=None,
-        candidates=0,
-        agreed=0,
-        error_px=None,
-        reason="X",
-    )
+    refused = refused_for("X")
     told = [["a", "b"], ["c"]]
     (row,) = explained(
         "abc",
@@ -310,15 +306,7 @@ def test_an_image_that_was_split_off_and_then_refused_says_both():
 def test_an_image_that_was_taken_out_and_then_refused_says_both():
     """It was taken out of the second model, and what registration says stands in the first one."""
     tried = {("a", "b"): counts(Status.VERIFIED, 500, 400)}
-    refused = RegistrationAttempt(
-        name="c",
-        registered=False,
-        octave_px=None,
-        candidates=0,
-        agreed=0,
-        error_px=None,
-        reason="X",
-    )
+    refused = refused_for("X")
     rows = [[refused], [taken_out("c", 17)]]
     (row,) = explained(
         "abc",

@@ -84,6 +84,12 @@ def test_a_report_of_the_second_format_is_read_under_its_names(old, tmp_path):
     assert under_old_names(report.to_json()) == plain  # what was given stays as it is
 
 
+def test_a_report_of_this_format_is_not_searched_for_old_names():
+    report = {"format": FORMAT, "looks": {"first_px": 800}}
+    assert with_new_names(report) is report
+    assert with_new_names(report | {"format": 2}) == {"format": 2, "low_resolution": {"px": 800}}
+
+
 def test_a_new_name_counts_before_an_old_one():
     both = {"checks": [{"shrunk": ["a"], "scale_drift": ["b"]}, None, {"shrunk": ["c"]}], "lost": 3}
     assert with_new_names(both) == {

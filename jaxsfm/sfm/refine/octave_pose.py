@@ -27,15 +27,15 @@ MIN_SHARE = 0.05
 is searched around (`jaxsfm.sfm.refine.pose_search`). At wrong poses up to 7 % agree, at right ones
 8 to 70 % at an eighth of the size (docs/decisions/weak-views.md)."""
 MAX_UNCERTAINTY_PX = 1.0
-"""Largest doubt about a trusted pose, working pixels. Right poses have 0.2 to 0.7. Of 24 poses
+"""Largest uncertainty of a trusted pose, working pixels. Right poses have 0.2 to 0.7. Of 24 poses
 followed from wrong starts (castle-P19 0016) one ends at 0.95, with 1.5 % of the points agreeing,
 and the others end above 1.6 or without any point."""
 MAX_SEARCHED_UNCERTAINTY_PX = 2.0
-"""Largest doubt about a pose that stands out after a search, working pixels. Of right ones, which
-are 0.5 to 3.3 px off (nights of fountain-P11 and castle-P19), the doubt is 0.4 to 1.9; wrong ones
+"""Largest uncertainty of a pose that stands out after a search, working pixels. Of right ones,
+which are 0.5 to 3.3 px off (nights of fountain-P11 and castle-P19), it is 0.4 to 1.9; wrong ones
 that are 16, 40 and 78 px off have 1.9, 2.5 and 4.2."""
 MAX_DESCENTS, SURE_PX = 2, 0.5
-"""A pose that ends in more doubt than SURE_PX (working pixels) is followed over all octaves once
+"""A pose that ends more uncertain than SURE_PX (working pixels) is followed over all octaves once
 more, from where it was best. A pose that was right only at the last octave finds more points at the
 first (castle-P19 night 0008: 1.84 m off at the start, 0.43 after one descent, 0.07 after two)."""
 MAX_STEPS, STILL_PX = 4, 0.5
@@ -71,7 +71,7 @@ class PoseHypothesis:
     """No other view has its camera, and its focal length may change."""
     octaves: dict[int, OctavePose] = dataclasses.field(default_factory=dict)
     """By working pixels per pixel of the octave: of the poses that the octave gave, the one of
-    least doubt."""
+    least uncertainty."""
     searched: bool = False
     """It was searched around, and has to stand out (`jaxsfm.sfm.refine.pose_search`)."""
     stands_out: OctavePose | None = None
@@ -85,7 +85,7 @@ class PoseHypothesis:
 
     @property
     def best(self) -> OctavePose | None:
-        """The pose of least doubt among those of the octaves."""
+        """The pose of least uncertainty among those of the octaves."""
         return min(self.octaves.values(), key=lambda each: each.uncertainty_px, default=None)
 
 
@@ -154,7 +154,7 @@ def _step(
 
 
 def follow(poses: Sequence[PoseHypothesis], structure: FixedStructure) -> None:
-    """Follow poses over all octaves, in place. Those that end in doubt are followed once more.
+    """Follow poses over all octaves, in place. Those that end uncertain are followed once more.
 
     Args:
       poses: of views that are not among those of the structure.

@@ -18,7 +18,7 @@ MEDIAN_RADIUS = 1.1774
 MAX_CONDITION = 1e12
 """Largest condition number of the normal equations of a pose. Good ones have 1e2 to 1e5."""
 MAX_PROBES = 2000
-"""Points at which the doubt about a pose is evaluated."""
+"""Points at which the uncertainty of a pose is evaluated."""
 
 
 def _jacobian(view: View, points: np.ndarray, *, focal: bool = False) -> np.ndarray:
