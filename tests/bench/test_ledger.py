@@ -260,6 +260,7 @@ def test_a_damaged_report_or_model_is_a_row_with_a_sentence(tmp_path):
 # -- runs that are made ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_that_raises_or_dies_says_so_in_a_sentence(tmp_path):
     assert apart(os._exit, 7) == "the process ended with exit status 7"
     assert apart(divmod, 1, 0).startswith("ZeroDivisionError: ")

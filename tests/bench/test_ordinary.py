@@ -103,6 +103,7 @@ def test_every_pixel_shows_something(name, blank):
         assert (render(planes, pose, SIZE) > 250).mean() > 0.999
 
 
+@pytest.mark.slow
 def test_somebody_who_passes_by_covers_a_part_of_each_photo(blank):
     scenes = [ordinary_scene(name, seed) for name in SCENES for seed in range(5)]
     crowded = [scene for scene in scenes if scene.passers]

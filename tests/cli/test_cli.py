@@ -188,6 +188,7 @@ def test_the_global_mapper_builds_a_model_too(scene, copied):
     assert report["models"] and report["models"][0]["registered"] == 3
 
 
+@pytest.mark.slow
 def test_reference_adds_an_evaluation(scene, tmp_path, plain):
     assert "evaluation" not in plain[1]
     reference = shutil.copytree(scene / "reference", tmp_path / "reference")
@@ -198,6 +199,7 @@ def test_reference_adds_an_evaluation(scene, tmp_path, plain):
     assert (found["registered"], found["reference_images"], found["missing"]) == (3, 3, [])
 
 
+@pytest.mark.slow
 def test_match_writes_arrays_and_a_picture_in_original_pixels(scene, tmp_path, capsys):
     images = [str(scene / "images" / n) for n in ("view0.png", "view2.png")]
     out, plot = tmp_path / "m.npz", tmp_path / "m.png"

@@ -1,5 +1,6 @@
 """Laws of types and precision that hold for every public function of the core."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -30,9 +31,13 @@ def equations(jaxpr) -> Iterator:
                     yield from equations(part)
 
 
-def program(name: str, *, x64: bool = False) -> list:
+@functools.cache
+def program(name: str, *, x64: bool = False) -> tuple[list, list]:
+    """The equations of a call, and the types of its results. It is traced once for all laws."""
+    call = CALLS[name]
     with jax.enable_x64(x64):
-        return list(equations(jax.make_jaxpr(CALLS[name].function)(*CALLS[name].args).jaxpr))
+        traced, results = jax.make_jaxpr(call.function, return_shape=True)(*call.args)
+    return list(equations(traced.jaxpr)), types(results)
 
 
 def types(tree) -> list:
@@ -50,18 +55,15 @@ def test_nothing_is_computed_in_64_bits_where_jax_has_64_bits(name):
 
     Numbers of Python (weak types) do not count: they take the type of what they meet.
     """
-    call = CALLS[name]
-    results = []
-    for x64 in (False, True):
-        with jax.enable_x64(x64):
-            results.append(jax.eval_shape(call.function, *call.args))
-    assert types(results[0]) == types(results[1])
-    for equation in program(name, x64=True):
+    computed, results = program(name, x64=True)
+    assert results == program(name)[1]
+    for equation in computed:
         for out in equation.outvars:
             wide = getattr(out.aval, "dtype", None) in (jnp.float64, jnp.complex128)
             assert not wide or out.aval.weak_type, equation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -89,11 +91,11 @@ def in_bfloat16(features):
 def test_coordinates_are_float32_also_where_features_are_bfloat16(name):
     call = CALLS[name]
     low = [in_bfloat16(x) if k in call.features else x for k, x in enumerate(call.args)]
-    for args in (call.args, low):
-        found = types(jax.eval_shape(call.function, *args))
+    for found in (program(name)[1], types(jax.eval_shape(call.function, *low))):
         assert {found[k] for k in call.coordinates} == {np.dtype(np.float32)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [k for k, c in CALLS.items() if c.coordinates and c.features and not c.slow | c.traced]
 )
@@ -108,7 +110,7 @@ def test_coordinates_of_bfloat16_features_are_those_of_the_same_numbers_in_float
 
 @EVERY
 def test_every_product_states_its_precision(name):
-    for equation in program(name):
+    for equation in program(name)[0]:
         if equation.primitive.name in PRODUCTS:
             assert equation.params["precision"] is not None, equation
 

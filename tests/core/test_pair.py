@@ -71,13 +71,16 @@ def equal(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-@pytest.mark.parametrize(
+EVERY_PRESET = pytest.mark.parametrize(
     "preset",
     [
         "paper",
         *(pytest.param(n, marks=pytest.mark.slow) for n in sorted(PRESETS.keys() - {"paper"})),
     ],
 )
+
+
+@EVERY_PRESET
 def test_matches_follow_the_known_map(features_of, warped, key, preset):
     f0, f1, _ = features_of(PRESETS[preset])
     found = match_pair(key, f0, f1, THRESHOLDS, shape=PRESETS[preset].pair)
@@ -119,7 +122,7 @@ def test_no_keypoint_is_matched_twice(features, key):
             assert len(np.unique(cells[:, side])) == len(cells)
 
 
-@pytest.mark.parametrize("preset", ["paper", "default"])
+@pytest.mark.parametrize("preset", ["paper", pytest.param("default", marks=pytest.mark.slow)])
 def test_of_a_cells_verified_partners_one_survives_the_first_or_the_most_similar(
     features_of, key, preset
 ):
@@ -186,17 +189,17 @@ def test_more_room_changes_nothing(features, key):
     )
 
 
-def test_swapping_the_images_swaps_the_matches(features_of, key):
-    for preset in PRESETS.values():
-        f0, f1, _ = features_of(preset)
-        forward = match_pair(key, f0, f1, THRESHOLDS, shape=preset.pair)
-        backward = match_pair(key, f1, f0, THRESHOLDS, shape=preset.pair)
-        assert forward.num_coarse == backward.num_coarse
-        assert forward.num_tentative == backward.num_tentative
-        ours = {tuple(c) for c in matches_of(forward, f0, f1)[0].tolist()}
-        swapped = {tuple(c[::-1]) for c in matches_of(backward, f1, f0)[0].tolist()}
-        # RANSAC draws differ, and the paper's error is one-way.
-        assert len(ours & swapped) > 0.85 * max(len(ours), len(swapped))
+@EVERY_PRESET
+def test_swapping_the_images_swaps_the_matches(features_of, key, preset):
+    f0, f1, _ = features_of(PRESETS[preset])
+    forward = match_pair(key, f0, f1, THRESHOLDS, shape=PRESETS[preset].pair)
+    backward = match_pair(key, f1, f0, THRESHOLDS, shape=PRESETS[preset].pair)
+    assert forward.num_coarse == backward.num_coarse
+    assert forward.num_tentative == backward.num_tentative
+    ours = {tuple(c) for c in matches_of(forward, f0, f1)[0].tolist()}
+    swapped = {tuple(c[::-1]) for c in matches_of(backward, f1, f0)[0].tolist()}
+    # RANSAC draws differ, and the paper's error is one-way.
+    assert len(ours & swapped) > 0.85 * max(len(ours), len(swapped))
 
 
 def test_the_key_of_a_pair_is_symmetric_and_its_own():

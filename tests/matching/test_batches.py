@@ -245,6 +245,7 @@ def test_a_hosts_memory_does_not_grow_with_the_number_of_small_images():
     assert 2 <= large <= 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("products", ["float32", "float16"])
 def test_memory_is_what_the_formula_says(features, products):
     config = dataclasses.replace(CONFIG, products=products)

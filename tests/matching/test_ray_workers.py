@@ -164,6 +164,7 @@ def test_workers_with_other_packages_are_refused(cluster, monkeypatch):
         results(echo)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "why"),
     [

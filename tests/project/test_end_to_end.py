@@ -11,6 +11,7 @@ from jaxsfm.sfm.evaluation import evaluate
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 
+@pytest.mark.slow
 def test_a_dozen_lines_of_python_do_the_same_as_the_command(tmp_path):
     from jaxsfm.bench.synthetic import camera_matrix, write_scene
 

@@ -261,6 +261,7 @@ print(json.dumps({"missing": sorted(missing), "refused": posix_only.refused}))
 """
 
 
+@pytest.mark.slow
 @ON_LINUX
 def test_every_module_is_imported_and_small_parts_work_without_what_windows_lacks(tmp_path, server):
     told = json.loads(as_on_windows(SMALL_PARTS, tmp_path, url(server)).splitlines()[-1])

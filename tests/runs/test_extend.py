@@ -183,6 +183,7 @@ def test_skipped_photos_are_named_once_and_new_when_they_are_mended(copied, tmp_
     assert "evaluation" not in report and "reference" in report["evaluation_failed"]
 
 
+@pytest.mark.slow
 def test_extend_asks_the_engine_that_was_chosen(copied, monkeypatch):
     run, photos = copied
     write(photos / "new.png", render(room(), POSE, SIZE))

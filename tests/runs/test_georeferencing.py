@@ -153,6 +153,7 @@ def test_exports_are_in_metres(placed, tmp_path):
         np.testing.assert_allclose(at, centres[Path(frame["file_path"]).name], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_localize_and_extend_stay_in_metres(placed, scene, tmp_path):
     run, photos = tmp_path / "run", tmp_path / "photos"
     shutil.copytree(placed.run, run)

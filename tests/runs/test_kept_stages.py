@@ -116,6 +116,7 @@ def test_a_refinement_that_a_lost_photo_prevented_is_tried_again(scene, tmp_path
     assert main([*base, "--out", str(out)]) == 0 and made == [1]
 
 
+@pytest.mark.slow
 def test_a_photo_that_was_away_for_a_moment_is_back_in_the_next_run(scene, tmp_path, monkeypatch):
     from jaxsfm.io import images
 

@@ -181,6 +181,7 @@ def test_kept_features_spare_the_next_call_and_change_no_pose(
     assert computed == [3, 1, 1]  # the run's photos once, the new one in each call
 
 
+@pytest.mark.slow
 def test_localize_asks_the_engine_that_was_chosen(localized, plain, photos, monkeypatch):
     """Even one that takes all photos in one call gives every photo what it has alone."""
     choices, engine = [], RecordingEngine(starts_workers=True)
@@ -306,6 +307,7 @@ def test_a_photo_has_the_camera_that_several_photos_of_its_size_have(plain, phot
     assert camera_prior(named, model.views, None, lambda _: "phone").source == "run"
 
 
+@pytest.mark.slow
 def test_a_photo_is_localized_in_the_model_of_which_it_shows_most(
     plain, photos, localized, tmp_path
 ):
