@@ -183,11 +183,9 @@ def _apart(pairs: Iterable[Pair]) -> list[Pair]:
     return found
 
 
-def attempt_of(
-    models: Sequence[pycolmap.Reconstruction], mapper: Mapper, start: Pair | None = None
-) -> Attempt:
-    """What a run of a mapper has made."""
-    return Attempt(mapper, start, [model.num_reg_images() for model in models])
+def attempt_of(models: Sequence[pycolmap.Reconstruction], mapper: Mapper) -> Attempt:
+    """What a run of a mapper has made, which started from a pair of its own choice."""
+    return Attempt(mapper, None, [model.num_reg_images() for model in models])
 
 
 def with_all_points(

@@ -116,11 +116,9 @@ def match_photos(
     Raises:
       ImageError: a photo cannot be decoded again.
     """
-    images = (features0.image, features1.image)
-    passes = match_in_passes(
-        weights, (features0, features1), config=config, seed=seed, worth_further=worth_further
-    )
-    aligned = [_aligned(each, images, config) for each in passes.chosen]
+    pair = PhotoPair((features0.image, features1.image), weights, config, seed)
+    passes = match_in_passes(pair, (features0, features1), worth_further=worth_further)
+    aligned = [_aligned(each, pair.images, config) for each in passes.chosen]
     return TwoPhotos(
         as_one([each.result for each in passes.chosen]),
         AlignedMatches(*map(np.concatenate, zip(*aligned, strict=True))),
@@ -168,27 +166,21 @@ class PairPasses(NamedTuple):
 
 
 def match_in_passes(
-    weights: Weights,
-    features: tuple[ImageFeatures, ImageFeatures],
-    *,
-    config: Config,
-    seed: int,
-    worth_further: float,
+    pair: PhotoPair, features: tuple[ImageFeatures, ImageFeatures], *, worth_further: float
 ) -> PairPasses:
     """As many passes over two photos as they need (`Config.max_rectified_planes`).
 
     Args:
-      features: of both photos, made with the same config.
+      features: of both photos, made with the config of the pair.
       worth_further: the significance that the search for the scale must find, or no further pass
         follows.
 
     Raises:
       ImageError: a photo cannot be decoded again.
     """
-    pair = PhotoPair((features[0].image, features[1].image), weights, config, seed)
     first = match_once(pair, *features)
     best, taken, least, conclusive = first, 1, HOPELESS, is_conclusive(first)
-    if not config.max_rectified_planes:
+    if not pair.config.max_rectified_planes:
         return PairPasses([first], taken)
     if not conclusive:
         searched = [first, *at_other_scales(pair, *features)]
