@@ -161,11 +161,11 @@ def pairs_at_once(
     A batch copies both sides of its pairs, into half of the memory that cached images leave.
     """
     asked, memory = execution.pairs_at_once, _device_memory(mesh)
-    if asked is None and memory is None:
+    if asked is None:
         asked = 1
-    elif asked is None:
-        each = 2 * joined_bytes(num_coarse, config=config) + PAIR_BYTES_PER_CELL * num_coarse
-        asked = _fitting((1 - DEVICE_SHARE) / 2 * memory, each, MAX_PAIRS)
+        if memory is not None:
+            each = 2 * joined_bytes(num_coarse, config=config) + PAIR_BYTES_PER_CELL * num_coarse
+            asked = _fitting((1 - DEVICE_SHARE) / 2 * memory, each, MAX_PAIRS)
     return min(asked, _own_part(count, mesh))
 
 
