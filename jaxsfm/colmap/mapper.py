@@ -120,37 +120,32 @@ def run_mapper(
                 False  # otherwise COLMAP starts every model from this pair, 50 times
             )
             _demand_little(p)
-        found = _incremental(database, scratch, p, on_image)
+
+        def incremental() -> list[pycolmap.Reconstruction]:
+            found = native(
+                lambda token: pycolmap.incremental_mapping(
+                    database,
+                    scratch,
+                    scratch,
+                    p,
+                    initial_image_pair_callback=lambda: (on_image(), on_image()) and None,
+                    next_image_callback=on_image,
+                    cancellation_token=token,
+                ),
+                database,
+            )
+            return list(found.values())
+
+        found = incremental()
         if not found and start is None:
             _demand_little(p)
-            found = _incremental(database, scratch, p, on_image)
+            found = incremental()
         return ordered(found)
 
 
 def _demand_little(p: pycolmap.IncrementalPipelineOptions) -> None:
     """Let the mapper start from a pair with few inliers, whose rays meet at small angles."""
     p.mapper.init_min_num_inliers, p.mapper.init_min_tri_angle = LOW_INLIERS, LOW_ANGLE_DEG
-
-
-def _incremental(
-    database: Path,
-    scratch: str,
-    p: pycolmap.IncrementalPipelineOptions,
-    on_image: Callable[[], None],
-) -> list[pycolmap.Reconstruction]:
-    found = native(
-        lambda token: pycolmap.incremental_mapping(
-            database,
-            scratch,
-            scratch,
-            p,
-            initial_image_pair_callback=lambda: (on_image(), on_image()) and None,
-            next_image_callback=on_image,
-            cancellation_token=token,
-        ),
-        database,
-    )
-    return list(found.values())
 
 
 def build_models(
@@ -188,11 +183,9 @@ def _apart(pairs: Iterable[Pair]) -> list[Pair]:
     return found
 
 
-def attempt_of(
-    models: Sequence[pycolmap.Reconstruction], mapper: Mapper, start: Pair | None = None
-) -> Attempt:
-    """What a run of a mapper has made."""
-    return Attempt(mapper, start, [model.num_reg_images() for model in models])
+def attempt_of(models: Sequence[pycolmap.Reconstruction], mapper: Mapper) -> Attempt:
+    """What a run of a mapper has made, which started from a pair of its own choice."""
+    return Attempt(mapper, None, [model.num_reg_images() for model in models])
 
 
 def with_all_points(

@@ -70,7 +70,11 @@ def other_camera(model: pycolmap.Reconstruction, *, threads: int) -> OtherCamera
     if len(model.cameras) != 1 or model.num_reg_images() < VIEWS_FOR_CENTRE:
         return None
     (held,) = model.cameras.values()
-    halves = [_adjusted(model, part, threads) for part in (0, 1)]
+    halves = []
+    for half in (_half(model, 0), _half(model, 1)):
+        bundle_adjust(half, loss_px=1.0, refine_intrinsics=True, threads=threads, steps=STEPS)
+        (camera,) = half.cameras.values()
+        halves.append(copy.deepcopy(camera))  # the model that holds it goes
     found = _between(*halves)
     distance, spread = camera_distance(held, found), camera_distance(*halves)
     if not math.isfinite(distance + spread):  # the adjustment has left what a lens can be
@@ -113,8 +117,9 @@ def _directions(camera: pycolmap.Camera, pixels: np.ndarray) -> np.ndarray:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def _adjusted(model: pycolmap.Reconstruction, part: int, threads: int) -> pycolmap.Camera:
-    """The camera of a copy of a model that has every second point, the first ones or the others."""
+def _half(model: pycolmap.Reconstruction, part: int) -> pycolmap.Reconstruction:
+    """A copy of a model that has every second point, the first ones or the others, with a camera
+    that can be adjusted."""
     half = pycolmap.Reconstruction(model)
     for k, number in enumerate(sorted(half.points3D)):
         if k % 2 != part:
@@ -124,9 +129,7 @@ def _adjusted(model: pycolmap.Reconstruction, part: int, threads: int) -> pycolm
         focal, centre = camera.params[: len(camera.focal_length_idxs())], camera.params[-2:]
         camera.model = WITH_DISTORTION
         camera.params = [focal[0], focal[-1], *centre, 0.0, 0.0, 0.0, 0.0]
-    bundle_adjust(half, loss_px=1.0, refine_intrinsics=True, threads=threads, steps=STEPS)
-    (camera,) = half.cameras.values()
-    return copy.deepcopy(camera)  # the model that holds it goes
+    return half
 
 
 def _between(first: pycolmap.Camera, second: pycolmap.Camera) -> pycolmap.Camera:

@@ -9,7 +9,6 @@ resized per axis with half-pixel centres. In COLMAP's files the centre of the to
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-COARSE_STRIDE = 16
 FINE_STRIDE = 8
 
 

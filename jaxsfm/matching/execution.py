@@ -153,22 +153,19 @@ PAIR_BYTES_PER_CELL = 35_000
 own account of the program of the preset `default` at 1600 x 1200; `paper` takes 13 000."""
 
 
-def fitting_pairs(memory: float, num_coarse: int, *, config: Config) -> int:
-    """How many pairs an accelerator with this memory (bytes) matches side by side.
-
-    A batch copies both sides of its pairs, into half of the memory that cached images leave.
-    """
-    each = 2 * joined_bytes(num_coarse, config=config) + PAIR_BYTES_PER_CELL * num_coarse
-    return _fitting((1 - DEVICE_SHARE) / 2 * memory, each, MAX_PAIRS)
-
-
 def pairs_at_once(
     execution: Execution, mesh: Mesh, num_coarse: int, count: int, *, config: Config
 ) -> int:
-    """How many of `count` pairs each device matches side by side, as in `images_at_once`."""
+    """How many of `count` pairs each device matches side by side, as in `images_at_once`.
+
+    A batch copies both sides of its pairs, into half of the memory that cached images leave.
+    """
     asked, memory = execution.pairs_at_once, _device_memory(mesh)
     if asked is None:
-        asked = 1 if memory is None else fitting_pairs(memory, num_coarse, config=config)
+        asked = 1
+        if memory is not None:
+            each = 2 * joined_bytes(num_coarse, config=config) + PAIR_BYTES_PER_CELL * num_coarse
+            asked = _fitting((1 - DEVICE_SHARE) / 2 * memory, each, MAX_PAIRS)
     return min(asked, _own_part(count, mesh))
 
 

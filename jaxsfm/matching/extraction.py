@@ -42,28 +42,39 @@ READERS = 8
 second."""
 
 
-def _start(
-    weights: Weights, working: Sequence[WorkingImage], config: Config, mesh: Mesh, batch_size: int
-) -> DenseFeatures:
-    """Start the extraction of images that share a padded size and a capacity.
+class _Extractor(NamedTuple):
+    """What the images of one call are extracted with."""
 
-    The features are on the devices, with leading axes for the devices and their batches.
-    """
-    padded, num_coarse = _shapes(working[0].rgb.shape[1::-1], config)
-    count = batch_size * mesh.size
-    images = np.zeros((count, *padded, 3), np.uint8)
-    sizes = np.zeros((count, 2), np.int32)
-    for k, each in enumerate(working):
-        height, width = sizes[k] = each.rgb.shape[:2]
-        images[k, :height, :width] = each.rgb
-    return _extract(
-        weights.params,
-        weights.scores(config),
-        images,
-        sizes,
-        mesh=mesh,
-        settings=extraction_settings(weights, config, num_coarse),
-    )
+    weights: Weights
+    config: Config
+    mesh: Mesh
+
+    def shapes(self, size: tuple[int, int]) -> tuple[tuple[int, int], int]:
+        """Padded size (width, height) and coarse capacity of a working image, which fix the
+        program."""
+        capacity = feature_capacity(size, fine_stride=self.config.fine_stride)
+        return padded_size(size), capacity.num_coarse
+
+    def start(self, working: Sequence[WorkingImage], batch_size: int) -> DenseFeatures:
+        """Start the extraction of images that share a padded size and a capacity.
+
+        The features are on the devices, with leading axes for the devices and their batches.
+        """
+        padded, num_coarse = self.shapes(working[0].rgb.shape[1::-1])
+        count = batch_size * self.mesh.size
+        images = np.zeros((count, *padded, 3), np.uint8)
+        sizes = np.zeros((count, 2), np.int32)
+        for k, each in enumerate(working):
+            height, width = sizes[k] = each.rgb.shape[:2]
+            images[k, :height, :width] = each.rgb
+        return _extract(
+            self.weights.params,
+            self.weights.scores(self.config),
+            images,
+            sizes,
+            mesh=self.mesh,
+            settings=extraction_settings(self.weights, self.config, num_coarse),
+        )
 
 
 def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Extraction:
@@ -85,11 +96,6 @@ def extraction_settings(weights: Weights, config: Config, num_coarse: int) -> Ex
     )
 
 
-def _shapes(size: tuple[int, int], config: Config) -> tuple[tuple[int, int], int]:
-    """Padded size (width, height) and coarse capacity of a working image, which fix the program."""
-    return padded_size(size), feature_capacity(size, fine_stride=config.fine_stride).num_coarse
-
-
 def image_features(weights: Weights, image: ImageFile, *, config: Config) -> ImageFeatures:
     """Read one image and compute its features; ImageError if it cannot be read."""
     ((_, found),) = extract_images(weights, [image], config=config, execution=ONE_AT_A_TIME)
@@ -108,10 +114,8 @@ def describe_pixels(
         its size and orientation, by the scale of `working`.
     """
     announce_compilation()
-    mesh = select_devices(ONE_AT_A_TIME)
-    ((_, found),) = _results(
-        (_Batch([(image, working)], 1), _start(weights, [working], config, mesh, 1))
-    )
+    extractor = _Extractor(weights, config, select_devices(ONE_AT_A_TIME))
+    ((_, found),) = _results((_Batch([(image, working)], 1), extractor.start([working], 1)))
     assert isinstance(found, ImageFeatures)
     return found
 
@@ -136,10 +140,10 @@ def extract_images(
     if images:
         announce_compilation()
     params = jax.device_put(weights.params, NamedSharding(mesh, PartitionSpec()))
-    weights = dataclasses.replace(weights, params=params)
+    extractor = _Extractor(dataclasses.replace(weights, params=params), config, mesh)
 
     def shapes(image: ImageFile) -> tuple[tuple[int, int], int]:
-        return _shapes(working_size(image.upright_size, config.max_size, config.enlarge), config)
+        return extractor.shapes(working_size(image.upright_size, config.max_size, config.enlarge))
 
     def batches() -> Iterator[_Batch]:
         for (padded, _), group in itertools.groupby(sorted(images, key=shapes), key=shapes):
@@ -152,7 +156,7 @@ def extract_images(
 
     def start(batch: _Batch) -> tuple[_Batch, DenseFeatures | None]:
         good = [each for _, each in batch.read if isinstance(each, WorkingImage)]
-        return batch, _start(weights, good, config, mesh, batch.side_by_side) if good else None
+        return batch, extractor.start(good, batch.side_by_side) if good else None
 
     return overlap_batches(batches(), start, _results)
 

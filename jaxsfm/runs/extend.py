@@ -46,6 +46,7 @@ from jaxsfm.runs.working_model import (
     weights_of_run,
 )
 from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.fixed_structure import ResectionMatches
 from jaxsfm.sfm.register.grow import grow
 from jaxsfm.sfm.register.locate_view import UnregisteredView
 
@@ -249,10 +250,9 @@ def write_extension(
         grown = grow(
             [each.model for each in working],
             unregistered,
-            matches,
+            ResectionMatches(matches, seed),
             DeviceImages(photos.gray),
             refinement=config.refinement,
-            seed=seed,
             on_view=on_view,
         )
     models = read_models(run.folder / "sparse", database)

@@ -20,6 +20,7 @@ from jaxsfm.io.store import Store
 from jaxsfm.matching.extraction import image_features
 from jaxsfm.runs.job import Job
 from jaxsfm.sfm.limits import REGISTER
+from jaxsfm.sfm.two_photos.matching_pass import PhotoPair
 from jaxsfm.sfm.two_photos.pair_passes import HOPELESS, as_one, match_in_passes, one_match_each
 
 KEPT_FEATURES = REGISTER.partners + 1
@@ -67,9 +68,8 @@ def match_further(
 
 def _matched(job: Job, features: tuple[ImageFeatures, ImageFeatures]) -> PairResult:
     """The matches of a pair, one for each fine cell; none if they are hardly ever right."""
-    passes = match_in_passes(
-        job.weights, features, config=job.config, seed=job.seed, worth_further=HOPELESS
-    )
+    pair = PhotoPair((features[0].image, features[1].image), job.weights, job.config, job.seed)
+    passes = match_in_passes(pair, features, worth_further=HOPELESS)
     found = as_one([each.result for each in passes.chosen])
     if passes.significance < REGISTER.significance:
         return without_matches(found)

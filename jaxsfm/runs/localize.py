@@ -49,6 +49,7 @@ from jaxsfm.runs.working_model import (
     weights_of_run,
 )
 from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.fixed_structure import ResectionMatches
 from jaxsfm.sfm.register.locate_view import LocatedView, UnregisteredView, best_location, locate_in
 
 MANY_INLIERS = 100
@@ -169,10 +170,11 @@ def locate_photo(
         for model, camera in zip(models, query.cameras, strict=True)
     ]
     wanted = UnregisteredView(views, query.cameras[0].estimated, query.shortlist)
-    refinement, seed = models[0].config.refinement or Refinement(), models[0].seed
+    refinement = models[0].config.refinement or Refinement()
+    resection = ResectionMatches(matches, models[0].seed)
     every = [each.model for each in models]
     return best_location(
-        locate_in(every, k, wanted, matches, images, refinement=refinement, seed=seed)
+        locate_in(every, k, wanted, resection, images, refinement=refinement)
         for k in range(len(every))
     )
 

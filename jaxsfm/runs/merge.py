@@ -1,11 +1,13 @@
 """Two models that share photos, joined to one in a new folder (`jaxsfm merge`)."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.given_model import (
     ModelFigures,
     figures_of,
@@ -24,7 +26,7 @@ from jaxsfm.options import check_threads
 from jaxsfm.runs.refine import check_new_folder, write_new_folder
 from jaxsfm.sfm.evaluation import pose_error
 from jaxsfm.sfm.given_refinement import move_back
-from jaxsfm.sfm.model_join import ERROR_PX, CommonFrame, adjusted, find_join, joined
+from jaxsfm.sfm.model_join import ERROR_PX, CommonFrame, Join, adjusted, find_join, joined
 
 if TYPE_CHECKING:
     import pycolmap
@@ -96,9 +98,9 @@ def merge_folders(
         models=[str(first), str(second)],
         before=[figures_of(model) for model in given],
         after=figures_of(merged.model),
-        shared=merged.shared,
-        common=merged.common,
-        agreed=merged.agreed,
+        shared=len(merged.join.shared),
+        common=len(merged.join.points.first),
+        agreed=merged.join.agreed,
         elsewhere=merged.elsewhere,
         refined_intrinsics=refines,
         versions=versions(),
@@ -135,13 +137,8 @@ class Merged(NamedTuple):
     """Two models as one."""
 
     model: "pycolmap.Reconstruction"
-    """In the frame of the first model."""
-    shared: int
-    """The number of photos that both have."""
-    common: int
-    """The number of points that have the same keypoints in shared photos."""
-    agreed: int
-    """Those of them that fall together. They are one point in the joined model."""
+    """In the frame of the first model. Common points that fall together are one point."""
+    join: Join
     elsewhere: list[str]
     """Shared photos that lie elsewhere in the second model. They stay where the first has them."""
 
@@ -183,11 +180,12 @@ def merge_models(
     both = joined(a, b, join, joined_cameras(a, b, shared))
     colours = np.concatenate([point_colours(first), point_colours(second)])
     before = [a.tracks.points, join.frame.similarity.moved_points(b.tracks.points)]
-    model = adjusted(both, error_px=error_px, refine_intrinsics=refine_intrinsics, threads=threads)
+    adjust = functools.partial(bundle_adjust, refine_intrinsics=refine_intrinsics, threads=threads)
+    model = adjusted(both, adjust, error_px=error_px)
     move_back(model, model_poses(first))
     coloured(model, np.concatenate(before), colours)
     elsewhere = _elsewhere(a, b, join.shared, join.frame)
-    return Merged(model, len(shared), len(join.points.first), join.agreed, elsewhere)
+    return Merged(model, join, elsewhere)
 
 
 def _with_new_ids(model: Model, start: int) -> Model:

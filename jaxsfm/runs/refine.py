@@ -21,6 +21,7 @@ from jaxsfm.io.images import shown_name
 from jaxsfm.io.libraries import versions
 from jaxsfm.options import check_threads
 from jaxsfm.sfm.given_refinement import GivenRefinement, ModelPhotos, refine_given
+from jaxsfm.sfm.refine.one_pass import PassSettings
 from jaxsfm.sfm.refine.passes import RefinementFigures
 
 if TYPE_CHECKING:
@@ -112,9 +113,7 @@ def refine_folder(
         found = refine_given(
             given,
             photos,
-            refinement=settings,
-            refine_intrinsics=refines,
-            threads=options.threads,
+            PassSettings(settings, refines, options.threads),
             on_pass=passed,
         )
     if found is None:

@@ -16,7 +16,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.poses import Poses, model_poses
 from jaxsfm.colmap.reconstruction import colour_points, move_model
-from jaxsfm.config import Config, Refinement
+from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import (
     ImageError,
@@ -143,34 +143,32 @@ class GivenRefinement(NamedTuple):
 def refine_given(
     given: "pycolmap.Reconstruction",
     photos: ModelPhotos,
+    settings: PassSettings,
     *,
-    refinement: Refinement,
-    refine_intrinsics: bool,
-    threads: int,
     on_pass: Callable[[], None] = lambda: None,
 ) -> GivenRefinement | None:
     """Refine a model that another tool has made; None if too little agrees with the photos.
 
     Args:
       given: `jaxsfm.colmap.given_model.read_given_model` has read it. It is not changed.
-      refine_intrinsics: whether bundle adjustment moves focal lengths and distortion.
-      threads: of bundle adjustment. With one thread the model is repeatable to the last byte.
+      settings: of the passes. With one thread the model is repeatable to the last byte.
     """
     refined, figures = refine_model(
         given,
         photos.gray,
-        PassSettings(refinement, refine_intrinsics, threads),
+        settings,
         described_px=_described_px(given, photos),
         on_pass=on_pass,
     )
     if not figures.confirmed:
         return None
     colour_points(refined, photos.rgb)
-    model = updated(given, refined)
+    model, threads = updated(given, refined), settings.threads
+    refines = settings.refine_intrinsics
     if has_rigs(model):
-        bundle_adjust(model, loss_px=1.0, refine_intrinsics=refine_intrinsics, threads=threads)
+        bundle_adjust(model, loss_px=1.0, refine_intrinsics=refines, threads=threads)
     move_back(model, model_poses(given))
-    if not refine_intrinsics:
+    if not refines:
         figures = dataclasses.replace(figures, camera=other_camera(model, threads=threads))
     return GivenRefinement(model, figures)
 

@@ -164,10 +164,10 @@ def map_trusted(
     Raises:
       UserError: COLMAP fails.
     """
-    mapper = mapper_of(given, verified, on_image)
+    mapper = mapper_of(given, verified)
 
     def compute(folder: Path) -> None:
-        made = mapper.map(trust, folder / DATABASE)
+        made = mapper.map(trust, folder / DATABASE, on_image)
         write_models(made.models, folder / SPARSE)
         write_figures(folder / FIGURES, made.checks)
 
@@ -181,11 +181,9 @@ def map_trusted(
     )
 
 
-def mapper_of(
-    given: MatchedPhotos, verified: VerifiedStage, on_image: Callable[[], None] = lambda: None
-) -> Mapper:
+def mapper_of(given: MatchedPhotos, verified: VerifiedStage) -> Mapper:
     """The mapper of verified photos."""
-    return Mapper(verified.pairs, config=given.config, options=given.options, on_image=on_image)
+    return Mapper(verified.pairs, config=given.config, options=given.options)
 
 
 def mapping_settings(given: MatchedPhotos) -> list[Json]:

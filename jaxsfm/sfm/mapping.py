@@ -160,22 +160,14 @@ class MappingFigures:
 class Mapper:
     """Makes mappings from verified pairs, and has their models checked."""
 
-    def __init__(
-        self,
-        given: VerifiedPairs,
-        *,
-        config: Config,
-        options: MapOptions,
-        on_image: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, given: VerifiedPairs, *, config: Config, options: MapOptions) -> None:
         """
         Args:
           config: its `view_graph`, `checked` and `refinement` switch those parts on. If models are
             refined, the mapper is given a share of the matches, of which it makes a draft.
-          on_image: called for every image that the mapper registers.
         """
         self.given, self._config, self._options = given, config, options
-        self._share, self._on_image = config.refinement is not None, on_image
+        self._share = config.refinement is not None
 
     @property
     def _draft(self) -> MapOptions:
@@ -216,11 +208,14 @@ class Mapper:
             return None
         return dataclasses.replace(first.trust, thorough=True)
 
-    def map(self, trust: Trust, database: Path) -> MappedModels:
+    def map(
+        self, trust: Trust, database: Path, on_image: Callable[[], None] = lambda: None
+    ) -> MappedModels:
         """Map the trusted pairs, and check the models.
 
         Args:
           database: where to write the pairs.
+          on_image: called for every image that the mapper registers.
 
         Raises:
           UserError: COLMAP fails.
@@ -234,7 +229,7 @@ class Mapper:
                 source = Path(scratch) / "mapper.db"
                 shutil.copyfile(database, source)
                 keep_inliers(source, mapper_matches(read_inliers(source)))
-            models = run_mapper(source, options, on_image=self._on_image)
+            models = run_mapper(source, options, on_image=on_image)
         checks = self.checker(database).check(models)
         return MappedModels(trust=trust, database=database, models=models, checks=checks)
 

@@ -2,13 +2,12 @@
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.sfm.evaluation import Similarity, umeyama
@@ -220,11 +219,12 @@ def joined(
 
 
 def adjusted(
-    model: Model, *, error_px: float, refine_intrinsics: bool, threads: int
+    model: Model, adjust: Callable[..., None], *, error_px: float
 ) -> "pycolmap.Reconstruction":
     """Filter the observations and adjust the bundle, twice; the first filter is coarse.
 
     Args:
+      adjust: `jaxsfm.colmap.bundle_adjustment.bundle_adjust` with all arguments but `loss_px`.
       error_px: the largest error of a right observation, pixels of the views.
     """
 
@@ -232,7 +232,7 @@ def adjusted(
         made = model.select(model.errors_px() < slack * error_px).to_colmap()
         # A larger error at first, so that what is far off still pulls.
         loss_px = max(slack / 4, 1.0) * error_px / 4
-        bundle_adjust(made, loss_px=loss_px, refine_intrinsics=refine_intrinsics, threads=threads)
+        adjust(made, loss_px=loss_px)
         return made
 
     model = Model.from_colmap(once(COARSE), model.sizes)

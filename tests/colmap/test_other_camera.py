@@ -1,6 +1,7 @@
 """Laws of the question whether photos speak for another camera than the one that was held."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -131,5 +132,7 @@ def test_photos_speak_for_no_camera_whose_distortion_folds(rendered, monkeypatch
     for half in halves:
         half.model, half.params = pycolmap.CameraModelId.OPENCV, [*TRUTH.params, *[0.0] * 4]
     halves[which] = folding()
-    monkeypatch.setattr(module, "_adjusted", lambda model, part, threads: halves[part])
+    models = [SimpleNamespace(cameras={1: half}) for half in halves]
+    monkeypatch.setattr(module, "_half", lambda model, part: models[part])
+    monkeypatch.setattr(module, "bundle_adjust", lambda *_, **__: None)
     assert other_camera(held_with(rendered, 1.03), threads=1) is None

@@ -14,6 +14,7 @@ from jaxsfm.io.store import Store
 from jaxsfm.runs import further_matching
 from jaxsfm.runs.further_matching import match_further, pairs_to_rematch, without_matches
 from jaxsfm.sfm.limits import REGISTER
+from jaxsfm.sfm.two_photos.matching_pass import PhotoPair
 from jaxsfm.sfm.two_photos.pair_passes import HOPELESS
 
 
@@ -49,8 +50,8 @@ def looked(monkeypatch):
                 raise ImageError(f"{image.name}: damaged")
             return SimpleNamespace(image=image, scale=(scale, scale))
 
-        def looks(_: object, both: Any, *, config: object, seed: int, worth_further: float):
-            assert worth_further == HOPELESS and seed == 7
+        def looks(given: PhotoPair, both: Any, *, worth_further: float):
+            assert worth_further == HOPELESS and given.seed == 7
             pair = (both[0].image.name, both[1].image.name)
             done.append(pair)
             chosen = [SimpleNamespace(result=result(pair))]

@@ -23,10 +23,11 @@ from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.colmap.tracks import Tracks
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.sfm.check.check_model import pair_fits
-from jaxsfm.sfm.check.pose_ambiguity import Refused, Surface, pose_ambiguities, pose_ambiguity
+from jaxsfm.sfm.check.pose_ambiguity import few_points, pose_ambiguities, pose_ambiguity
 from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.limits import CHECK, POSE_AMBIGUITY
 from jaxsfm.sfm.refine import plane_geometry
+from jaxsfm.sfm.refine.fixed_structure import FixedStructure, ResectionMatches
 
 NAMES = [f"{k}.png" for k in range(6)]
 PAIR = (NAMES[0], NAMES[1])
@@ -36,8 +37,8 @@ def normals(model: Model) -> np.ndarray:
     return plane_geometry.normals(model, neighbours=REFINEMENT.neighbours)
 
 
-def surface(model: Model) -> Surface:
-    return Surface(model, normals(model))
+def structure(seen: Scene) -> FixedStructure:
+    return FixedStructure(seen.model, seen.images, REFINEMENT)
 
 
 # -- pairs -----------------------------------------------------------------------------------------
@@ -162,12 +163,12 @@ def equal() -> Scene:
     return two_walls(TURNED)
 
 
-def refused(*results: PairResult) -> Refused:
-    return Refused({result.pair: result for result in results}, 0)
+def refused(*results: PairResult) -> ResectionMatches:
+    return ResectionMatches({result.pair: result for result in results}, 0)
 
 
-def places(seen: Scene, against: Refused):
-    return pose_ambiguities(surface(seen.model), seen.images, REFINEMENT, against)
+def places(seen: Scene, against: ResectionMatches):
+    return pose_ambiguities(structure(seen), against)
 
 
 @pytest.mark.parametrize(("motion", "turned_deg"), [(TURNED, 70.0), (ASIDE, 0.0)])
@@ -215,8 +216,8 @@ def test_few_matches_give_no_second_place(equal, count, found):
     seen = equal
     twins = twin_matches(seen.model, 0, 3, TURNED)
     few = matched(twins.pair, twins.keypoints0[:count], twins.keypoints1[:count])
-    whole = surface(seen.model)
-    view = (whole, whole.few(), seen.images, REFINEMENT, refused(few))
+    whole = structure(seen)
+    view = (whole, few_points(whole), refused(few))
     assert sum(pose_ambiguity(*view, k) is not None for k in (0, 3)) == 2 * found
 
 
@@ -232,8 +233,8 @@ def test_a_place_from_which_few_points_are_seen_is_no_second_place(equal, points
     rows = np.flatnonzero((equal.plane == 0) | (np.cumsum(equal.plane == 1) <= points))
     few = equal._replace(model=equal.model.with_tracks(equal.model.tracks.select_points(rows)))
     against = refused(twin_matches(equal.model, 0, 3, TURNED))
-    whole = surface(few.model)
-    place = pose_ambiguity(whole, whole.few(), few.images, REFINEMENT, against, 0)
+    whole = structure(few)
+    place = pose_ambiguity(whole, few_points(whole), against, 0)
     assert (place is not None) == found
 
 

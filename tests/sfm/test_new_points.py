@@ -10,6 +10,7 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
+from jaxsfm.sfm.refine.fixed_structure import ResectionMatches
 from jaxsfm.sfm.register import grow as grow_module
 from jaxsfm.sfm.register import triangulate
 from jaxsfm.sfm.register.grow import grow
@@ -146,7 +147,7 @@ def test_a_view_that_only_a_new_one_reaches_comes_in_the_next_round(rendered):
     grown = grow(
         [known],
         unregistered,
-        all_matches(rendered),
+        ResectionMatches(all_matches(rendered), 0),
         images_of(rendered),
         refinement=Refinement(),
     )
@@ -171,7 +172,7 @@ def test_a_view_gets_its_place_in_the_model_of_which_it_shows_most_points(render
         return grow(
             chosen,
             {NEW: view},
-            all_matches(rendered),
+            ResectionMatches(all_matches(rendered), 0),
             images_of(rendered),
             refinement=Refinement(),
         )
@@ -195,7 +196,7 @@ def test_a_view_that_too_few_points_hold_is_not_placed(rendered, monkeypatch, mi
         return grow(
             [model],
             unregistered,
-            all_matches(rendered),
+            ResectionMatches(all_matches(rendered), 0),
             images_of(rendered),
             refinement=Refinement(),
         )

@@ -15,7 +15,7 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.sfm.two_photos import further_passes
 from jaxsfm.sfm.two_photos.further_passes import SIZES, match_planes_rectified
-from jaxsfm.sfm.two_photos.matching_pass import BY_CHANCE, MatchingPass
+from jaxsfm.sfm.two_photos.matching_pass import BY_CHANCE, MatchingPass, PhotoPair
 from jaxsfm.sfm.two_photos.pair_passes import as_one, one_match_each
 
 IMAGES: Any = ("photo 0", "photo 1")
@@ -27,7 +27,7 @@ def looked_at(monkeypatch):
     log: list[tuple[int, int]] = []  # planes and sizes
     seen: dict[tuple[int, int], float] = {}
 
-    def closer(_, __, plane: int, *, size: int, **___: object) -> Any:
+    def closer(_, plane: int, *, size: int) -> Any:
         log.append((plane, size))
         value = seen.get((plane, size))
         return None if value is None else SimpleNamespace(significance=value, at=(plane, size))
@@ -47,7 +47,7 @@ def looked_at(monkeypatch):
         )
         config = dataclasses.replace(preset("default"), max_rectified_planes=most)
         weights: Any = None
-        chosen = match_planes_rectified(weights, IMAGES, best, config=config, seed=0)
+        chosen = match_planes_rectified(PhotoPair(IMAGES, weights, config, 0), best)
         assert chosen.taken == len([at for at in log if at in seen])
         return [each.at for each in chosen.confirmed]  # type: ignore[attr-defined]
 
@@ -134,7 +134,6 @@ def test_a_plane_must_grow_by_what_is_due_to_chance(monkeypatch):
     for significance, counts in ((100.0 + BY_CHANCE, 1), (99.9 + BY_CHANCE, 0)):
         seen = MatchingPass(one, np.asarray([significance]))
         monkeypatch.setattr(further_passes, "match_rectified", lambda *_, seen=seen, **__: seen)
-        found = match_planes_rectified(
-            weights, (photo, photo), best, config=preset("default"), seed=0
-        )
+        pair = PhotoPair((photo, photo), weights, preset("default"), 0)
+        found = match_planes_rectified(pair, best)
         assert len(found.confirmed) == counts and found.taken == 1 + counts

@@ -14,7 +14,12 @@ from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
 from jaxsfm.io.photos import Pixels
 from jaxsfm.sfm.refine import octave_pose, plane_geometry, pose_search
-from jaxsfm.sfm.refine.fixed_structure import NO_MATCHES, AlignedPoints, FixedStructure
+from jaxsfm.sfm.refine.fixed_structure import (
+    NO_MATCHES,
+    AlignedPoints,
+    FixedStructure,
+    ResectionMatches,
+)
 from jaxsfm.sfm.refine.octave_pose import OctavePose, PoseHypothesis, follow, trusted
 from jaxsfm.sfm.refine.pose_search import MIN_PATCHES, search
 from jaxsfm.sfm.refine.weak_views import register_weak_views
@@ -319,7 +324,7 @@ def localized(scene: Room, shift: float) -> Localization:
     rows = np.flatnonzero(scene.visible[:, [1, NIGHT]].all(1))[::5][:40]
     at, there = (each.project(scene.points[rows])[0] for each in (day, view))
     matches = {("1.png", NIGHT_NAME): matched(("1.png", NIGHT_NAME), at, there)}
-    return locate(view, structure_of(scene), matches, own_camera=False)
+    return locate(view, structure_of(scene), ResectionMatches(matches, 0), own_camera=False)
 
 
 def test_a_photo_of_which_a_corner_is_lit_is_localized(rendered, much_is_asked):

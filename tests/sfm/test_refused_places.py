@@ -16,6 +16,7 @@ from wall_scene import (
 )
 
 from jaxsfm.io.pairs import PairResult
+from jaxsfm.sfm.refine.fixed_structure import ResectionMatches
 from jaxsfm.sfm.register import grow as module
 from jaxsfm.sfm.register.grow import ExtendedModels, grow
 from jaxsfm.sfm.register.locate_view import UnregisteredView
@@ -49,7 +50,7 @@ def grown(seen: Scene, *others: PairResult) -> ExtendedModels:
     return grow(
         [known],
         {NAMES[NEW]: UnregisteredView([seen.model.views[NEW]], False, NAMES[:NEW])},
-        {each.pair: each for each in pairs},
+        ResectionMatches({each.pair: each for each in pairs}, 0),
         seen.images,
         refinement=REFINEMENT,
     )
@@ -103,8 +104,8 @@ def test_a_view_is_asked_about_once_and_a_refused_one_leaves_the_model_as_it_was
     monkeypatch.setattr(module, "objections", lambda *given: asked.append(given) or against)
     found = grown(seen)
     assert [*found.registered] == registered and found.rounds == 1 and len(asked) == 1
-    model, _, _, details, following, _ = asked[0]
-    assert [view.name for view in model.views] == NAMES and details == {NAMES[NEW]: True}
+    whole, details, following, _ = asked[0]
+    assert [view.name for view in whole.model.views] == NAMES and details == {NAMES[NEW]: True}
     assert set(following) == {(NAMES[NEW - 1], NAMES[NEW])}
     known = seen.model.part(set(NAMES[:NEW]))[0].tracks
     if not registered:

@@ -13,9 +13,9 @@ from wall_scene import (
 )
 
 from jaxsfm.io.pairs import PairResult
-from jaxsfm.sfm.check.pose_ambiguity import Surface
+from jaxsfm.sfm.check.pose_ambiguity import few_points
 from jaxsfm.sfm.limits import REGISTER
-from jaxsfm.sfm.refine.plane_geometry import normals
+from jaxsfm.sfm.refine.fixed_structure import FixedStructure
 from jaxsfm.sfm.register import grow
 from jaxsfm.sfm.register.grow import objections
 
@@ -39,10 +39,14 @@ def placed_before(own: int, others: int) -> Scene:
     return seen._replace(model=seen.model.select(keep))
 
 
+def whole(seen: Scene) -> FixedStructure:
+    return FixedStructure(seen.model, seen.images, REFINEMENT)
+
+
 def doubted(seen: Scene, *pairs: PairResult, full_size: bool = True) -> dict[str, str]:
     matches = {each.pair: each for each in pairs}
     details = {NAMES[NEW]: full_size}
-    return objections(seen.model, seen.images, REFINEMENT, details, matches.keys(), matches)
+    return objections(whole(seen), details, matches.keys(), matches)
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +71,7 @@ def test_nothing_speaks_against_a_right_place(right):
 def test_a_view_that_shows_something_else_is_doubted_by_its_numbers(wrong):
     (name,), (why,) = zip(*doubted(wrong).items(), strict=True)
     assert name == NAMES[NEW]
-    surface = Surface(wrong.model, normals(wrong.model, neighbours=16))
-    tested, contradicted = grow.shown_by(surface.few(), wrong.images, REFINEMENT, NEW)
+    tested, contradicted = grow.shown_by(few_points(whole(wrong)), NEW)
     assert f"of {tested} points" in why and why.endswith(f"instead of {contradicted}")
     assert (
         REGISTER.least_contradicted <= contradicted

@@ -10,7 +10,7 @@ from test_weak_views import NIGHT, NIGHT_NAME, night_matches
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.refine.fixed_structure import FixedStructure
+from jaxsfm.sfm.refine.fixed_structure import NO_MATCHES, FixedStructure
 from jaxsfm.sfm.refine.pose_uncertainty import PoseUncertainty
 from jaxsfm.sfm.register import locate_view
 from jaxsfm.sfm.register.locate_view import Localization, locate
@@ -34,7 +34,7 @@ def found(
     return locate(
         image,
         FixedStructure(known(scene), images_of(scene), Refinement()),
-        night_matches(scene, right=right, wrong=wrong).matches,
+        night_matches(scene, right=right, wrong=wrong),
         own_camera=own_camera,
     )
 
@@ -168,5 +168,5 @@ def test_a_part_of_a_model_is_what_its_views_see(rendered):
 def test_no_view_is_no_pose(rendered):
     part, _ = exact_model(rendered).part(set())
     nothing = FixedStructure(part, images_of(rendered), Refinement())
-    located = locate(rendered.views[NIGHT], nothing, {}, own_camera=False)
+    located = locate(rendered.views[NIGHT], nothing, NO_MATCHES, own_camera=False)
     assert located.view is None and located.why

@@ -318,7 +318,7 @@ def test_if_a_pair_must_be_worth_it_further_passes_follow_a_sign_at_some_scale(
     monkeypatch.setattr(pair_passes, "_search_further", lambda *given, **__: [*given[2], asked])
     planes: list[float] = []
 
-    def match_planes_rectified(_, __, best: Any, **___: object) -> further_passes.PlanePasses:
+    def match_planes_rectified(_, best: Any) -> further_passes.PlanePasses:
         planes.append(best.significance)
         return further_passes.PlanePasses([], 0)
 

@@ -13,6 +13,7 @@ from jaxsfm.config import preset
 from jaxsfm.sfm.refine.pair_alignment import AlignedMatches
 from jaxsfm.sfm.two_photos import pair_passes
 from jaxsfm.sfm.two_photos.further_passes import PlanePasses
+from jaxsfm.sfm.two_photos.matching_pass import PhotoPair
 from jaxsfm.sfm.two_photos.rectification import Located
 
 
@@ -139,7 +140,7 @@ def test_the_planes_of_the_best_pass_give_the_matches_if_they_are_confirmed(
     weights: Any = None
     asked: list[float] = []
 
-    def match_planes_rectified(_, __, whole: Any, **___: object) -> list[Any]:
+    def match_planes_rectified(_, whole: Any) -> list[Any]:
         asked.append(whole.significance)
         return PlanePasses([fake(each) for each in planes], 5)
 
@@ -204,7 +205,7 @@ def steps(monkeypatch):
     def one(name: str) -> Any:
         return (taken(name) or [fake(0.0)])[0]
 
-    def closer(_, __, located: object, *, size: int, **___: object) -> Any:
+    def closer(_, located: object, *, size: int) -> Any:
         assert size == pair_passes.SMALL_SIZE
         return (taken("proposed") or [None])[0]
 
@@ -220,9 +221,9 @@ def steps(monkeypatch):
         found.clear()
         found.update(finds)
         weights: Any = None
-        pair_passes._search_further(
-            weights, (FEATURES, FEATURES), [fake(first)], config=preset(name), seed=0
-        )
+        photos: Any = ("photo", "photo")
+        pair = PhotoPair(photos, weights, preset(name), 0)
+        pair_passes._search_further(pair, (FEATURES, FEATURES), [fake(first)])
         return list(log)
 
     return looks

@@ -5,8 +5,8 @@ they would put it. If it shows the same, nothing tells the two places apart, and
 explains the photos as well.
 """
 
-from collections.abc import Collection, Mapping
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 
@@ -14,70 +14,44 @@ from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.resection import find_view
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.io.pairs import Pair, PairResult
+from jaxsfm.io.pairs import Pair
 from jaxsfm.sfm.check.agreement import agreement
 from jaxsfm.sfm.check.check_model import VerifiedMatches, thinned, thinned_points
 from jaxsfm.sfm.check.grouping import MAX_CONTRADICTED
 from jaxsfm.sfm.check.model_check import PoseAmbiguity
 from jaxsfm.sfm.limits import POSE_AMBIGUITY
-from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.candidates import may_show
 from jaxsfm.sfm.refine.device_images import DeviceImages
-from jaxsfm.sfm.refine.fixed_structure import MATCH_ERROR_PX, matched_points
+from jaxsfm.sfm.refine.fixed_structure import (
+    MATCH_ERROR_PX,
+    FixedStructure,
+    ResectionMatches,
+    matched_points,
+)
 from jaxsfm.sfm.view_graph import rotation_angle_deg
 
 
-class Refused(NamedTuple):
-    """What speaks for other places: the pairs that a model does not agree with."""
-
-    pairs: Mapping[Pair, PairResult]
-    """Their matches, original pixels."""
-    seed: int
-    """For RANSAC."""
-
-
-class Surface(NamedTuple):
-    """The points of a model as pieces of a surface."""
-
-    model: Model
-    normal: np.ndarray
-    """float64 (points, 3)."""
-
-    def few(self) -> "Surface":
-        """So many of the points as are tested in a second place."""
-        rows = thinned_points(self.model, per_view=POSE_AMBIGUITY.tested_per_view)
-        tracks = self.model.tracks.select_points(rows)
-        return Surface(self.model.with_tracks(tracks), self.normal[rows])
-
-    def of_others(self, k: int) -> "Surface":
-        """The same without the observations of one view, by index."""
-        return self._replace(model=self.model.select(self.model.tracks.view != k))
-
-    def with_view(self, k: int, view: View) -> "Surface":
-        """The same with another view in the place of one, by index."""
-        views = self.model.views
-        return self._replace(model=self.model.with_views([*views[:k], view, *views[k + 1 :]]))
+def few_points(whole: FixedStructure) -> FixedStructure:
+    """So many of the points as are tested in a second place."""
+    return whole.some(thinned_points(whole.model, per_view=POSE_AMBIGUITY.tested_per_view))
 
 
 def pose_ambiguity(
-    whole: Surface,
-    few: Surface,
-    images: DeviceImages,
-    refinement: Refinement,
-    refused: Refused,
-    k: int,
+    whole: FixedStructure, few: FixedStructure, refused: ResectionMatches, k: int
 ) -> PoseAmbiguity | None:
     """The second place of a view; None if it has none.
 
     Args:
-      whole: places are found from its points.
-      few: those of its points that are tested (`Surface.few`).
-      images: those of the views, in the model's pixels.
+      whole: the model; places are found from its points.
+      few: those of its points that are tested (`few_points`).
+      refused: what speaks for other places: the pairs that the model does not agree with.
       k: index of the view.
     """
     view = whole.model.views[k]
-    own = {pair: each for pair, each in refused.pairs.items() if view.name in pair}
-    parts = [matched_points(view, *whole, {pair: each}) for pair, each in own.items()]
+    own = {pair: each for pair, each in refused.matches.items() if view.name in pair}
+    parts = [
+        matched_points(view, whole.model, whole.normals, {pair: each}) for pair, each in own.items()
+    ]
     xy, points = (np.concatenate(column) for column in zip(*parts, strict=True))
     there = find_view(
         view,
@@ -98,7 +72,11 @@ def pose_ambiguity(
         for (a, b), count in zip(own, support, strict=True)
         if count >= POSE_AMBIGUITY.least_support
     ]
-    tested, contradicted = shown_by(few.with_view(k, there), images, refinement, k)
+    views = few.model.views
+    moved = few.model.with_views([*views[:k], there, *views[k + 1 :]])
+    tested, contradicted = shown_by(
+        dataclasses.replace(few, model=moved, known_normals=few.normals), k
+    )
     if (
         tested - contradicted < POSE_AMBIGUITY.least_agreed
         or contradicted > MAX_CONTRADICTED * tested
@@ -129,12 +107,11 @@ def _elsewhere(view: View, there: View, points: np.ndarray) -> bool:
     )
 
 
-def shown_by(few: Surface, images: DeviceImages, refinement: Refinement, k: int) -> tuple[int, int]:
+def shown_by(few: FixedStructure, k: int) -> tuple[int, int]:
     """What a view shows of the points that other views have seen.
 
     Args:
       few: the points that are tested, with the view where it is to stand.
-      images: those of the views, in the model's pixels.
       k: index of the view.
 
     Returns:
@@ -142,10 +119,10 @@ def shown_by(few: Surface, images: DeviceImages, refinement: Refinement, k: int)
       contradictions among them (`jaxsfm.sfm.check.agreement`): means over the other views.
     """
     # What the view itself has contributed to the model holds at its first place only.
-    model, normal = few.of_others(k)
+    model = few.model.select(few.model.tracks.view != k)
     rows = np.flatnonzero(may_show(model.tracks.points, [model.views[k]]))
     some = model.with_tracks(model.tracks.select_points(rows))
-    found = agreement(some, images, refinement, targets=[k], normal=normal[rows])
+    found = agreement(some, few.images, few.refinement, targets=[k], normal=few.normals[rows])
     counts = found.tested[:, k]
     if not counts.any():
         return 0, 0
@@ -153,15 +130,13 @@ def shown_by(few: Surface, images: DeviceImages, refinement: Refinement, k: int)
     return round(weight @ counts), round(weight @ found.contradicted[:, k])
 
 
-def pose_ambiguities(
-    surface: Surface, images: DeviceImages, refinement: Refinement, refused: Refused
-) -> list[PoseAmbiguity]:
+def pose_ambiguities(whole: FixedStructure, refused: ResectionMatches) -> list[PoseAmbiguity]:
     """The second places of all views of a model, sorted by name. Arguments as in
     `pose_ambiguity`."""
-    named, few = {name for pair in refused.pairs for name in pair}, surface.few()
+    named, few = {name for pair in refused.matches for name in pair}, few_points(whole)
     found = [
-        pose_ambiguity(surface, few, images, refinement, refused, k)
-        for k, view in enumerate(surface.model.views)
+        pose_ambiguity(whole, few, refused, k)
+        for k, view in enumerate(whole.model.views)
         if view.name in named
     ]
     places = [place for place in found if place is not None]
@@ -184,7 +159,6 @@ def find_pose_ambiguities(
     Raises:
       ImageError: an image of the model cannot be read any more.
     """
-    model = thinned(model)
-    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
-    refused = Refused({pair: given.matches[pair] for pair in sorted(against)}, given.seed)
-    return pose_ambiguities(Surface(model, normal), images, refinement, refused)
+    matches = {pair: given.matches[pair] for pair in sorted(against)}
+    whole = FixedStructure(thinned(model), images, refinement)
+    return pose_ambiguities(whole, ResectionMatches(matches, given.seed))

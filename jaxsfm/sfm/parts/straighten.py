@@ -63,10 +63,16 @@ def straightened(model: Model, *, error_px: float, loss_px: float, threads: int)
     groups, _ = connected_components(graph.weights, directed=False)
     if groups != 1 or hops(graph) < LONG:
         return None
-    parts = [
-        _adjusted(model, names, loss_px=loss_px, threads=threads)
-        for names in overlapping_parts(graph, size=PART, overlap=OVERLAP)
-    ]
+
+    def adjusted(names: Sequence[str]) -> _Part:
+        """A part of the row, adjusted by itself; its cameras stay."""
+        some, rows = model.part(names)
+        made, index = some.numbered_colmap()
+        bundle_adjust(made, loss_px=loss_px, refine_intrinsics=False, threads=threads)
+        kept = [index[number] for number in sorted(made.point3D_ids())]
+        return _Part(Model.from_colmap(made, model.sizes), rows[kept])
+
+    parts = [adjusted(names) for names in overlapping_parts(graph, size=PART, overlap=OVERLAP)]
     parts.sort(key=lambda part: -len(part.model.views))
     shared = {
         (i, j): found
@@ -148,15 +154,6 @@ def _incidence(row: np.ndarray, column: np.ndarray, shape: tuple[int, int]) -> c
     found = csr_array(coo_array((np.ones(len(row)), (row, column)), shape=shape))
     found.data[:] = 1
     return found
-
-
-def _adjusted(model: Model, names: Sequence[str], *, loss_px: float, threads: int) -> _Part:
-    """A part of a row, adjusted by itself; its cameras stay."""
-    some, rows = model.part(names)
-    made, index = some.numbered_colmap()
-    bundle_adjust(made, loss_px=loss_px, refine_intrinsics=False, threads=threads)
-    kept = [index[number] for number in sorted(made.point3D_ids())]
-    return _Part(Model.from_colmap(made, model.sizes), rows[kept])
 
 
 def _put_together(

@@ -32,12 +32,12 @@ refinement, because hundreds of observations determine one pose."""
 
 
 class ResectionMatches(NamedTuple):
-    """Facts that refinement uses besides the model."""
+    """What says where views may stand: poses are found from it by resection."""
 
     matches: Mapping[Pair, PairResult]
     """Verified matches by pair, original pixels."""
     seed: int
-    """For RANSAC in the resection from matches."""
+    """For RANSAC in the resection."""
 
 
 NO_MATCHES = ResectionMatches({}, 0)
@@ -109,6 +109,8 @@ class FixedStructure:
     images: DeviceImages
     """Those of the views and of the further ones, in working pixels."""
     refinement: Refinement
+    known_normals: np.ndarray | None = None
+    """float64 (points, 3): unit normals, if they do not follow from these observations."""
 
     @functools.cached_property
     def normals(self) -> np.ndarray:
@@ -118,7 +120,16 @@ class FixedStructure:
         s, and a pose is aligned up to 32 times, or more often if it is searched around. There must
         be a point.
         """
+        if self.known_normals is not None:
+            return self.known_normals
         return plane_geometry.normals(self.model, neighbours=self.refinement.neighbours)
+
+    def some(self, rows: np.ndarray) -> "FixedStructure":
+        """Some of the points, by their indices; their normals stay."""
+        tracks = self.model.tracks.select_points(rows)
+        return dataclasses.replace(
+            self, model=self.model.with_tracks(tracks), known_normals=self.normals[rows]
+        )
 
     def shown_from(self, views: Sequence[View], px: int) -> list[tuple[View, AlignedPoints]]:
         """For each of several further views, the view in pixels of an octave, and what it shows.

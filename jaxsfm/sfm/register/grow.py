@@ -16,11 +16,11 @@ from jaxsfm.config import Refinement
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, PairResult
 from jaxsfm.sfm.check.check_model import pair_fits
-from jaxsfm.sfm.check.pose_ambiguity import Surface, shown_by
+from jaxsfm.sfm.check.pose_ambiguity import few_points, shown_by
 from jaxsfm.sfm.limits import CHECK, REGISTER
 from jaxsfm.sfm.photo_order import neighbours
-from jaxsfm.sfm.refine import plane_geometry
 from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.fixed_structure import FixedStructure, ResectionMatches
 from jaxsfm.sfm.refine.octave_pose import MIN_COUNT
 from jaxsfm.sfm.register.locate_view import (
     Localization,
@@ -49,11 +49,10 @@ class ExtendedModels(NamedTuple):
 def grow(
     models: Sequence[Model],
     unregistered: Mapping[str, UnregisteredView],
-    matches: Mapping[Pair, PairResult],
+    resection: ResectionMatches,
     images: DeviceImages,
     *,
     refinement: Refinement | None,
-    seed: int = 0,
     on_view: Callable[[], None] = lambda: None,
 ) -> ExtendedModels:
     """Register views until no other view has a place that can be trusted. The views of one round
@@ -61,12 +60,12 @@ def grow(
 
     Args:
       models: one at least.
-      matches: of unregistered views with views and with each other, original pixels.
+      resection: matches of unregistered views with views and with each other.
       images: those of all these views, in working pixels.
       refinement: that of the models; None: they were not refined.
       on_view: called for every view that is registered.
     """
-    models, registered = list(models), dict[str, int]()
+    models, registered, matches = list(models), dict[str, int](), resection.matches
     tried: dict[str, dict[int, LocatedView | None]] = {name: {} for name in unregistered}
     rounds, latest = 0, set[str]()
     while True:
@@ -81,10 +80,9 @@ def grow(
                     models,
                     k,
                     each,
-                    matches,
+                    resection,
                     images,
                     refinement=refinement or Refinement(),
-                    seed=seed,
                 )
                 known[k] = place and place._replace(found=_held(place.found))
             best = best_location(known.values())
@@ -97,9 +95,9 @@ def grow(
         for k in sorted({place.model for place in fresh.values()}):
             own = {name: place for name, place in fresh.items() if place.model == k}
             against = objections(
-                _with_registered(models[k], own),
-                images,
-                refinement or Refinement(),
+                FixedStructure(
+                    _with_registered(models[k], own), images, refinement or Refinement()
+                ),
                 {name: place.found.rests_on_details for name, place in own.items()},
                 neighbours(matches.keys()),
                 matches,
@@ -135,9 +133,7 @@ def _held(located: Localization) -> Localization:
 
 
 def objections(
-    model: Model,
-    images: DeviceImages,
-    refinement: Refinement,
+    whole: FixedStructure,
     details: Mapping[str, bool],
     following: Collection[Pair],
     matches: Mapping[Pair, PairResult],
@@ -149,26 +145,23 @@ def objections(
     views. So it can only contradict them, and they cannot contradict it.
 
     Args:
-      model: with the registered views.
-      images: those of the views, in the model's pixels.
-      refinement: how patches are aligned, and when they agree.
+      whole: the model with the registered views.
       details: by the name of each registered view, whether its place rests on details at full size.
         If not, noise hides them there, and what the view does not show says nothing.
       following: pairs of photos that follow each other and that COLMAP verified.
       matches: of these pairs at least, original pixels.
     """
-    normal = plane_geometry.normals(model, neighbours=refinement.neighbours)
     pairs = [pair for pair in following if details.keys() & set(pair)]
-    fits = pair_fits(model, normal, matches, pairs)
-    few, found = Surface(model, normal).few(), {}
+    fits = pair_fits(whole.model, whole.normals, matches, pairs)
+    few, found = few_points(whole), {}
     for pair in sorted(pair for pair, fit in fits.items() if fit < CHECK.fit):
         for name in details.keys() & set(pair):
             (other,) = set(pair) - {name}
             found[name] = f"its matches with its neighbour {shown_name(other)} do not agree with it"
-    for k, view in enumerate(model.views):
+    for k, view in enumerate(whole.model.views):
         if view.name in found or not details.get(view.name):
             continue
-        tested, contradicted = shown_by(few, images, refinement, k)
+        tested, contradicted = shown_by(few, k)
         if contradicted >= max(REGISTER.least_contradicted, REGISTER.contradicted_share * tested):
             found[view.name] = (
                 f"of {tested} points that it should show there, it shows something else instead of "

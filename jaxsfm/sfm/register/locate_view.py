@@ -22,6 +22,7 @@ from jaxsfm.sfm.refine.fixed_structure import (
     MATCH_ERROR_PX,
     AlignedPoints,
     FixedStructure,
+    ResectionMatches,
     matched_points,
 )
 from jaxsfm.sfm.refine.octave_pose import (
@@ -100,20 +101,20 @@ class Localization:
 def locate(
     image: View,
     structure: FixedStructure,
-    matches: Mapping[Pair, PairResult],
+    resection: ResectionMatches,
     *,
     own_camera: bool,
-    seed: int = 0,
 ) -> Localization:
     """Find the pose of a photo among views of a model.
 
     Args:
       image: size, pixels and camera of the photo; its pose plays no part.
       structure: the views, and the points that they see, which may be none.
-      matches: of the photo with the views, original pixels.
+      resection: matches of the photo with the views.
       own_camera: estimate the focal length too. It is estimated from nothing, unless the camera's
         was known before (`has_prior_focal_length`).
     """
+    matches = resection.matches
     if not len(structure.model.tracks.points):
         return nowhere(0, matches)
     xy, points = matched_points(image, structure.model, structure.normals, matches)
@@ -123,7 +124,7 @@ def locate(
         points,
         max_error_px=MATCH_ERROR_PX,
         estimate_focal_length=own_camera and not image.camera.has_prior_focal_length,
-        seed=seed,
+        seed=resection.seed,
     )
     if found is None:
         return nowhere(len(xy), matches)
@@ -253,17 +254,15 @@ def locate_in(
     models: Sequence[Model],
     k: int,
     wanted: UnregisteredView,
-    matches: Mapping[Pair, PairResult],
+    resection: ResectionMatches,
     images: DeviceImages,
     *,
     refinement: Refinement,
-    seed: int,
 ) -> LocatedView | None:
     """Look for a view in one of the models, from its matches with the views of its shortlist.
 
     Args:
       k: index of the model.
-      matches: original pixels.
       images: those of the view and of its shortlist, in working pixels.
 
     Returns:
@@ -274,13 +273,12 @@ def locate_in(
     if not around:
         return None
     part, rows = models[k].part(around)
-    pairs = [make_pair(view.name, name) for name in around]
+    pairs, matches = [make_pair(view.name, name) for name in around], resection.matches
     found = locate(
         view,
         FixedStructure(part, images, refinement),
-        {pair: matches[pair] for pair in pairs if pair in matches},
+        resection._replace(matches={pair: matches[pair] for pair in pairs if pair in matches}),
         own_camera=wanted.own_camera,
-        seed=seed,
     )
     return LocatedView(k, found, rows)
 

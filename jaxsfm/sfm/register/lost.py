@@ -26,6 +26,7 @@ from jaxsfm.sfm.checker import opened
 from jaxsfm.sfm.limits import REGISTER
 from jaxsfm.sfm.mapped_stage import FIGURES, SPARSE, MatchedPhotos, StageCache
 from jaxsfm.sfm.refine.device_images import DeviceImages
+from jaxsfm.sfm.refine.fixed_structure import ResectionMatches
 from jaxsfm.sfm.refine.passes import RefinementFigures
 from jaxsfm.sfm.refine.weak_views import RegistrationAttempt
 from jaxsfm.sfm.refined_models import RefinedModels
@@ -153,10 +154,9 @@ class _Registration:
         grown = grow(
             self._models,
             wanted,
-            {pair: matches[pair] for pair in pairs},
+            ResectionMatches({pair: matches[pair] for pair in pairs}, self._given.options.seed),
             self._images,
             refinement=self._given.config.refinement,
-            seed=self._given.options.seed,
         )
         self._models = grown.models
         self._outcomes |= grown.located

@@ -16,14 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsfm.config import Config
 from jaxsfm.core.octaves import smaller
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.photos import PhotoView, read_view
-from jaxsfm.io.weights import Weights
 from jaxsfm.matching.extraction import describe_pixels
-from jaxsfm.sfm.two_photos.matching_pass import BY_CHANCE, MatchingPass, match_once
+from jaxsfm.sfm.two_photos.matching_pass import BY_CHANCE, MatchingPass, PhotoPair, match_once
 from jaxsfm.sfm.two_photos.rectification import (
     SMALL_SIZE,
     Located,
@@ -51,27 +49,26 @@ TURNED_OCTAVES = (0, 1, 2)
 """The octaves of the first photo that a turned second photo is matched with."""
 
 
-def at_octave(features: ImageFeatures, octave: int, *, config: Config) -> ImageFeatures:
+def at_octave(features: ImageFeatures, octave: int, *, fine_stride: int) -> ImageFeatures:
     """The features of a photo whose working image is 1 / 2^`octave` times as large."""
     x, y = features.scale
     return features._replace(
         scale=(x * 2**octave, y * 2**octave),
-        dense=smaller(features.dense, octave, fine_stride=config.fine_stride),
+        dense=smaller(features.dense, octave, fine_stride=fine_stride),
     )
 
 
 def at_other_scales(
-    features0: ImageFeatures, features1: ImageFeatures, *, config: Config, seed: int
+    pair: PhotoPair, features0: ImageFeatures, features1: ImageFeatures
 ) -> Iterator[MatchingPass]:
     """Looks at two photos at other relative scales; none if the features have a single octave."""
-    images = (features0.image, features1.image)
     for octave0, octave1 in OCTAVES:
-        if max(octave0, octave1) >= config.octaves:
+        if max(octave0, octave1) >= pair.config.octaves:
             continue
-        side0 = at_octave(features0, octave0, config=config)
-        side1 = at_octave(features1, octave1, config=config)
+        side0 = at_octave(features0, octave0, fine_stride=pair.config.fine_stride)
+        side1 = at_octave(features1, octave1, fine_stride=pair.config.fine_stride)
         if all(min(side.dense.coarse_grid) >= LEAST_CELLS for side in (side0, side1)):
-            yield match_once(side0, side1, images, config=config, seed=seed)
+            yield match_once(pair, side0, side1)
 
 
 def turned_view(image: ImageFile, quarters: int) -> PhotoView:
@@ -87,49 +84,36 @@ def turned_view(image: ImageFile, quarters: int) -> PhotoView:
     return PhotoView(zoom @ turns, (round(width * factor), round(height * factor)))
 
 
-def turned(
-    weights: Weights, features0: ImageFeatures, image1: ImageFile, *, config: Config, seed: int
-) -> Iterator[MatchingPass]:
+def turned(pair: PhotoPair, features0: ImageFeatures) -> Iterator[MatchingPass]:
     """Looks at two photos, the second one turned by one, two and three quarter turns."""
     for quarters in (1, 2, 3):
-        view = turned_view(image1, quarters)
-        seen = describe_view(weights, image1, view, config=config)
-        for octave in TURNED_OCTAVES[: config.octaves]:
-            side = at_octave(features0, octave, config=config)
+        view = turned_view(pair.images[1], quarters)
+        seen = _describe_view(pair, 1, view)
+        for octave in TURNED_OCTAVES[: pair.config.octaves]:
+            side = at_octave(features0, octave, fine_stride=pair.config.fine_stride)
             if min(side.dense.coarse_grid) >= LEAST_CELLS:
-                images = (features0.image, image1)
-                yield match_once(side, seen, images, views=(None, view), config=config, seed=seed)
+                yield match_once(pair, side, seen, views=(None, view))
 
 
-def describe_view(
-    weights: Weights, image: ImageFile, view: PhotoView, *, config: Config
-) -> ImageFeatures:
-    """The features of a view; coordinates are those of the view."""
-    return describe_pixels(weights, view.as_photo(image), read_view(image, view), config=config)
+def _describe_view(pair: PhotoPair, side: int, view: PhotoView) -> ImageFeatures:
+    """The features of a view of one of the photos; coordinates are those of the view."""
+    image = pair.images[side]
+    return describe_pixels(
+        pair.weights, view.as_photo(image), read_view(image, view), config=pair.config
+    )
 
 
-def match_rectified(
-    weights: Weights,
-    images: tuple[ImageFile, ImageFile],
-    matches: Located,
-    *,
-    size: int,
-    config: Config,
-    seed: int,
-) -> MatchingPass | None:
+def match_rectified(pair: PhotoPair, matches: Located, *, size: int) -> MatchingPass | None:
     """A pass over both photos as seen from one place; None if the matches determine no place.
 
     Args:
       size: the longer side of the common view, pixels.
     """
-    views = rectified_views(matches, *images, size=size)
+    views = rectified_views(matches, *pair.images, size=size)
     if views is None:
         return None
-    seen0, seen1 = (
-        describe_view(weights, image, view, config=config)
-        for image, view in zip(images, views, strict=True)
-    )
-    return match_once(seen0, seen1, images, views=views, config=config, seed=seed)
+    seen0, seen1 = (_describe_view(pair, side, view) for side, view in enumerate(views))
+    return match_once(pair, seen0, seen1, views=views)
 
 
 def proposals(passes: Sequence[MatchingPass], images: tuple[ImageFile, ImageFile]) -> list[Located]:
@@ -171,14 +155,7 @@ class PlanePasses(NamedTuple):
     """How many were taken, those included that do not count."""
 
 
-def match_planes_rectified(
-    weights: Weights,
-    images: tuple[ImageFile, ImageFile],
-    best: MatchingPass,
-    *,
-    config: Config,
-    seed: int,
-) -> PlanePasses:
+def match_planes_rectified(pair: PhotoPair, best: MatchingPass) -> PlanePasses:
     """A pass over each of the strongest planes of a pass, as seen from one place.
 
     A common view of the whole scene fits one plane at best: other surfaces are shifted, stretched
@@ -195,15 +172,16 @@ def match_planes_rectified(
     one is (docs/decisions/hard-pairs.md).
 
     Args:
-      best: the pass whose planes are matched, as many as `config.max_rectified_planes` says.
+      best: the pass whose planes are matched, as many as `Config.max_rectified_planes` says.
     """
-    strongest = np.argsort(-best.plane_significance, kind="stable")[: config.max_rectified_planes]
+    most = pair.config.max_rectified_planes
+    strongest = np.argsort(-best.plane_significance, kind="stable")[:most]
     found, taken = [], 0
     for plane in strongest[best.plane_significance[strongest] > BY_CHANCE]:
-        place = best.on_planes(np.asarray([plane]), *images)
+        place = best.on_planes(np.asarray([plane]), *pair.images)
         confirmed = []
         for size in SIZES:
-            nearer = match_rectified(weights, images, place, size=size, config=config, seed=seed)
+            nearer = match_rectified(pair, place, size=size)
             taken += nearer is not None
             if nearer is None or nearer.significance < best.plane_significance[plane]:
                 break

@@ -12,6 +12,7 @@ from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photos import PhotoView
+from jaxsfm.io.weights import Weights
 from jaxsfm.matching.pair_matching import match_features
 from jaxsfm.sfm.two_photos.rectification import Located, transformed, upright
 
@@ -31,6 +32,16 @@ BY_CHANCE = 15.0
 """Planes with less significance than this do not count. Matches are not placed at random: repeated
 structure and neighbouring cells give false planes a significance of up to 35 (photos of different
 places, docs/decisions/hard-pairs.md)."""
+
+
+class PhotoPair(NamedTuple):
+    """Two photos, and what all passes over them are made with."""
+
+    images: tuple[ImageFile, ImageFile]
+    weights: Weights
+    config: Config
+    seed: int
+    """For RANSAC."""
 
 
 class Described(NamedTuple):
@@ -94,21 +105,19 @@ def to_stored(views: Views, images: tuple[ImageFile, ImageFile]) -> tuple[np.nda
 
 
 def match_once(
+    pair: PhotoPair,
     features0: ImageFeatures,
     features1: ImageFeatures,
-    images: tuple[ImageFile, ImageFile],
     *,
     views: Views = WHOLE,
-    config: Config,
-    seed: int,
 ) -> MatchingPass:
     """Match two photos.
 
     Args:
       features0, features1: of the photos, of their octaves, or of `views` of them.
-      images: the photos.
     """
-    found = match_features(features0, features1, config=config, seed=seed)
+    config = pair.config
+    found = match_features(features0, features1, config=config, seed=pair.seed)
     described0, described1 = (
         Described(
             rows=int(features.dense.fine_grid[0]),
@@ -124,7 +133,9 @@ def match_once(
         fine_stride=config.fine_stride,
     )
     return MatchingPass(
-        moved(found, *to_stored(views, images)) if views != WHOLE else found, significance, views
+        moved(found, *to_stored(views, pair.images)) if views != WHOLE else found,
+        significance,
+        views,
     )
 
 

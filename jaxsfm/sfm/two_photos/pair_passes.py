@@ -28,7 +28,13 @@ from jaxsfm.sfm.two_photos.further_passes import (
     proposals,
     turned,
 )
-from jaxsfm.sfm.two_photos.matching_pass import MatchingPass, match_once, moved, to_stored
+from jaxsfm.sfm.two_photos.matching_pass import (
+    MatchingPass,
+    PhotoPair,
+    match_once,
+    moved,
+    to_stored,
+)
 from jaxsfm.sfm.two_photos.rectification import (
     SIZE,
     SMALL_SIZE,
@@ -110,11 +116,9 @@ def match_photos(
     Raises:
       ImageError: a photo cannot be decoded again.
     """
-    images = (features0.image, features1.image)
-    passes = match_in_passes(
-        weights, (features0, features1), config=config, seed=seed, worth_further=worth_further
-    )
-    aligned = [_aligned(each, images, config) for each in passes.chosen]
+    pair = PhotoPair((features0.image, features1.image), weights, config, seed)
+    passes = match_in_passes(pair, (features0, features1), worth_further=worth_further)
+    aligned = [_aligned(each, pair.images, config) for each in passes.chosen]
     return TwoPhotos(
         as_one([each.result for each in passes.chosen]),
         AlignedMatches(*map(np.concatenate, zip(*aligned, strict=True))),
@@ -162,41 +166,34 @@ class PairPasses(NamedTuple):
 
 
 def match_in_passes(
-    weights: Weights,
-    features: tuple[ImageFeatures, ImageFeatures],
-    *,
-    config: Config,
-    seed: int,
-    worth_further: float,
+    pair: PhotoPair, features: tuple[ImageFeatures, ImageFeatures], *, worth_further: float
 ) -> PairPasses:
     """As many passes over two photos as they need (`Config.max_rectified_planes`).
 
     Args:
-      features: of both photos, made with the same config.
+      features: of both photos, made with the config of the pair.
       worth_further: the significance that the search for the scale must find, or no further pass
         follows.
 
     Raises:
       ImageError: a photo cannot be decoded again.
     """
-    images = (features[0].image, features[1].image)
-    first = match_once(*features, images, config=config, seed=seed)
+    first = match_once(pair, *features)
     best, taken, least, conclusive = first, 1, HOPELESS, is_conclusive(first)
-    if not config.max_rectified_planes:
+    if not pair.config.max_rectified_planes:
         return PairPasses([first], taken)
     if not conclusive:
-        searched = [first, *at_other_scales(*features, config=config, seed=seed)]
+        searched = [first, *at_other_scales(pair, *features)]
         if _best(searched).significance >= worth_further:
-            searched = _search_further(weights, features, searched, config=config, seed=seed)
+            searched = _search_further(pair, features, searched)
         best, taken, least = _best(searched), len(searched), max(HOPELESS, worth_further)
     if best.significance >= least and not is_strong(first):
-        planes = match_planes_rectified(weights, images, best, config=config, seed=seed)
+        planes = match_planes_rectified(pair, best)
         taken += planes.taken
         if planes.confirmed:
             return PairPasses(planes.confirmed, taken)
-    if conclusive and not seen_alike(first, images):
-        place = first.located(*images)
-        nearer = match_rectified(weights, images, place, size=SIZE, config=config, seed=seed)
+    if conclusive and not seen_alike(first, pair.images):
+        nearer = match_rectified(pair, first.located(*pair.images), size=SIZE)
         if nearer is not None:
             taken += 1
             if nearer.significance >= CONFIRMED * first.significance:
@@ -205,29 +202,25 @@ def match_in_passes(
 
 
 def _search_further(
-    weights: Weights,
-    features: tuple[ImageFeatures, ImageFeatures],
-    passes: list[MatchingPass],
-    *,
-    config: Config,
-    seed: int,
+    pair: PhotoPair, features: tuple[ImageFeatures, ImageFeatures], passes: list[MatchingPass]
 ) -> list[MatchingPass]:
     """The passes that were taken, and further ones: enlarged, at proposals, and turned."""
-    passes, images = list(passes), (features[0].image, features[1].image)
-    if _best(passes).significance < SURE and config.enlarge < MOST_ENLARGED:
-        config = dataclasses.replace(config, enlarge=MOST_ENLARGED)
-        enlarged0, enlarged1 = (image_features(weights, each, config=config) for each in images)
-        passes.append(match_once(enlarged0, enlarged1, images, config=config, seed=seed))
-        passes += at_other_scales(enlarged0, enlarged1, config=config, seed=seed)
+    passes = list(passes)
+    if _best(passes).significance < SURE and pair.config.enlarge < MOST_ENLARGED:
+        pair = pair._replace(config=dataclasses.replace(pair.config, enlarge=MOST_ENLARGED))
+        enlarged0, enlarged1 = (
+            image_features(pair.weights, each, config=pair.config) for each in pair.images
+        )
         features = (enlarged0, enlarged1)
+        passes.append(match_once(pair, *features))
+        passes += at_other_scales(pair, *features)
     if _best(passes).significance < SURE:
         tried = (
-            match_rectified(weights, images, each, size=SMALL_SIZE, config=config, seed=seed)
-            for each in proposals(passes, images)
+            match_rectified(pair, each, size=SMALL_SIZE) for each in proposals(passes, pair.images)
         )
         passes += [each for each in tried if each is not None]
     if _best(passes).significance < SURE:
-        passes += turned(weights, features[0], images[1], config=config, seed=seed)
+        passes += turned(pair, features[0])
     return passes
 
 
