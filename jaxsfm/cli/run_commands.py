@@ -222,9 +222,8 @@ def frames(
     from jaxsfm.io.entries import named_place
     from jaxsfm.runs.video.frames import FrameOptions, frames_folder
 
-    found = frames_folder(
-        video, named_place(out), FrameOptions(overlap=overlap, most=most), progress=True
-    )
+    options = FrameOptions(overlap=overlap, most=most)
+    found = frames_folder(video, named_place(out), options, progress=True)
     before = ", chosen before" if found.there else ""
     print(
         f"{len(found.names)} frames: {out} (neighbours have about {100 * found.common:.0f} % in "

@@ -6,7 +6,8 @@ there, and the path of each comes from `entry`, which follows no link. A folder 
 is opened if one of its entries is a link, or holds one (`check_entries`), so that a run does not
 fail at its end. The folder itself may be reached through links, as the user likes.
 
-COLMAP writes databases and models, and follows links. It is given folders that jaxsfm has just made.
+COLMAP writes databases and models, and follows links. It is given folders that jaxsfm has just
+made, and databases that were looked at.
 
 Who may write into the folder while a command works there could still put a link into the place of
 a folder, between a look at it and its use. Only a path that is looked at and used in one call of
@@ -19,6 +20,7 @@ import stat
 from pathlib import Path, PureWindowsPath
 
 from jaxsfm.errors import UserError
+from jaxsfm.io.typed_files import read_json
 
 RECORD = "run.json"
 """The file with the identity of the last run. A folder without it is not a work folder."""
@@ -68,7 +70,7 @@ def entry(folder: Path, name: str, *below: str) -> Path:
         raise ValueError(f"name must be one of ENTRIES; got {name!r}")
     path = folder
     for each in (name, *below):
-        if each == ".." or PureWindowsPath(each).name != each:
+        if each in ("", "..") or PureWindowsPath(each).name != each:
             raise ValueError(f"a name must have no folder in it; got {each!r}")
         path = path / each
         if is_link(path):
@@ -127,7 +129,7 @@ def named_place(path: Path) -> Path:
             inside = False
         elif inside and is_link(each):
             raise _refused(each)
-        inside = inside or (each / RECORD).is_file()
+        inside = inside or "images" in (read_json(each / RECORD, dict) or {})
     return path.resolve() if is_link(path) else path
 
 
