@@ -160,6 +160,7 @@ def _make_own(database: Path) -> None:
     """Copy a database that has other names too (hard links), because COLMAP writes into it."""
     if database.stat().st_nlink > 1:
         copy = database.with_name(database.name + PARTIAL)
+        remove(copy)
         shutil.copyfile(database, copy)
         os.replace(copy, database)
 

@@ -32,7 +32,7 @@ def live(out: Path) -> None:
         for name in ("verified", "mapped"):
             open_database(folder.stage(name, "key", write_stage))
         folder.forget_stage("mapped")
-        for names in (RESULTS, RESULTS[:2]):
+        for names in (RESULTS[:2], RESULTS, RESULTS[:2]):
             with folder.publish() as fresh:
                 write_results(fresh, names)
         folder.drop_features()
@@ -146,6 +146,16 @@ def test_a_link_at_any_place_leads_no_run_to_other_files(lived, attack, kind):
             assert f"out/{place}: " in str(refusal) or place == RECORD
 
 
+def test_results_of_an_interrupted_run_without_a_model_go_into_no_other_run(attack):
+    def put(out: Path, outside: Path) -> None:
+        moves = {"failed": True, "names": list(RESULTS)}
+        (out / "publishing" / "moves.json").write_text(json.dumps(moves))
+        remove(out / "failed")
+        (out / "failed").symlink_to(outside / "other run")
+
+    assert "out/failed: " in str(attack(put))
+
+
 def test_another_name_of_a_file_outside_is_not_written_through(lived, attack):
     """A hard link cannot be told from a file, and copies of a work folder may share files."""
     for place in places(lived):
@@ -199,10 +209,32 @@ def test_a_log_of_a_database_is_not_played_back(lived, attack):
     """SQLite deletes the file that a journal names as that of all databases of a transaction."""
 
     def put(out: Path, outside: Path) -> None:
-        for stage in ("verified", "mapped"):
-            _plant(out / "stages" / stage / "database.db", outside / "file")
+        def with_journal(fresh: Path) -> None:
+            write_stage(fresh)
+            _plant(fresh / "database.db", outside / "file")
+
+        _keep(out, with_journal)
 
     assert attack(put) is None
+
+
+def test_a_database_with_two_names_is_copied_and_not_over_another_file(attack, tmp_path):
+    def put(out: Path, outside: Path) -> None:
+        def with_names(fresh: Path) -> None:
+            write_stage(fresh)
+            os.link(fresh / "database.db", tmp_path / "second name")
+            os.link(outside / "file", fresh / "database.db.partial")
+
+        _keep(out, with_names)
+
+    assert attack(put) is None
+
+
+def _keep(out: Path, compute: Callable[[Path], None]) -> None:
+    """Let a stage be found that something else has computed."""
+    with open_folder(out, IDENTITY) as folder:
+        key = folder.stage("verified", "other", compute) / "key"
+    key.write_text(key.read_text().replace("other", "key"))
 
 
 def _plant(database: Path, victim: Path) -> None:
