@@ -14,7 +14,7 @@ import pytest
 from kept_runs import renamed
 
 from jaxsfm.cli.main import main
-from jaxsfm.io.entries import ENTRIES, FRAMES, PARTIAL, RECORD, remove
+from jaxsfm.io.entries import ENTRIES, FRAMES, PARTIAL, remove
 from jaxsfm.report.run_report import RunReport
 
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
@@ -76,7 +76,7 @@ def test_all_that_commands_write_is_in_the_table_of_entries(plain, scene, tmp_pa
         assert main(["report", str(out)]) == 0
     below = {Path(path).relative_to(out).parts for path in written if path.startswith(str(out))}
     first = {parts[0] for parts in below if parts}
-    assert {"features", "matches", "descriptors", "stages", "fresh", "sparse", RECORD} <= first
+    assert {"features", "matches", "descriptors", "stages", "fresh", "sparse"} <= first
     made = {path.name for path in out.iterdir()}
     assert {name for name in first | made if not name.endswith(PARTIAL)} <= ENTRIES
 
