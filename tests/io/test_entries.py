@@ -115,12 +115,13 @@ def attack(lived, tmp_path) -> Callable[..., UserError | None]:
     def attacked(put: Callable[[Path, Path], None]) -> UserError | None:
         shutil.copytree(lived, out)
         put(out, outside)
-        refusal = None
+        refusal: UserError | OSError | None = None
         try:
             live(out)
-        except UserError as error:
+        except (UserError, OSError) as error:
             refusal = error
         assert state(outside) == before
+        assert not isinstance(refusal, OSError), refusal
         shutil.rmtree(out)
         return refusal
 
