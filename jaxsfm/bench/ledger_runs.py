@@ -30,9 +30,9 @@ from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
+from jaxsfm.io.entries import FAILED
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.photo_folder import find_images
-from jaxsfm.io.store import FAILED
 from jaxsfm.io.typed_files import read_json
 from jaxsfm.options import Step
 from jaxsfm.report.run_report import FILE, RunReport, read_report

@@ -27,10 +27,10 @@ from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
 from jaxsfm.errors import writing
 from jaxsfm.io.atomic import atomic_folder
+from jaxsfm.io.entries import RECORD
 from jaxsfm.io.pairs import Pair, best_pairs, exhaustive_pairs
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.weights import chosen_weights
-from jaxsfm.io.work_folder import RECORD
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import USUAL_WEIGHTS, WeightsChoice
 from jaxsfm.report.run_report import RunReport

@@ -23,9 +23,9 @@ from jaxsfm.colmap.poses import CameraPose, Poses, model_poses
 from jaxsfm.colmap.rootsift import write_rootsift_database
 from jaxsfm.colmap.two_views import VerificationOptions, rays_of, read_two_views
 from jaxsfm.errors import UserError
+from jaxsfm.io.entries import RECORD
 from jaxsfm.io.pairs import Pair, PairResult, exhaustive_pairs
 from jaxsfm.io.weights import chosen_weights
-from jaxsfm.io.work_folder import RECORD
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.mapped_stage import DATABASE

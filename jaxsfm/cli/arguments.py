@@ -18,6 +18,7 @@ import tyro
 from jaxsfm.config import BackboneName, Config, Convolutions, Keypoints, Refinement, preset
 from jaxsfm.core.pair_shape import Products
 from jaxsfm.errors import UserError
+from jaxsfm.io.entries import named_place
 
 Command = Callable[..., int]
 _WRAPPED = re.compile(r"\n {4,}(?=[^\s$])")
@@ -161,10 +162,11 @@ def check_writable(path: Path | None, option: str, suffixes: tuple[str, ...]) ->
 
     Raises:
       UserError: the name ends in none of the suffixes, or the place cannot be written to. The
-        message starts with the option.
+        message starts with the option. Or a link in a work folder leads there (`named_place`).
     """
     if path is None:
         return
+    named_place(path)
     if path.suffix.lower() not in suffixes:
         raise UserError(f"{option} {path}: the name must end in {' or '.join(suffixes)}")
     try:

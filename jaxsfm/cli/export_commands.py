@@ -13,6 +13,7 @@ import tyro
 from jaxsfm.cli.arguments import check_writable
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
+from jaxsfm.io.entries import named_place
 
 if TYPE_CHECKING:
     import pycolmap
@@ -105,6 +106,8 @@ def _fresh(path: Path, suffix: str | None) -> Iterator[Path]:
             raise UserError(f"--out {path}: is a file, not a folder")
         elif path.is_dir() and any(path.iterdir()):
             raise UserError(f"--out {path}: not empty; choose an empty or new folder")
+        else:
+            path = named_place(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch = tempfile.TemporaryDirectory(dir=path.parent, prefix=".jaxsfm-")
     except OSError as error:

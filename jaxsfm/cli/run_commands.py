@@ -60,7 +60,7 @@ def reconstruct(
     """
     chosen = config.config(network.relocalizer)
     limit_threads(run.threads)
-    from jaxsfm.io.store import FAILED
+    from jaxsfm.io.entries import FAILED
     from jaxsfm.matching.execution import Execution
     from jaxsfm.report.summary import summary_lines
     from jaxsfm.runs.reconstruct import reconstruct_folder, reconstruct_video
@@ -219,9 +219,11 @@ def frames(
       most: The largest number of frames. If there are more, frames at equal steps of the camera's
         way are kept, with less overlap.
     """
+    from jaxsfm.io.entries import named_place
     from jaxsfm.runs.video.frames import FrameOptions, frames_folder
 
-    found = frames_folder(video, out, FrameOptions(overlap=overlap, most=most), progress=True)
+    options = FrameOptions(overlap=overlap, most=most)
+    found = frames_folder(video, named_place(out), options, progress=True)
     before = ", chosen before" if found.there else ""
     print(
         f"{len(found.names)} frames: {out} (neighbours have about {100 * found.common:.0f} % in "

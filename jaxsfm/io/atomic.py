@@ -20,11 +20,10 @@ from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike
 
 from jaxsfm.errors import UserError, writing
+from jaxsfm.io.entries import PARTIAL, remove
 
 Json: TypeAlias = Mapping[str, "Json"] | Sequence["Json"] | str | int | float | bool | None
 """What `json.dumps` writes. What `json.loads` returns is a dict, a list or one of the others."""
-PARTIAL = ".partial"
-"""The suffix of a file or folder that is still being written."""
 CHECKSUM = "crc32"
 """The name of the array that holds the checksum of the others."""
 SPARE_BYTES = 4_000_000
@@ -36,7 +35,8 @@ tables, poses and the report page."""
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing; it takes the place of `path` when the block ends.
 
-    Until then its bytes are in a file of another name. Data that the system has not written to the
+    Until then its bytes are in a new file of another name. If `path` is a link, it is replaced, and
+    what it leads to stays as it is. Data that the system has not written to the
     disk yet may be lost if power fails; `write_atomic` waits for them. Raises UserError if the file
     cannot be written.
     """
@@ -44,7 +44,8 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     with writing(path):
         try:
-            with partial.open("wb") as file:
+            partial.unlink(missing_ok=True)
+            with partial.open("xb") as file:
                 yield file
             os.replace(partial, path)
         except OSError:
@@ -119,17 +120,18 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Make an empty folder; it takes the place of `path` when the block ends.
 
     The old folder is removed before the new one is renamed, so a process that is killed between
-    the two leaves neither. If the block fails, nothing is left of the new folder.
+    the two leaves neither. If the block fails, nothing is left of the new folder. If `path` is a
+    link, it is replaced, and what it leads to stays as it is.
     """
     partial = path.with_name(path.name + PARTIAL)
-    shutil.rmtree(partial, ignore_errors=True)
+    remove(partial)
     partial.mkdir(parents=True)
     try:
         yield partial
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    shutil.rmtree(path, ignore_errors=True)
+    remove(path)
     partial.rename(path)
 
 

@@ -16,7 +16,16 @@ from jaxtyping import Array
 from jaxsfm.config import EXTRACTED_BY
 from jaxsfm.core.types import DenseFeatures, Status
 from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import PARTIAL, Json, load_arrays, save_arrays, write_atomic
+from jaxsfm.io.atomic import Json, load_arrays, save_arrays, write_atomic
+from jaxsfm.io.entries import (
+    DESCRIPTORS,
+    FAILED,
+    FEATURES,
+    MATCHES,
+    PARTIAL,
+    UNUSABLE,
+    entry,
+)
 from jaxsfm.io.features import ImageFeatures
 from jaxsfm.io.images import DamagedImage, ImageError, ImageFile, content
 from jaxsfm.io.orientation import checked
@@ -33,15 +42,51 @@ _OCTAVES = ("coarse", "fine")
 """The fields of DenseFeatures that hold one array for each octave."""
 _RESULT = ("cells", "keypoints0", "keypoints1", "plane", "homographies")
 """The fields of PairResult that are arrays."""
-_FOLDERS = ("features", "matches", "descriptors")
-FAILED = "failed"
-"""The folder for the report of a run without a model, beside an earlier model."""
+_FOLDERS = (FEATURES, MATCHES, DESCRIPTORS)
 
 
 def digest(*parts: Json) -> str:
     """Return 32 hexadecimal digits of the SHA-256 of values that JSON can hold."""
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+_OPTIONS = {
+    name: f"--{name.replace('_', '-')}"
+    for name in (
+        "max_size",
+        "keypoints",
+        "convolutions",
+        "products",
+        "backbone",
+        "seed",
+        "weights",
+    )
+}
+
+
+def differences(old: Identity, new: Identity) -> str:
+    """Say in the user's terms how two identities differ; "" if they do not."""
+    parts = []
+    for key in sorted(old.keys() | new.keys()):
+        before, now = old.get(key), new.get(key)
+        if before == now:
+            continue
+        if isinstance(before, dict) and isinstance(now, dict) and key == "images":
+            changed = sorted(n for n in before.keys() | now.keys() if before.get(n) != now.get(n))
+            parts.append(f"{len(changed)} images, first {changed[0]!r}")
+        elif key in ("orientations", "masks"):
+            parts.append({"orientations": "how images are turned", "masks": "--masks"}[key])
+        elif isinstance(before, dict) and isinstance(now, dict):
+            parts.append(differences(before, now))
+        else:
+            parts.append(f"{_OPTIONS.get(key, key)}: {_short(before)} there, {_short(now)} now")
+    return "; ".join(parts)
+
+
+def _short(value: Json) -> Json:
+    """The first digits of a value that is a hash; any other value as it is."""
+    return f"{value[:8]}.." if isinstance(value, str) and len(value) == 64 else value
 
 
 class Store:
@@ -59,6 +104,12 @@ class Store:
         # The sub-folders keep a run of 100 000 pairs from having as many files in one folder.
         return self.path / kind / name[:2] / f"{name[2:]}.safetensors"
 
+    def _save(self, path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a file of the store; UserError if it cannot be written, or a link leads to it."""
+        kind, folder, _ = path.relative_to(self.path).parts
+        entry(self.path, kind, folder)
+        save_arrays(path, arrays)
+
     def _setting(self, name: str) -> Mapping[str, Json]:
         """An entry of the identity that is an object, or {} if it is none."""
         value = self.identity.get(name)
@@ -67,9 +118,9 @@ class Store:
     def sweep(self) -> None:
         """Remove the files that a killed process had begun to write."""
         for kind in _FOLDERS:
-            for partial in (self.path / kind).glob(f"*/*{PARTIAL}"):
+            for partial in entry(self.path, kind).glob(f"*/*{PARTIAL}"):
                 partial.unlink(missing_ok=True)
-        for folder in (self.path, self.path / FAILED):
+        for folder in (self.path, entry(self.path, FAILED)):
             for partial in folder.glob(f"*.*.*{PARTIAL}"):  # NAME.SUFFIX.PROCESS.partial
                 partial.unlink(missing_ok=True)
 
@@ -77,7 +128,7 @@ class Store:
 
     def _feature_path(self, image: ImageFile) -> Path:
         config = self._setting("config")
-        return self._file("features", {k: config.get(k) for k in EXTRACTED_BY}, image.content)
+        return self._file(FEATURES, {k: config.get(k) for k in EXTRACTED_BY}, image.content)
 
     def save_features(self, features: ImageFeatures) -> None:
         """Save the features of an image. Raises UserError if they cannot be written."""
@@ -87,7 +138,7 @@ class Store:
                 arrays |= {f"octave{k}_{name}": array for k, array in enumerate(value)}
             else:
                 arrays[name] = value
-        save_arrays(self._feature_path(features.image), arrays)
+        self._save(self._feature_path(features.image), arrays)
 
     def has_features(self, image: ImageFile) -> bool:
         """Whether features of the image are saved; the file may still be damaged."""
@@ -115,7 +166,7 @@ class Store:
 
         A run calls this when every pair has its matches.
         """
-        shutil.rmtree(self.path / "features", ignore_errors=True)
+        shutil.rmtree(entry(self.path, FEATURES), ignore_errors=True)
 
     # -- descriptors of whole photos: they are small and stay ------------------------------------
 
@@ -126,16 +177,16 @@ class Store:
           kind: the name of the description, followed by all that it depends on besides the photo,
             the weights and jaxsfm's version.
         """
-        save_arrays(self._file("descriptors", kind, image.content), {"array": array})
+        self._save(self._file(DESCRIPTORS, kind, image.content), {"array": array})
 
     def load_descriptor(self, image: ImageFile, kind: str) -> np.ndarray | None:
         """The array that was saved, or None if the file is missing or damaged."""
-        return (load_arrays(self._file("descriptors", kind, image.content)) or {}).get("array")
+        return (load_arrays(self._file(DESCRIPTORS, kind, image.content)) or {}).get("array")
 
     # -- photos that could not be decoded --------------------------------------------------------
 
     def _unusable(self) -> dict[str, str]:
-        return read_json(self.path / "unusable.json", dict[str, str]) or {}
+        return read_json(self.path / UNUSABLE, dict[str, str]) or {}
 
     def why_unusable(self, image: ImageFile) -> str | None:
         """The reason why an earlier run could not decode the photo; None if there is none."""
@@ -150,7 +201,7 @@ class Store:
             return
         key = digest(self.identity.get("version"), image.sha256)
         record = self._unusable() | {key: str(error)}
-        write_atomic(self.path / "unusable.json", json.dumps(record, indent=1).encode())
+        write_atomic(entry(self.path, UNUSABLE), json.dumps(record, indent=1).encode())
 
     # -- matches ---------------------------------------------------------------------------------
 
@@ -165,15 +216,13 @@ class Store:
             content(str(images.get(name)), checked(turned.get(name)), _text(masks.get(name)))
             for name in pair
         ]
-        return self._file(
-            "matches", self.identity.get("config"), self.identity.get("seed"), contents
-        )
+        return self._file(MATCHES, self.identity.get("config"), self.identity.get("seed"), contents)
 
     def save_matches(self, result: PairResult) -> None:
         """Save the matches of a pair. Raises UserError if they cannot be written."""
         arrays = {name: getattr(result, name) for name in _RESULT}
         counts = [result.num_tentative, result.num_dropped, int(result.status)]
-        save_arrays(
+        self._save(
             self._match_path(result.pair), {**arrays, "counts": np.asarray(counts, np.int64)}
         )
 

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import json
 import logging
+import os
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -18,29 +19,37 @@ import msgspec
 
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import (
-    PARTIAL,
-    Json,
     atomic_folder,
     only_process,
     rows_sha256,
     sha256_of,
     write_atomic,
 )
-from jaxsfm.io.store import FAILED, Identity, Store, digest
+from jaxsfm.io.entries import (
+    DATABASE,
+    FAILED,
+    FRAMES,
+    FRAMES_RECORD,
+    FRESH,
+    LOCK,
+    LOGS,
+    PARTIAL,
+    PUBLISHING,
+    RECORD,
+    RESULTS,
+    STAGES,
+    check_entries,
+    entry,
+    lock_file,
+    named_place,
+    remove,
+)
+from jaxsfm.io.store import Identity, Store, differences, digest
 from jaxsfm.io.typed_files import read_json
 
 logger = logging.getLogger(__name__)
 
-RECORD = "run.json"
-"""The file with the identity of the last run. A folder without it is not a work folder."""
-FRAMES = "frames"
-"""The folder with the frames of a video. It is there before the first run begins."""
-FRAMES_RECORD = "frames.json"
-"""The file in it that says what the frames were made from."""
-PAGE = "report.html"
-"""The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
-RESULTS = (PAGE, "report.json", "sparse", "alternative", "database.db")
-_MOVES, _LOCK, _KEY = "moves.json", ".lock", "key"
+_MOVES, _KEY = "moves.json", "key"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -75,6 +84,8 @@ class WorkFolder(Store):
         """
         folder = self._stage_folder(name)
         if _is_kept(folder, key):
+            for database in folder.glob("*.db"):
+                _make_own(database)
             logger.info("%s: as before, nothing it depends on has changed", name)
             return folder
         with atomic_folder(folder) as fresh:
@@ -87,7 +98,15 @@ class WorkFolder(Store):
         (self._stage_folder(name) / _KEY).unlink(missing_ok=True)
 
     def _stage_folder(self, name: str) -> Path:
-        return self.path / "stages" / name
+        return entry(self.path, STAGES, name)
+
+    def sweep(self) -> None:
+        """Remove what a killed process had begun to write, and logs of databases, which are
+        whole without them."""
+        super().sweep()
+        for end in LOGS:
+            for log in entry(self.path, STAGES).glob(f"*/*{end}"):
+                remove(log)
 
     # -- results ---------------------------------------------------------------------------------
 
@@ -98,8 +117,8 @@ class WorkFolder(Store):
         If the process is killed while it moves them, the next run moves the rest first. Results
         without a model do not replace results with one: they are put into the folder `failed`.
         """
-        fresh = self.path / "fresh"
-        _remove(fresh)
+        fresh = entry(self.path, FRESH)
+        remove(fresh)
         fresh.mkdir()
         yield fresh
         failed = (self.path / "sparse").exists() and not (fresh / "sparse").exists()
@@ -110,36 +129,40 @@ class WorkFolder(Store):
             )
         moves = {"failed": failed, "names": [n for n in RESULTS if (fresh / n).exists()]}
         write_atomic(fresh / _MOVES, json.dumps(moves).encode())
-        fresh.rename(self.path / "publishing")  # from here on they are the results
+        fresh.rename(entry(self.path, PUBLISHING))  # from here on they are the results
         self.finish_publishing()
 
     def finish_publishing(self) -> None:
         """Move those of the complete results that have not been moved yet."""
-        made = self.path / "publishing"
+        made = entry(self.path, PUBLISHING)
         moves = read_json(made / _MOVES, _Moves)
         if moves is None:
-            _remove(made)
+            remove(made)
             return
-        target = self.path / FAILED if moves.failed else self.path
+        target = entry(self.path, FAILED) if moves.failed else self.path
         target.mkdir(exist_ok=True)
         # The report is removed first and moved last, so that it never describes other files.
         for name in RESULTS:
             if name not in moves.names or (made / name).exists():
-                _remove(target / name)
+                remove(target / name)
+                for end in LOGS if name == DATABASE else ():
+                    remove(target / (name + end))
         for name in reversed(RESULTS):
             if (made / name).exists():
                 (made / name).rename(target / name)
         if target == self.path:
-            _remove(self.path / FAILED)  # left by an earlier attempt
+            remove(entry(self.path, FAILED))  # left by an earlier attempt
         (made / _MOVES).unlink()
-        _remove(made)
+        remove(made)
 
 
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+def _make_own(database: Path) -> None:
+    """Copy a database that has other names too (hard links), because COLMAP writes into it."""
+    if database.stat().st_nlink > 1:
+        copy = database.with_name(database.name + PARTIAL)
+        remove(copy)
+        shutil.copyfile(database, copy)
+        os.replace(copy, database)
 
 
 def _is_kept(folder: Path, key: str) -> bool:
@@ -166,52 +189,14 @@ def _hash(file: Path) -> str:
         return f"damaged: {error}"
 
 
-_OPTIONS = {
-    name: f"--{name.replace('_', '-')}"
-    for name in (
-        "max_size",
-        "keypoints",
-        "convolutions",
-        "products",
-        "backbone",
-        "seed",
-        "weights",
-    )
-}
-
-
-def differences(old: Identity, new: Identity) -> str:
-    """Say in the user's terms how two identities differ; "" if they do not."""
-    parts = []
-    for key in sorted(old.keys() | new.keys()):
-        before, now = old.get(key), new.get(key)
-        if before == now:
-            continue
-        if isinstance(before, dict) and isinstance(now, dict) and key == "images":
-            changed = sorted(n for n in before.keys() | now.keys() if before.get(n) != now.get(n))
-            parts.append(f"{len(changed)} images, first {changed[0]!r}")
-        elif key in ("orientations", "masks"):
-            parts.append({"orientations": "how images are turned", "masks": "--masks"}[key])
-        elif isinstance(before, dict) and isinstance(now, dict):
-            parts.append(differences(before, now))
-        else:
-            parts.append(f"{_OPTIONS.get(key, key)}: {_short(before)} there, {_short(now)} now")
-    return "; ".join(parts)
-
-
-def _short(value: Json) -> Json:
-    """The first digits of a value that is a hash; any other value as it is."""
-    return f"{value[:8]}.." if isinstance(value, str) and len(value) == 64 else value
-
-
 def _prepare(path: Path) -> None:
     """Make the folder, or check that it is a work folder."""
     with writing(f"--out {path}"):
         if path.exists() and not path.is_dir():
             raise UserError(f"--out {path}: this is a file and not a folder")
         if path.is_dir() and not (path / RECORD).exists():
-            begun = {*path.glob(f"{RECORD}.*{PARTIAL}"), path / _LOCK}
-            if (path / _LOCK).exists():
+            begun = {*path.glob(f"{RECORD}.*{PARTIAL}"), path / LOCK}
+            if (path / LOCK).exists():
                 begun.add(path / (FRAMES + PARTIAL))
             if (path / FRAMES / FRAMES_RECORD).is_file():
                 begun.add(path / FRAMES)
@@ -262,13 +247,16 @@ def lock_folder(path: Path) -> Iterator[None]:
     """Create or find a work folder and hold its lock while the block runs.
 
     If a run was killed while it moved its results into place, the rest is moved first. Raises
-    UserError if `path` is a file or a folder of something else, cannot be written, or is in use.
+    UserError if `path` is a file or a folder of something else, cannot be written, is in use, or
+    holds links (`jaxsfm.io.entries`).
     """
+    named_place(path)
     _prepare(path)
     with contextlib.ExitStack() as stack:
         with writing(f"--out {path}"):
             in_use = f"--out {path}: another run is using this folder"
-            stack.enter_context(only_process(path / _LOCK, in_use))
+            stack.enter_context(only_process(lock_file(path), in_use))
+            check_entries(path)
             WorkFolder(path, {}).finish_publishing()
         yield
 

@@ -16,6 +16,7 @@ from jaxsfm.colmap.poses import Poses, model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io import orientation
+from jaxsfm.io.entries import RECORD
 from jaxsfm.io.images import (
     ImageError,
     ImageFile,
@@ -27,7 +28,6 @@ from jaxsfm.io.images import (
 from jaxsfm.io.masks import MaskFile, mask_path
 from jaxsfm.io.photo_folder import with_mask
 from jaxsfm.io.store import Store
-from jaxsfm.io.work_folder import RECORD
 from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
 from jaxsfm.report.run_results import EvaluationReport

@@ -19,12 +19,13 @@ from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.reconstruction import colour_points
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
+from jaxsfm.io.entries import RECORD
 from jaxsfm.io.images import ImageError, ImageFile
 from jaxsfm.io.libraries import versions
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches
-from jaxsfm.io.work_folder import RECORD, lock_folder, open_locked_folder
+from jaxsfm.io.work_folder import lock_folder, open_locked_folder
 from jaxsfm.matching.engines import Engine, chosen_engine
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import check_threads

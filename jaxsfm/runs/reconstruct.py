@@ -17,14 +17,14 @@ from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
+from jaxsfm.io.entries import FAILED, FRAMES
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.photo_folder import masks_of, with_masks
-from jaxsfm.io.store import FAILED
 from jaxsfm.io.video import open_video
 from jaxsfm.io.weights import chosen_weights
-from jaxsfm.io.work_folder import FRAMES, lock_folder, open_folder
+from jaxsfm.io.work_folder import lock_folder, open_folder
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs

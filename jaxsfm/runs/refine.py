@@ -17,6 +17,7 @@ from jaxsfm.colmap.given_model import (
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import SPARE_BYTES, atomic_folder, check_disk_space
+from jaxsfm.io.entries import named_place
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.libraries import versions
 from jaxsfm.options import check_threads
@@ -143,9 +144,10 @@ def check_new_folder(out: Path) -> None:
       UserError: there is a file or a folder with something in it, or the place cannot be written.
     """
     with writing(f"--out {out}"):
+        place = named_place(out)
         if out.exists() and not (out.is_dir() and not any(out.iterdir())):
             raise UserError(f"--out {out}: not empty; choose an empty or new folder")
-        out.parent.mkdir(parents=True, exist_ok=True)
+        place.parent.mkdir(parents=True, exist_ok=True)
 
 
 def write_new_folder(
@@ -155,7 +157,7 @@ def write_new_folder(
 
     Raises UserError if the folder cannot be written, or the disk is too small.
     """
-    with writing(f"--out {out}"), atomic_folder(out) as fresh:
+    with writing(f"--out {out}"), atomic_folder(named_place(out)) as fresh:
         check_disk_space(fresh, SPARE_BYTES + OBSERVATION_BYTES * model.compute_num_observations())
         model.write_binary(fresh)
         (fresh / name).write_text(json.dumps(report, indent=1), encoding="utf-8")

@@ -127,3 +127,20 @@ def test_what_is_no_database_is_refused(tmp_path, content):
     assert path.read_bytes() == content
     with pytest.raises(UserError, match="no such file"):
         read_database(tmp_path, where="--with-database d.db")
+
+
+def test_a_database_with_a_log_is_read_without_writing_into_files_of_other_places(tmp_path, files):
+    """SQLite writes into the index of a log, which can have another name elsewhere."""
+    (tmp_path / "run").mkdir()
+    path, mine = tmp_path / "run" / "database.db", tmp_path / "mine"
+    path.write_bytes((files / "database.db").read_bytes())
+    path.with_name("database.db-wal").touch()
+    assert len(read_database(path, where="x").keypoints) == len(NAMES)
+    mine.write_text("mine" * 9000)
+    index = path.with_name("database.db-shm")
+    for link in (index.hardlink_to, index.symlink_to):
+        index.unlink(missing_ok=True)
+        link(mine)
+        with pytest.raises(UserError, match="^x: "):
+            read_database(path, where="x")
+        assert mine.read_text() == "mine" * 9000

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxsfm.io.atomic import PARTIAL
+from jaxsfm.io.entries import PARTIAL
 from jaxsfm.io.work_folder import WorkFolder
 
 

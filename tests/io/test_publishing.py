@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxsfm.io.work_folder import RESULTS, open_folder
+from jaxsfm.io.entries import RESULTS
+from jaxsfm.io.work_folder import open_folder
 
 IDENTITY = {"version": "1", "images": {"a.jpg": "00"}}
 

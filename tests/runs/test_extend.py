@@ -16,7 +16,8 @@ from jaxsfm.cli.main import main
 from jaxsfm.colmap.database import read_matches
 from jaxsfm.colmap.model_files import read_model
 from jaxsfm.colmap.poses import model_poses, read_poses
-from jaxsfm.io.work_folder import RESULTS, lock_folder
+from jaxsfm.io.entries import RESULTS
+from jaxsfm.io.work_folder import lock_folder
 from jaxsfm.options import EngineChoice
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.run_report import read_report

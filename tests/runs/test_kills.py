@@ -15,7 +15,8 @@ import pytest
 from databases import content
 
 from jaxsfm.bench.synthetic import write_scene
-from jaxsfm.io.atomic import PARTIAL, load_arrays
+from jaxsfm.io.atomic import load_arrays
+from jaxsfm.io.entries import PARTIAL
 
 KILLS, ROUNDS, SEED = 15, 4, 8
 """Fifteen kills, one in each fifteenth of a run, meet more different moments than as many at random

@@ -70,6 +70,10 @@ def read_database(path: Path, *, where: str) -> Tables:
     # A COLMAP database has a log file beside it while it is open. sqlite3 makes this file even to
     # read, unless it is told that nobody writes. An existing log holds data that the database does
     # not hold yet.
+    # SQLite writes into the index of that log, which must not be a file of another place too.
+    index = path.with_name(path.name + "-shm")
+    if index.is_file() and index.stat().st_nlink > 1:
+        raise UserError(f"{where}: {index.name} beside it is another file too; delete it")
     how = "mode=ro" if path.with_name(path.name + "-wal").exists() else "immutable=1"
     try:
         address = f"file:{quote(str(path.absolute()), errors='surrogateescape')}?{how}"

@@ -3,7 +3,7 @@
 import logging
 from pathlib import Path
 
-from jaxsfm.io.work_folder import PAGE
+from jaxsfm.io.entries import PAGE
 
 logger = logging.getLogger(__name__)
 

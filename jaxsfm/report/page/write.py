@@ -10,9 +10,9 @@ import plotly.offline
 from markupsafe import Markup
 
 from jaxsfm.io.atomic import write_atomic
+from jaxsfm.io.entries import FAILED, PAGE, RECORD, entry
 from jaxsfm.io.images import MOST_NAMED, shown_name
 from jaxsfm.io.pairs import describe
-from jaxsfm.io.work_folder import PAGE
 from jaxsfm.report.finished_run import FinishedRun, read_run
 from jaxsfm.report.page.figures import figures
 from jaxsfm.report.page.pairs import pair_pictures, pair_table
@@ -129,6 +129,8 @@ def write_page(
       UserError: there is no finished run, or an argument cannot be used.
     """
     run = read_run(folder, images=images, reference=reference)
+    if folder.name == FAILED and (folder.parent / RECORD).is_file():
+        folder = entry(folder.parent, FAILED)
     path = out or folder / PAGE
     write_atomic(path, page(run).encode("utf-8", errors="replace"))
     return path

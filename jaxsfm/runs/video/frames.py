@@ -13,10 +13,10 @@ from tqdm import tqdm
 
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import Json, atomic_folder, sha256_of
+from jaxsfm.io.entries import FRAMES_RECORD
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.typed_files import read_json
 from jaxsfm.io.video import Video, open_video
-from jaxsfm.io.work_folder import FRAMES_RECORD
 from jaxsfm.runs.video.choice import ChosenFrame, choose_frames
 from jaxsfm.runs.video.motion import common_area
 
