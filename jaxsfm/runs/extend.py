@@ -13,13 +13,18 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
+from jaxsfm.colmap.extend_database import (
+    add_images,
+    add_matches,
+    copy_database,
+    used_by_colmap,
+)
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.reconstruction import colour_points
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
-from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.images import ImageError, ImageFile, shown_name
 from jaxsfm.io.libraries import versions
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
@@ -201,6 +206,18 @@ def _match_new(
     return SavedMatches(job.store, pairs_without(pairs, lost)), lost
 
 
+def _check_numbers(
+    database: Path, ids: Mapping[str, int], working: Sequence[WorkingModel]
+) -> None:
+    """Raise UserError if a photo of the models has another number in the database, or none."""
+    for view in (view for model in working for view in model.views):
+        if ids.get(view.name) != view.image_id:
+            raise UserError(
+                f"{database}: is not of the run's models: {shown_name(view.name)} is photo "
+                f"{view.image_id} there, and {ids.get(view.name, 'none')} in the database"
+            )
+
+
 def write_extension(
     target: Path,
     run: FinishedRun,
@@ -216,17 +233,23 @@ def write_extension(
       working: the models of the run.
       photos: the run's photos and the new ones.
       matches: the matches of the new photos with their shortlists.
+
+    Raises:
+      UserError: the run's database is damaged, or is not that of its models.
     """
-    database = target / "database.db"
+    source, database = run.folder / "database.db", target / "database.db"
     count = sum(result.num_inliers for result in matches.values())
-    copy_database(run.folder / "database.db", database, count)
-    # A camera of the run has the same number in all models, and a new one has none yet.
-    added = add_images(database, {n: (i, new.cameras[n][0].camera) for n, i in new.images.items()})
+    _check_numbers(source, copy_database(source, database, count), working)
     seed, config = run.report.known_options.seed, run.config
     verification = VerificationOptions(
         seed=seed, threads=options.threads, scale=photos.median_scale()
     )
-    verified = add_matches(database, matches, verification)
+    with used_by_colmap(source):
+        # A camera of the run has the same number in all models, and a new one has none yet.
+        added = add_images(
+            database, {n: (i, new.cameras[n][0].camera) for n, i in new.images.items()}
+        )
+        verified = add_matches(database, matches, verification)
     unregistered = {}
     for name, (image_id, in_database) in added.items():
         views = [
