@@ -107,7 +107,9 @@ class ForeignDatabase:
 def _is_stored(kind: object, page: object, sql: object) -> bool:
     """Whether an entry of the schema is a table that has pages of its own."""
     text = sql.upper() if isinstance(sql, str) else ""
-    return kind == "table" and isinstance(page, int) and page > 0 and text.startswith("CREATE TABLE")
+    return (
+        kind == "table" and isinstance(page, int) and page > 0 and text.startswith("CREATE TABLE")
+    )
 
 
 @contextlib.contextmanager

@@ -206,9 +206,7 @@ def _match_new(
     return SavedMatches(job.store, pairs_without(pairs, lost)), lost
 
 
-def _check_numbers(
-    database: Path, ids: Mapping[str, int], working: Sequence[WorkingModel]
-) -> None:
+def _check_numbers(database: Path, ids: Mapping[str, int], working: Sequence[WorkingModel]) -> None:
     """Raise UserError if a photo of the models has another number in the database, or none."""
     for view in (view for model in working for view in model.views):
         if ids.get(view.name) != view.image_id:

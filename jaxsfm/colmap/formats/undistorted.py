@@ -50,7 +50,7 @@ def write_undistorted(
         _check_name(image.name)
         _check_photo(image.name, model.camera(image.camera_id), photos)
     used = {image.camera_id for image in images}
-    for camera_id in model.cameras.keys() - used:
+    for camera_id in set(model.cameras) - used:
         _check_size(model.camera(camera_id))
     cameras = {k: _undistorted(camera, options) for k, camera in model.cameras.items()}
     pixels = sum(
