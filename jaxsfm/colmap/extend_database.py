@@ -55,8 +55,8 @@ def copy_database(source: Path, target: Path, matches: int) -> dict[str, int]:
       the numbers of its images, by name.
 
     Raises:
-      UserError: the database is damaged; or the copy, the copy that `add_matches` makes, and SQLite's journal do not fit on the
-        disk.
+      UserError: the database is damaged; or the copy, the copy that `add_matches` makes, and
+        SQLite's journal do not fit on the disk.
     """
     # A match takes at most a keypoint in both images, itself and its verification: 8 bytes each.
     rows = 4 * matches

@@ -87,7 +87,7 @@ def test_a_blob_of_another_size_is_named_with_its_image(tmp_path, files):
     db.execute("UPDATE keypoints SET rows = 3 WHERE image_id = 2")
     db.commit()
     db.close()
-    with pytest.raises(UserError, match=r"d.db: sub/b.jpg: 3 x 2 values expected; got 40"):
+    with pytest.raises(UserError, match=r"d.db: keypoints, row 2 .sub/b.jpg.: 3 x 2 values"):
         read_database(path, where="d.db")
 
 

@@ -8,16 +8,15 @@ import sqlite3
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 from foreign_model import NAMES, camera, exact_model, image_files, results_of, write_run
 from fuzz_children import run_cases
 from mutations import damaged, outcome
 
 from jaxsfm.cli.export_commands import export
-from jaxsfm.colmap.external_matches import read_external_matches
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database, used_by_colmap
-from jaxsfm.colmap.two_views import VerificationOptions, read_two_views
+from jaxsfm.colmap.external_matches import read_external_matches
+from jaxsfm.colmap.two_views import VerificationOptions
 
 POINTS = 20
 NEW = "new.jpg"

@@ -1,5 +1,6 @@
-"""Odd values in any field of a stranger's COLMAP model: what commands do with it, or one sentence."""
+"""Odd values in any field of a stranger's model: what commands make of it, or one sentence."""
 
+import functools
 import shutil
 import struct
 from pathlib import Path
@@ -8,7 +9,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pycolmap
-import pytest
 from foreign_model import CAMERAS, NAMES, SIZE, camera, exact_model
 from fuzz_children import run_cases
 from mutations import outcome
@@ -217,9 +217,8 @@ def odd(rng, folder: Path) -> str:
         out.mkdir()
         target = out / ("points.ply" if to == "ply" else "made")
         copied = to == "nerfstudio" and rng.random() < 0.5
-        made, _ = outcome(
-            lambda: export(bad, to=to, out=target, images=photos, copy_images=copied), *known
-        )
+        write = functools.partial(export, bad, to=to, out=target, images=photos)
+        made, _ = outcome(functools.partial(write, copy_images=copied), *known)
         assert target.exists() == (made == "read")
         assert sorted(out.iterdir()) == [target] * (made == "read")
     if given == "read" and rng.random() < 0.1:

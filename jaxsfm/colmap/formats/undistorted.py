@@ -87,8 +87,8 @@ def _check_size(camera: pycolmap.Camera) -> None:
     """Refuse a camera without photos that is so large that COLMAP would not end."""
     if max(camera.width, camera.height) > LONGEST_SIDE:
         raise UserError(
-            f"--to undistorted: camera {camera.camera_id}, which has no photos, has "
-            f"{camera.width} x {camera.height} pixels; at most {LONGEST_SIDE} a side are undistorted"
+            f"--to undistorted: camera {camera.camera_id}, which has no photos, has {camera.width} "
+            f"x {camera.height} pixels; at most {LONGEST_SIDE} a side are undistorted"
         )
 
 
