@@ -9,7 +9,6 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.database import PIXEL_OFFSET, read_images
-from jaxsfm.colmap.formats.database import check_database
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
@@ -48,23 +47,21 @@ def used_by_colmap(path: Path) -> Iterator[None]:
         raise UserError(f"{path}: COLMAP cannot use this database ({error})") from error
 
 
-def copy_database(source: Path, target: Path, matches: int) -> dict[str, int]:
-    """Copy a database to which `matches` matches will be added, after it was checked.
+def copy_database(source: Path, target: Path, matches: int) -> None:
+    """Copy a database to which `matches` matches will be added.
 
-    Returns:
-      the numbers of its images, by name.
+    Args:
+      source: `check_database` has checked it.
 
     Raises:
-      UserError: the database is damaged; or the copy, the copy that `add_matches` makes, and
-        SQLite's journal do not fit on the disk.
+      UserError: the copy, the copy that `add_matches` makes, and SQLite's journal do not fit on the
+        disk.
     """
     # A match takes at most a keypoint in both images, itself and its verification: 8 bytes each.
     rows = 4 * matches
-    ids = check_database(source, where=str(source))
     size = source.stat().st_size
     check_disk_space(target.parent, SPARE_BYTES + 3 * size + 16 * rows)
     shutil.copyfile(source, target)
-    return ids
 
 
 def _keys(xy: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ from jaxsfm.colmap.extend_database import (
     copy_database,
     used_by_colmap,
 )
+from jaxsfm.colmap.formats.database import check_database
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.reconstruction import colour_points
@@ -101,6 +102,7 @@ def _extend(
     if not images and not skipped:
         return None
     models = read_working_models(finished)
+    _check_database(run / "database.db", models)
     names = sorted({view.name for model in models for view in model.views})
     files = _unchanged_photos(finished, usable, names) | images
     intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
@@ -206,8 +208,10 @@ def _match_new(
     return SavedMatches(job.store, pairs_without(pairs, lost)), lost
 
 
-def _check_numbers(database: Path, ids: Mapping[str, int], working: Sequence[WorkingModel]) -> None:
-    """Raise UserError if a photo of the models has another number in the database, or none."""
+def _check_database(database: Path, working: Sequence[WorkingModel]) -> None:
+    """Raise UserError if a run's database is damaged, or numbers the photos of its models
+    differently."""
+    ids = check_database(database, where=str(database))
     for view in (view for model in working for view in model.views):
         if ids.get(view.name) != view.image_id:
             raise UserError(
@@ -231,13 +235,10 @@ def write_extension(
       working: the models of the run.
       photos: the run's photos and the new ones.
       matches: the matches of the new photos with their shortlists.
-
-    Raises:
-      UserError: the run's database is damaged, or is not that of its models.
     """
     source, database = run.folder / "database.db", target / "database.db"
     count = sum(result.num_inliers for result in matches.values())
-    _check_numbers(source, copy_database(source, database, count), working)
+    copy_database(source, database, count)
     seed, config = run.report.known_options.seed, run.config
     verification = VerificationOptions(
         seed=seed, threads=options.threads, scale=photos.median_scale()

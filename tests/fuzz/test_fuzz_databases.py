@@ -16,6 +16,7 @@ from mutations import damaged, outcome
 from jaxsfm.cli.export_commands import export
 from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database, used_by_colmap
 from jaxsfm.colmap.external_matches import read_external_matches
+from jaxsfm.colmap.formats.database import check_database
 from jaxsfm.colmap.two_views import VerificationOptions
 
 POINTS = 20
@@ -277,7 +278,8 @@ def extended(rng, folder: Path) -> str:
     (new,) = image_files([NEW], folder)
 
     def extend() -> None:
-        numbers = copy_database(source, copy, 100)
+        numbers = check_database(source, where=str(source))
+        copy_database(source, copy, 100)
         there = {pair: r for pair, r in results.items() if numbers.keys() >= {*pair} - {NEW}}
         with used_by_colmap(source):
             add_images(copy, {NEW: (new, model.camera(1))})
