@@ -291,5 +291,7 @@ def extended(rng, folder: Path) -> str:
 @pytest.mark.parametrize("kind", ["database", "extended"])
 def test_an_odd_database_is_read_or_refused_by_name(tmp_path, share, least, kind):
     cases = {"database": 2000, "extended": 600}[kind]
-    found = run_cases("test_fuzz_databases", kind, round(cases * share), tmp_path)
+    found = run_cases(
+        "test_fuzz_databases", kind, round(cases * share), tmp_path, patience_s=600 * share + 60
+    )
     assert found["read"] > cases / 20 * least and found["refused"] > cases / 3 * least

@@ -229,5 +229,7 @@ def odd(rng, folder: Path) -> str:
 
 
 def test_an_odd_model_is_used_or_refused_by_name(tmp_path, share, least):
-    found = run_cases("test_fuzz_odd_models", "odd", round(1500 * share), tmp_path, patience_s=300)
+    found = run_cases(
+        "test_fuzz_odd_models", "odd", round(1500 * share), tmp_path, patience_s=600 * share + 60
+    )
     assert found["read"] > 200 * least and found["refused"] > 300 * least
