@@ -1,7 +1,8 @@
 """Images and matches that are added to a COLMAP database. What is in it keeps its ids."""
 
+import contextlib
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pycolmap
 
 from jaxsfm.colmap.database import PIXEL_OFFSET, read_images
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
+from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult
@@ -36,8 +38,20 @@ def add_images(
     return {name: every[name] for name in images}
 
 
+@contextlib.contextmanager
+def used_by_colmap(path: Path) -> Iterator[None]:
+    """Report what COLMAP says of a database that it cannot use as a UserError that names `path`."""
+    try:
+        yield
+    except RuntimeError as error:  # of SQLite in COLMAP, such as a constraint that failed
+        raise UserError(f"{path}: COLMAP cannot use this database ({error})") from error
+
+
 def copy_database(source: Path, target: Path, matches: int) -> None:
     """Copy a database to which `matches` matches will be added.
+
+    Args:
+      source: `check_database` has checked it.
 
     Raises:
       UserError: the copy, the copy that `add_matches` makes, and SQLite's journal do not fit on the

@@ -19,6 +19,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.formats.tables import (
+    camera_fault,
+    clash,
+    clash_fault,
+    name_fault,
+    num_camera_params,
+)
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import shown_name
@@ -68,7 +75,7 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         model = pycolmap.Reconstruction(path)
         if suffix == ".txt":
             check_text(path, model)
-        _ = [image.name for image in model.images.values()]  # Python decodes them when asked
+        _check_names([image.name for image in model.images.values()], suffix)
         if not model.is_valid():
             raise DamagedModelError("its files do not fit together")
         return model
@@ -82,6 +89,15 @@ def read_model(path: Path) -> pycolmap.Reconstruction:
         raise UserError(f"{path}: not a readable COLMAP model") from error
 
 
+def _check_names(names: list[str], suffix: str) -> None:
+    """Raise DamagedModelError if names cannot be those of photos in one folder."""
+    fault = next((fault for fault in map(name_fault, names) if fault), None)
+    if fault is None and (both := clash(names)):
+        fault = clash_fault(both)
+    if fault is not None:
+        raise DamagedModelError(f"images{suffix}: {fault}")
+
+
 def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
     """Read what `write_models` wrote. Files are checked before COLMAP reads them.
 
@@ -90,7 +106,7 @@ def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
         COLMAP's model files do not.
 
     Raises:
-      UserError: a model is damaged.
+      UserError: a model is damaged, or has a camera that the database has not.
     """
     with pycolmap.Database.open(database) as db:
         known = {c.camera_id: c.has_prior_focal_length for c in db.read_all_cameras()}
@@ -98,6 +114,8 @@ def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
     while (path := folder / str(len(models))).is_dir():
         model = read_model(path)
         for camera_id, camera in model.cameras.items():
+            if camera_id not in known:
+                raise UserError(f"{path}: its camera {camera_id} is not in {database.name}")
             camera.has_prior_focal_length = known[camera_id]
         models.append(model)
     return models
@@ -209,12 +227,11 @@ def check_text(folder: Path, model: pycolmap.Reconstruction) -> None:
 
 
 def _check_camera(file: _Reader) -> None:
-    _camera, model, _width, _height = file.values("IiQQ")
-    known = {int(each): each for each in pycolmap.CameraModelId.__members__.values()}
-    if model < 0 or model not in known:
-        raise file.bad("a camera of no known model")
-    example = pycolmap.Camera.create_from_model_id(1, known[model], 1.0, 1, 1)
-    file.values(f"{len(example.params)}d")
+    camera, model, width, height = file.values("IiQQ")
+    count = num_camera_params(model)
+    params = file.values(f"{count}d") if count is not None else ()
+    if fault := camera_fault(model, (width, height), params):
+        raise file.bad(f"camera {camera}: {fault}")
 
 
 def _check_rig(file: _Reader) -> None:

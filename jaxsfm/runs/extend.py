@@ -13,14 +13,20 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from jaxsfm.colmap.extend_database import add_images, add_matches, copy_database
+from jaxsfm.colmap.extend_database import (
+    add_images,
+    add_matches,
+    copy_database,
+    used_by_colmap,
+)
+from jaxsfm.colmap.formats.database import check_database
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.reconstruction import colour_points
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
 from jaxsfm.io.entries import RECORD
-from jaxsfm.io.images import ImageError, ImageFile
+from jaxsfm.io.images import ImageError, ImageFile, shown_name
 from jaxsfm.io.libraries import versions
 from jaxsfm.io.pairs import make_pair
 from jaxsfm.io.photos import Photos
@@ -98,6 +104,7 @@ def _extend(
     if not images and not skipped:
         return None
     models = read_working_models(finished)
+    _check_database(run / "database.db", models)
     names = sorted({view.name for model in models for view in model.views})
     files = _unchanged_photos(finished, usable, names) | images
     intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
@@ -203,6 +210,18 @@ def _match_new(
     return SavedMatches(job.store, pairs_without(pairs, lost)), lost
 
 
+def _check_database(database: Path, working: Sequence[WorkingModel]) -> None:
+    """Raise UserError if a run's database is damaged, or numbers the photos of its models
+    differently."""
+    ids = check_database(database, where=str(database))
+    for view in (view for model in working for view in model.views):
+        if ids.get(view.name) != view.image_id:
+            raise UserError(
+                f"{database}: is not of the run's models: {shown_name(view.name)} is photo "
+                f"{view.image_id} there, and {ids.get(view.name, 'none')} in the database"
+            )
+
+
 def write_extension(
     target: Path,
     run: FinishedRun,
@@ -219,16 +238,19 @@ def write_extension(
       photos: the run's photos and the new ones.
       matches: the matches of the new photos with their shortlists.
     """
-    database = target / "database.db"
+    source, database = run.folder / "database.db", target / "database.db"
     count = sum(result.num_inliers for result in matches.values())
-    copy_database(run.folder / "database.db", database, count)
-    # A camera of the run has the same number in all models, and a new one has none yet.
-    added = add_images(database, {n: (i, new.cameras[n][0].camera) for n, i in new.images.items()})
+    copy_database(source, database, count)
     seed, config = run.report.known_options.seed, run.config
     verification = VerificationOptions(
         seed=seed, threads=options.threads, scale=photos.median_scale()
     )
-    verified = add_matches(database, matches, verification)
+    with used_by_colmap(source):
+        # A camera of the run has the same number in all models, and a new one has none yet.
+        added = add_images(
+            database, {n: (i, new.cameras[n][0].camera) for n, i in new.images.items()}
+        )
+        verified = add_matches(database, matches, verification)
     unregistered = {}
     for name, (image_id, in_database) in added.items():
         views = [

@@ -87,7 +87,7 @@ def test_a_blob_of_another_size_is_named_with_its_image(tmp_path, files):
     db.execute("UPDATE keypoints SET rows = 3 WHERE image_id = 2")
     db.commit()
     db.close()
-    with pytest.raises(UserError, match=r"d.db: sub/b.jpg: 3 x 2 values expected; got 40"):
+    with pytest.raises(UserError, match=r"d.db: keypoints, row 2 .sub/b.jpg.: 3 x 2 values"):
         read_database(path, where="d.db")
 
 
@@ -122,7 +122,8 @@ def test_reading_a_database_does_not_change_it(tmp_path, files):
 def test_what_is_no_database_is_refused(tmp_path, content):
     path = tmp_path / "d.db"
     path.write_bytes(content)
-    with pytest.raises(UserError, match="not a readable COLMAP database"):
+    why = "not a readable COLMAP database" if content else "no table cameras"
+    with pytest.raises(UserError, match=f"^--with-database d.db: {why}"):
         read_database(path, where="--with-database d.db")
     assert path.read_bytes() == content
     with pytest.raises(UserError, match="no such file"):

@@ -5,6 +5,7 @@ Each kind of damage is here with what COLMAP alone does, which is the reason for
 
 import dataclasses
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -17,9 +18,10 @@ from foreign_model import camera, exact_model
 from mapped import map_database
 
 from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_files import read_model, write_models
+from jaxsfm.colmap.model_files import read_model, read_models, write_models
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.reconstruction import colour_points
 from jaxsfm.errors import UserError
@@ -110,7 +112,15 @@ def test_colmap_alone_reads_it_without_an_end(tmp_path, whole, damage):
 
 
 KEYPOINT = IMAGE_KEYPOINTS + 8
+CAMERA_WIDTH = 16
 UNNOTICED = {
+    "a camera without pixels": ("cameras.bin", lambda d: put(d, CAMERA_WIDTH, "Q", 0), "width"),
+    "an endless camera": ("cameras.bin", lambda d: put(d, CAMERA_WIDTH + 8, "Q", 2**40), "height"),
+    "no focal length": ("cameras.bin", lambda d: put(d, CAMERA_PARAMS, "d", 0), "positive; got 0"),
+    "a negative one": ("cameras.bin", lambda d: put(d, CAMERA_PARAMS + 8, "d", -9), "positive"),
+    "no name": ("images.bin", lambda d: d.replace(b"a.jpg", b""), "'' names no file"),
+    "one photo twice": ("images.bin", lambda d: d.replace(b"a.jpg", b"sub//b.jpg"), "one folder"),
+    "a photo that is a folder": ("images.bin", lambda d: d.replace(b"a.jpg", b"z"), "one folder"),
     "half of a camera": ("cameras.bin", lambda d: d[:-30], "it ends too early"),
     "half of a rig": ("rigs.bin", lambda d: d[:-1], "it ends too early"),
     "a byte less": ("points3D.bin", lambda d: d[:-1], "it ends too early"),
@@ -251,3 +261,10 @@ def test_a_point_has_the_colour_of_the_pixels_under_it(scene, scale):
     assert len(checked) > 100
     for point_id in checked:
         assert tuple(model.point3D(point_id).color) == (point_id % 256, 40, 70)
+
+
+def test_models_with_a_camera_that_their_database_has_not_are_refused(tmp_path, whole):
+    shutil.copytree(whole, tmp_path / "sparse" / "0")
+    write_database(tmp_path / "d.db", [], {}, Cameras())
+    with pytest.raises(UserError, match=r"0: its camera \d is not in d\.db"):
+        read_models(tmp_path / "sparse", tmp_path / "d.db")

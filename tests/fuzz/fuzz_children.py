@@ -10,6 +10,7 @@ import importlib
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -23,6 +24,8 @@ from mutations import SEED, rng_of  # noqa: E402
 ROOM = 2 << 30
 """Bytes of address space that a child may take beyond its imports, so that the size that a damaged
 header claims cannot be allocated."""
+CASE_S = 10
+"""Seconds of computing that a case may take."""
 
 
 def run_cases(
@@ -56,6 +59,7 @@ def main(module: str, function: str, first: str, count: str, scratch: str) -> No
     found: Counter = Counter()
     for case in range(int(first), int(first) + int(count)):
         (folder / "case").write_text(str(case))
+        signal.setitimer(signal.ITIMER_PROF, CASE_S)  # its signal ends the process
         found[check(rng_of(function, case), folder)] += 1
     (folder / "found.json").write_text(json.dumps(found))
 

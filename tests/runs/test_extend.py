@@ -1,7 +1,9 @@
 """Laws of extending a finished run: what is there stays, what is new finds its place."""
 
 import json
+import re
 import shutil
+import sqlite3
 from pathlib import Path
 from typing import NamedTuple
 
@@ -244,3 +246,25 @@ def test_what_cannot_be_extended_is_one_sentence(plain, tmp_path, capsys):
     assert "was made by jaxsfm 0.0.1" in says(run)
     change_report(run, lambda report: report.update(models=[]))
     assert "no model to extend" in says(run)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ("UPDATE images SET name = 'z' WHERE name = 'view0.png'", "is not of .*: view0.png is"),
+        ("UPDATE keypoints SET data = x'00'", r"keypoints, row 1 \(.*\): .* values expected"),
+        ("CREATE TRIGGER t AFTER INSERT ON images BEGIN SELECT 1; END", "has triggers"),
+    ],
+)
+def test_a_database_that_is_not_the_runs_is_refused_before_the_work(
+    plain, scene, tmp_path, monkeypatch, capsys, change, why
+):
+    run, photos = tmp_path / "run", tmp_path / "photos"
+    shutil.copytree(plain[0], run)
+    shutil.copytree(scene / "images", photos)
+    write(photos / "new.png", render(room(), POSE, SIZE))
+    with sqlite3.connect(run / "database.db") as db:
+        db.execute(change)
+    monkeypatch.setattr(extend_module, "_match_new", None)
+    assert main(["extend", str(run), "--images", str(photos)]) == 2
+    assert re.search(rf"^jaxsfm: .*database\.db: {why}", capsys.readouterr().err)

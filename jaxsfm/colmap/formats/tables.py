@@ -1,7 +1,8 @@
 """What the formats share: keypoints and matches from files of other tools, checked, in this
 package's pixels, and checks of the names of images."""
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from pathlib import PurePath
 from typing import NamedTuple
 
@@ -14,6 +15,11 @@ from jaxsfm.io.pairs import Pair, describe, make_pair
 
 MAX_KEYPOINTS = 10_000_000
 """Keypoints of one image. A file that claims more is damaged."""
+
+MAX_SIDE = 2**31 - 1
+"""Pixels of the longer side of a photo: PNG allows no more."""
+MAX_NAME = 4096
+"""Bytes of a name: Linux opens no longer path."""
 
 
 class Tables(NamedTuple):
@@ -48,12 +54,13 @@ def checked_keypoints(values: np.ndarray, where: str) -> np.ndarray:
 
 
 def checked_matches(
-    rows: np.ndarray, names: tuple[str, str], keypoints: dict[str, np.ndarray], where: str
+    rows: np.ndarray, names: tuple[str, str], keypoints: Mapping[str, Sized], where: str
 ) -> tuple[Pair, np.ndarray]:
     """Check the matches of a pair.
 
     Args:
       rows: integers (m, 2), columns in the order of `names`.
+      keypoints: of each image; only their number is looked at.
 
     Returns:
       the pair, with its names in order; int32 (m, 2), with its columns in that order.
@@ -73,6 +80,96 @@ def checked_matches(
             )
     pair = make_pair(*names)
     return pair, (rows if pair == names else rows[:, ::-1]).astype(np.int32)
+
+
+class _CameraKind(NamedTuple):
+    """What a camera model of COLMAP has."""
+
+    params: int
+    focal_lengths: Sequence[int]
+    """Their places among the parameters. Cameras of 360-degree photos have none."""
+
+
+@functools.cache
+def _camera_kind(model: int) -> _CameraKind | None:
+    """The camera model with a number; None if COLMAP has none."""
+    known = {int(each): each for each in pycolmap.CameraModelId.__members__.values()}
+    if model < 0 or model not in known:
+        return None
+    example = pycolmap.Camera.create_from_model_id(1, known[model], 1.0, 1, 1)
+    return _CameraKind(len(example.params), tuple(example.focal_length_idxs()))
+
+
+def num_camera_params(model: int) -> int | None:
+    """How many parameters a camera model has, by its number; None if there is no such model."""
+    kind = _camera_kind(model)
+    return kind.params if kind is not None else None
+
+
+def focal_length(model: int, params: Sequence[float]) -> float | None:
+    """The focal length in x of a camera that has no fault; None if its model has none."""
+    kind = _camera_kind(model)
+    return params[kind.focal_lengths[0]] if kind is not None and kind.focal_lengths else None
+
+
+def camera_fault(model: int, size: tuple[int, int], params: Sequence[float]) -> str | None:
+    """What is wrong with a camera of somebody else's, as it follows its place; None: nothing.
+
+    Args:
+      model: the number of COLMAP's camera model.
+      size: width and height, pixels.
+    """
+    kind = _camera_kind(model)
+    if kind is None:
+        return f"a camera of no known model (number {model})"
+    for side, value in zip(("width", "height"), size, strict=True):
+        if not 1 <= value <= MAX_SIDE:
+            return f"{side} must lie in 1 .. {MAX_SIDE}; got {value}"
+    if len(params) != kind.params:
+        return f"{kind.params} parameters expected for camera model {model}; got {len(params)}"
+    if not np.isfinite(params).all():
+        return "the parameters of a camera must be finite"
+    for place in kind.focal_lengths:
+        if params[place] <= 0:
+            return f"the focal length must be positive; got {params[place]:g}"
+    return None
+
+
+def name_fault(name: str) -> str | None:
+    """What is wrong with the name of an image, as it follows its place; None: nothing."""
+    try:
+        data = name.encode("utf-8")
+    except UnicodeEncodeError:
+        return "a name that is not UTF-8"
+    if b"\0" in data or not _path_of(name):
+        return f"{shown_name(name)[:80]!r} names no file"
+    if len(data) > MAX_NAME:
+        return f"a name of {len(data)} bytes"
+    return None
+
+
+def _path_of(name: str) -> str:
+    """A name without what a path may have more than it needs, as in ./a//b.jpg."""
+    return "/".join(part for part in name.split("/") if part not in ("", "."))
+
+
+def clash(names: Iterable[str]) -> tuple[str, str] | None:
+    """Two of the names that cannot both be files of one folder; None if there are none.
+
+    They name one file, as a.jpg and ./a.jpg do, or one is a folder of the other one.
+    """
+    # If / comes before all other letters, all that is below a name follows it at once.
+    paths = sorted((_path_of(name).replace("/", "\0"), name) for name in names)
+    for (path, name), (after, other) in zip(paths, paths[1:], strict=False):
+        if f"{after}\0".startswith(f"{path}\0"):
+            return name, other
+    return None
+
+
+def clash_fault(names: tuple[str, str]) -> str:
+    """What is wrong with two names that clash, as it follows their place."""
+    first, second = (repr(shown_name(name)[:80]) for name in names)
+    return f"{first} and {second} cannot both be files of one folder"
 
 
 def check_no_blanks(names: Iterable[str], to: str) -> None:

@@ -19,6 +19,9 @@ from jaxsfm.io.images import inspect_image, read_image, shown_name
 IMAGES, SPARSE = "images", "sparse"
 READABLE = frozenset(".jpg .jpeg .jpe .png .tif .tiff .bmp .ppm .pgm".split())
 """The photos that the pip package of COLMAP 4.2 reads and writes (measured)."""
+LONGEST_SIDE = 65_535
+"""Pixels of a side of a camera without photos, which is that of the longest JPEG. COLMAP undistorts
+every pixel of a camera's border: of so long a side, in 1 to 5 s."""
 BYTES_PER_PIXEL = 3
 """More than a written photo takes: it is compressed, except for .bmp and .ppm."""
 
@@ -42,11 +45,14 @@ def write_undistorted(
     """
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = max_size
-    cameras = {k: _undistorted(camera, options) for k, camera in model.cameras.items()}
     images = registered_images(model)
     for image in images:
         _check_name(image.name)
         _check_photo(image.name, model.camera(image.camera_id), photos)
+    used = {image.camera_id for image in images}
+    for camera_id in set(model.cameras) - used:
+        _check_size(model.camera(camera_id))
+    cameras = {k: _undistorted(camera, options) for k, camera in model.cameras.items()}
     pixels = sum(
         cameras[image.camera_id].width * cameras[image.camera_id].height for image in images
     )
@@ -75,6 +81,15 @@ def _undistorted(
         raise UserError(
             f"--to undistorted: COLMAP cannot undistort a camera of model {camera.model_name}"
         ) from error
+
+
+def _check_size(camera: pycolmap.Camera) -> None:
+    """Refuse a camera without photos that is so large that COLMAP would not end."""
+    if max(camera.width, camera.height) > LONGEST_SIDE:
+        raise UserError(
+            f"--to undistorted: camera {camera.camera_id}, which has no photos, has {camera.width} "
+            f"x {camera.height} pixels; at most {LONGEST_SIDE} a side are undistorted"
+        )
 
 
 def _check_name(name: str) -> None:
