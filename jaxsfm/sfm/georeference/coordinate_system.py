@@ -22,6 +22,9 @@ Kind = Literal["geographic", "projected", "local"]
 FAR = 10_000.0
 """Local coordinates beyond this many metres get an offset. There float32, in which many formats
 store points, has steps of a millimetre."""
+BEYOND = 1.0
+"""Surveys at the border of a projection's region keep its coordinates, but not farther than so many
+degrees, 111 km: there the next zone has another scale."""
 _GEOGRAPHIC = ("epsg:4326", "epsg:4979", "wgs84", "wgs 84")
 _UTM = re.compile(
     r"(?:WGS[ _]?(?:19)?84|(ETRS[ _]?(?:19)?89))?[ /_]*UTM[ _]*(?:zone)?[ _]*(\d{1,2})[ _]*"
@@ -60,6 +63,26 @@ class CoordinateSystem(NamedTuple):
         """Raise UserError unless all positions float64 (n, 3) lie in this system."""
         if self.kind != "local":
             self._wgs84(xyz)
+
+    def covers(self, xyz: np.ndarray) -> bool:
+        """Whether all positions float64 (n, 3) lie in the region that this projection is made for,
+        or at most `BEYOND` degrees from it; False if it is not known."""
+        try:
+            return self.around(self._wgs84(xyz))
+        except UserError:
+            return False
+
+    def around(self, lon_lat: np.ndarray) -> bool:
+        """The same of longitudes and latitudes: the first two columns."""
+        area = None if self.crs is None else self.crs.area_of_use
+        if area is None:
+            return False
+        lon, lat = lon_lat[:, 0], lon_lat[:, 1]
+        east = (lon - area.west + BEYOND) % 360  # a region may cross the 180th meridian
+        inside = (east <= (area.east - area.west) % 360 + 2 * BEYOND) & (
+            (lat >= area.south - BEYOND) & (lat <= area.north + BEYOND)
+        )
+        return bool(inside.all())
 
     def frame(self, xyz: np.ndarray) -> Frame:
         """The frame whose origin lies amid positions float64 (n, 3), n >= 1, in this system."""
