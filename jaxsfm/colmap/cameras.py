@@ -10,6 +10,7 @@ photos it gets a file that stands in for theirs.
 
 import contextlib
 import dataclasses
+import logging
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -17,7 +18,7 @@ from pathlib import Path, PurePosixPath
 import cv2
 import numpy as np
 import pycolmap
-from PIL import ExifTags, Image
+from PIL import Image
 
 from jaxsfm.colmap.intrinsics import (
     MODELS,
@@ -31,22 +32,16 @@ from jaxsfm.colmap.intrinsics import (
 )
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
-from jaxsfm.io.decoders import BRANDS_END, open_header, special_format
-from jaxsfm.io.images import ImageFile, image_bytes, shown_name
+from jaxsfm.io.decoders import BRANDS_END, special_format
+from jaxsfm.io.exif_camera import ExifCamera, exif_camera, is_of_a_lens
+from jaxsfm.io.images import ImageFile, exif_data, named, shown_name
 from jaxsfm.io.orientation import QUARTERS
 from jaxsfm.options import CameraSharing
 
+logger = logging.getLogger("jaxsfm")
+
 GUESSED_FOCAL = 1.2
 """COLMAP's guess of an unknown focal length, in units of the longer side of the photo."""
-Tag = ExifTags.Base
-CAMERA = (Tag.Make, Tag.Model)
-LENS = (
-    Tag.FocalLength,
-    Tag.FocalLengthIn35mmFilm,
-    Tag.FocalPlaneXResolution,
-    Tag.FocalPlaneYResolution,
-    Tag.FocalPlaneResolutionUnit,
-)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,8 +81,16 @@ class Cameras:
         Raises:
           UserError: a known camera does not fit its photos, or COLMAP does not accept it.
         """
-        upright = pixels_were_turned(images)
-        return [(self._camera(group, upright), group) for group in self.groups(images)]
+        groups = self.groups(images)
+        if self.known is None:  # from EXIF if one of the photos has a focal length
+            told = [told_camera(group, self.model) for group in groups]
+            report_doubts(doubts for _, doubts in told)
+            return [(camera, group) for (camera, _), group in zip(told, groups, strict=True)]
+        upright, given = pixels_were_turned(images), []
+        for group in groups:
+            known = camera_of(self.known, group[0], upright=upright)
+            given.append((accepted(known.camera(group[0].size), group[0]), group))
+        return given
 
     def groups(self, images: Sequence[ImageFile]) -> list[list[ImageFile]]:
         """The photos that share a camera: groups and photos in the order of the photos' names."""
@@ -116,13 +119,6 @@ class Cameras:
                 told = image.taken_with or one_source
                 return (image.taken_with, image.size) if told else image.name
 
-    def _camera(self, group: Sequence[ImageFile], upright: bool) -> pycolmap.Camera:
-        """The camera of photos that share it: from EXIF if one of them has a focal length."""
-        if self.known is not None:
-            known = camera_of(self.known, group[0], upright=upright)
-            return accepted(known.camera(group[0].size), group[0])
-        return estimated_camera(group, self.model)
-
 
 def pixels_were_turned(images: Sequence[ImageFile]) -> bool:
     """Whether a program has turned the pixels of some photos of one camera, and noted it.
@@ -147,29 +143,77 @@ def _from_one_source(images: Sequence[ImageFile]) -> bool:
 
 
 def estimated_camera(group: Sequence[ImageFile], model: str = "SIMPLE_RADIAL") -> pycolmap.Camera:
-    """The camera that photos of one size start with, before it is refined.
+    """The camera that photos of one size start with, before it is refined (`told_camera`).
+
+    Tags of EXIF that cannot be are named in one line of the log.
+
+    Raises:
+      UserError: COLMAP does not accept the camera.
+    """
+    camera, doubts = told_camera(group, model)
+    report_doubts([doubts])
+    return camera
+
+
+def told_camera(
+    group: Sequence[ImageFile], model: str
+) -> tuple[pycolmap.Camera, dict[str, list[str]]]:
+    """The camera that photos of one size start with, and which tags of EXIF are not believed.
 
     The focal length comes from the EXIF data of the first photo that has one. COLMAP knows the
     sensors of many cameras. Without EXIF it is `GUESSED_FOCAL` x the longer side of the photo.
+
+    Returns:
+      the camera; the names of photos, by what is wrong with their EXIF data.
 
     Raises:
       UserError: COLMAP does not accept the camera.
     """
     # A photo that is not the first is asked only if EXIF says that the camera is the same.
-    size = group[0].size
-    options = pycolmap.ImageReaderOptions()
-    options.camera_model = model
+    size, doubts = group[0].size, dict[str, list[str]]()
     for image in group if group[0].taken_with else group[:1]:
-        try:
-            with readable_by_colmap(image) as path:
-                camera = pycolmap.infer_camera_from_image(path, options)
-        except Exception:  # COLMAP reads fewer formats, and raises various errors
-            continue
-        if camera.has_prior_focal_length and (camera.width, camera.height) == size:
+        camera, doubt = _from_exif(image, model)
+        if doubt is not None:
+            doubts.setdefault(doubt, []).append(image.name)
+        if camera is not None and (camera.width, camera.height) == size:
             break
     else:
         camera = pycolmap.Camera.create_from_model_name(0, model, GUESSED_FOCAL * max(size), *size)
-    return accepted(camera, group[0])
+    return accepted(camera, group[0]), doubts
+
+
+def report_doubts(each: Iterable[Mapping[str, Sequence[str]]]) -> None:
+    """Name each kind of tags that are not believed once, with its photos.
+
+    Args:
+      each: of each camera, the names of photos by what is wrong with their EXIF data.
+    """
+    together: dict[str, list[str]] = {}
+    for doubts in each:
+        for doubt, names in doubts.items():
+            together.setdefault(doubt, []).extend(names)
+    for doubt, names in together.items():
+        logger.warning("%s: EXIF is not believed about %s", named(sorted(names)), doubt)
+
+
+def _from_exif(image: ImageFile, model: str) -> tuple[pycolmap.Camera | None, str | None]:
+    """The camera of a photo if EXIF gives a focal length that can be, and what is not believed."""
+    options = pycolmap.ImageReaderOptions()
+    options.camera_model = model
+    try:
+        told = exif_camera(exif_data(image).tags, image.size)
+        if told.doubt is not None and not told.lens:
+            return None, f"{told.doubt}, so the focal length is guessed"
+        with readable_by_colmap(image, told) as path:
+            camera = pycolmap.infer_camera_from_image(path, options)
+    except Exception:  # COLMAP reads fewer formats, and raises various errors
+        return None, None
+    doubt = told.doubt and f"{told.doubt}, so it is not used"
+    if not camera.has_prior_focal_length:
+        return None, doubt
+    if not is_of_a_lens(camera.mean_focal_length(), image.size):
+        return None, "FocalLength, so the focal length is guessed"
+    return camera, doubt
 
 
 def accepted(camera: pycolmap.Camera, image: ImageFile) -> pycolmap.Camera:
@@ -183,35 +227,22 @@ def accepted(camera: pycolmap.Camera, image: ImageFile) -> pycolmap.Camera:
 
 
 @contextlib.contextmanager
-def readable_by_colmap(image: ImageFile) -> Iterator[Path]:
-    """The file of a photo, or a grey JPEG with its size and its camera's EXIF tags.
+def readable_by_colmap(image: ImageFile, told: ExifCamera) -> Iterator[Path]:
+    """The file of a photo, or a grey JPEG with its size and the believed tags of its camera.
 
     Raises OSError or ImageError if the file has changed or cannot be read.
     """
     with image.path.open("rb") as file:
-        if special_format(file.read(BRANDS_END), image.path.suffix) is None:
-            yield image.path
-            return
-    data = image_bytes(image)
-    with open_header(data, image.path.suffix) as header:
-        exif = _of_camera(header.getexif())
+        ordinary = special_format(file.read(BRANDS_END), image.path.suffix) is None
+    if ordinary and told.whole:
+        yield image.path
+        return
     width, height = image.size
     _, grey = cv2.imencode(".jpg", np.zeros((height, width), np.uint8))
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         path = Path(scratch) / "camera.jpg"
-        path.write_bytes(_with_exif(grey.tobytes(), exif))
+        path.write_bytes(_with_exif(grey.tobytes(), told.exif()))
         yield path
-
-
-def _of_camera(exif: Image.Exif) -> Image.Exif:
-    """The tags that say what the camera and its lens are."""
-    kept = Image.Exif()
-    for tag in CAMERA:
-        if tag in exif:
-            kept[tag] = exif[tag]
-    lens = exif.get_ifd(ExifTags.IFD.Exif)
-    kept.get_ifd(ExifTags.IFD.Exif).update({tag: lens[tag] for tag in LENS if tag in lens})
-    return kept
 
 
 def _with_exif(jpeg: bytes, exif: Image.Exif) -> bytes:

@@ -20,6 +20,11 @@ from jaxsfm.io.images import shown_name
 
 ENCODING = "utf-8-sig"
 """With or without the mark that editors of Windows write first."""
+SMALLEST_PX = 1e-3
+"""A smaller skew is what the rounding of a decomposition leaves: no measurement sees it."""
+ROUNDING = 1e-7
+"""The last row of a matrix may be so far off: in a photo of 8000 pixels, it moves none by more than
+`SMALLEST_PX`."""
 _LINE = re.compile(rf"(.+?)\s+({'|'.join(MODELS)})\s+(\d+)\s+(\d+)\s+(.+)")
 """A line of a list of cameras."""
 
@@ -46,9 +51,9 @@ def _from_matrix(text: str, where: str) -> Intrinsics:
     if len(values) != 9:
         raise UserError(f"{where}: expected the 9 numbers of a 3 x 3 matrix; got {len(values)}")
     (fx, skew, cx), (zero, fy, cy), last = np.reshape(values, (3, 3)).tolist()
-    if last != [0, 0, 1] or zero != 0:
+    if not np.allclose(last, [0, 0, 1], rtol=0, atol=ROUNDING) or abs(zero) >= SMALLEST_PX:
         raise UserError(f"{where}: not a camera matrix (rows must be fx 0 cx, 0 fy cy, 0 0 1)")
-    if skew != 0:
+    if abs(skew) >= SMALLEST_PX:
         raise UserError(f"{where}: skew must be 0; got {skew}")
     if fx <= 0 or fy <= 0:
         raise UserError(f"{where}: focal lengths must be positive; got {fx} and {fy}")

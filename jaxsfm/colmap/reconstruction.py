@@ -15,6 +15,9 @@ LEAST_NEW = 3
 ten photos of castle-P19, a second model had four of the first model's nine, and the tenth: no photo
 of it was right. An image that loses its place in this way can be registered in a larger model."""
 
+ASKED = 1000
+"""So many points are enough for a median that is needed to a power of ten."""
+
 
 def ordered(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
     """The models, the one with most images first, without those that bring few new images.
@@ -81,6 +84,19 @@ def move_model(
     """
     turned = pycolmap.Rotation3d(np.ascontiguousarray(rotation))
     model.transform(pycolmap.Sim3d(scale, turned, translation))
+
+
+def usual_distance(model: pycolmap.Reconstruction) -> float:
+    """The median distance from points to an image that observes them, world units; nan if there
+    are no points. At most `ASKED` points are asked."""
+    ids = sorted(model.point3D_ids())
+    found = []
+    for k in ids[:: max(1, len(ids) // ASKED)]:
+        point = model.point3D(k)
+        if point.track.length():
+            image = model.image(point.track.elements[0].image_id)
+            found.append(float(np.linalg.norm(point.xyz - image.projection_center())))
+    return float(np.median(found)) if found else np.nan
 
 
 def coloured(model: pycolmap.Reconstruction, points: np.ndarray, colours: np.ndarray) -> None:

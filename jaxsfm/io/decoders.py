@@ -8,7 +8,7 @@ OpenCV decodes most formats. HEIC, AVIF and camera RAW are read by other package
 import contextlib
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
@@ -50,8 +50,6 @@ SIDEWAYS = 4
 """The bit of LibRaw's `flip` that says that width and height change places."""
 TIFF = (b"II*\0", b"MM\0*")
 """How TIFF files begin."""
-_CAMERA = ("Make", "Model", "BodySerialNumber", "LensModel", "FocalLength", "DigitalZoomRatio")
-"""The tags that tell cameras apart."""
 _SCAN_END = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 """The first marker after the entropy-coded data of a JPEG scan."""
 _HOW = "pip install 'jaxsfm[formats]'"
@@ -215,14 +213,6 @@ def exif_of(header: Header) -> dict[int, object]:
     if getattr(header, "format", None) == "TIFF":
         found.pop(ExifTags.Base.Orientation, None)
     return found
-
-
-def taken_with(exif: Mapping[int, object]) -> str:
-    """What EXIF says of the camera (`ImageFile.taken_with`)."""
-    if not exif.get(ExifTags.Base.Model):
-        return ""
-    values = (exif.get(ExifTags.Base[tag], "") for tag in _CAMERA)
-    return ", ".join(text for value in values if (text := str(value).strip("\0 ")))
 
 
 def jpeg_is_complete(data: bytes) -> bool:

@@ -5,6 +5,7 @@ that are written are those of the stored pixels. COLMAP 4.2 does the same (measu
 and intrinsics agree with COLMAP's own tools.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import logging
@@ -20,6 +21,7 @@ from PIL import ExifTags
 from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 from jaxsfm.io import decoders, orientation
+from jaxsfm.io.exif_camera import taken_with
 from jaxsfm.io.masks import MaskFile, read_mask, without_blank_border
 
 logger = logging.getLogger(__name__)
@@ -161,7 +163,7 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
         size=size,
         sha256=digest,
         orientation=orientation.checked(exif.get(ExifTags.Base.Orientation)),
-        taken_with=decoders.taken_with(exif),
+        taken_with=taken_with(exif),
     )
 
 
@@ -189,6 +191,25 @@ def image_bytes(image: ImageFile) -> bytes:
     if hashlib.sha256(data).hexdigest() != image.sha256:
         raise ImageError(f"{shown_name(image.name)}: the file has changed since it was first read")
     return data
+
+
+class ExifData(NamedTuple):
+    """The EXIF data of a photo; empty where there are none, or they are damaged."""
+
+    tags: dict[int, object]
+    """The main directory and the directory of the exposure, together."""
+    gps: dict[int, object]
+
+
+def exif_data(image: ImageFile) -> ExifData:
+    """Read the EXIF data of a photo. Raises ImageError if the file is gone or has changed."""
+    data, found = image_bytes(image), ExifData({}, {})
+    with warnings.catch_warnings(), contextlib.suppress(Exception):  # see `inspect_image`
+        warnings.simplefilter("ignore")
+        with decoders.any_size(), decoders.open_header(data, image.path.suffix) as header:
+            found.tags.update(decoders.exif_of(header))
+            found.gps.update(header.getexif().get_ifd(ExifTags.IFD.GPSInfo))
+    return found
 
 
 def _decode(image: ImageFile) -> np.ndarray:

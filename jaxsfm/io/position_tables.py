@@ -1,15 +1,14 @@
 """Files of measured positions: where cameras stood, or where points on the ground are.
 
 Two layouts are read. OpenDroneMap's text files (gcp_list.txt, geo.txt) begin with a line that names
-the coordinate system; fields are separated by blanks. A CSV file begins with the names of its
+the coordinate system; fields are separated by blanks. Other tables begin with the names of their
 columns; a line that names the coordinate system may come before them. See docs/formats.md.
 
 Source: https://docs.opendronemap.org/gcp/ and https://docs.opendronemap.org/geo/.
 """
 
-import csv
 import math
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -17,11 +16,24 @@ from typing import NamedTuple
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import listed_lines
+from jaxsfm.io.position_columns import (
+    Columns,
+    begins_with_point,
+    camera_fields,
+    columns_of,
+    is_number,
+    point_fields,
+)
 
 OPTION = "--georeference"
 WGS84 = "EPSG:4326"
 """The coordinate system of latitude and longitude that GPS uses."""
-_DELIMITERS = ",;\t"
+_SYSTEM = re.compile(
+    r"epsg\b|epsg\d|\+|wgs ?_?(19)?84|utm|etrs|urn:ogc|(proj|geog|geod|compd|compound)(cs|crs)",
+    re.IGNORECASE,
+)
+"""How a line begins that names a coordinate system."""
+_METASHAPES = re.compile(r"CoordinateSystem:\s*(.+)")
 
 
 class Position(NamedTuple):
@@ -89,8 +101,8 @@ class _Row(NamedTuple):
     def number(self, name: str) -> float:
         """The number in a column; UserError if there is none."""
         text = self.fields.get(name, "").strip()
-        try:
-            value = float(text)
+        try:  # where no comma separates fields, one may stand for the point
+            value = float(text.replace(",", ".", 1))
         except ValueError:
             raise UserError(f"{self.where}: {name} must be a number; got {text!r}") from None
         if not math.isfinite(value):
@@ -125,54 +137,59 @@ def read_position_table(path: Path) -> PositionTable:
     if not lines:
         raise UserError(f"{where}: the file is empty")
     system = None
-    if lines[0][1].lower().startswith(("epsg:", "+proj", "+init", "wgs84")):
+    if _SYSTEM.match(lines[0][1]) and columns_of(lines[0][1]) is None:
         system, lines = lines[0][1], lines[1:]
         if not lines:
             raise UserError(f"{where}: there is nothing below the coordinate system")
-    columns = _columns(lines[0][1])
+    columns = columns_of(lines[0][1])
     if columns is not None:
-        return _read_csv(lines, columns, system, where)
-    if system is None:
+        return _read_csv(lines[1:], columns, system, where)
+    if system is not None:
+        return _read_blanks(lines, system, where)
+    columns, system = _in_comments(path)
+    if columns is None:
         raise UserError(
             f"{where}: the first line must name a coordinate system (EPSG:4326, WGS84 UTM 32N, "
             "+proj=...) or the columns image,lat,lon,alt or image,x,y,z or "
             "point,x,y,z,image,px,py"
         )
-    return _read_blanks(lines, system, where)
+    return _read_csv(lines, columns, system, where)
 
 
-def _columns(line: str) -> Sequence[str] | None:
-    """The names of the columns that a line lists; None if it does not."""
-    names = [name.strip().lower() for name in next(csv.reader([line], delimiter=_delimiter(line)))]
-    return names if "image" in names else None
-
-
-def _delimiter(line: str) -> str:
-    return next((each for each in _DELIMITERS if each in line), ",")
+def _in_comments(path: Path) -> tuple[Columns | None, str | None]:
+    """The columns and the coordinate system that comments name, as Metashape writes them."""
+    columns, system = None, None
+    for line in path.read_text(encoding="utf-8-sig").splitlines():
+        if line.startswith("#"):
+            text = line.strip("# \t")
+            if named := _METASHAPES.match(text):
+                system = named[1]
+            columns = columns or columns_of(text)
+    if system is not None and system.startswith("LOCAL_CS"):
+        system = None
+    return columns, system
 
 
 def _read_csv(
-    lines: list[tuple[int, str]], columns: Sequence[str], system: str | None, where: str
+    lines: list[tuple[int, str]], columns: Columns, system: str | None, where: str
 ) -> PositionTable:
-    geographic = {"lat", "lon"} <= set(columns)
-    if not geographic and not {"x", "y"} <= set(columns):
-        raise UserError(f"{where}: needs the columns lat, lon, alt or x, y, z; got {columns}")
-    if geographic:
+    names = columns.names
+    if not columns.located:
+        raise UserError(f"{where}: needs the columns lat, lon, alt or x, y, z; got {names}")
+    if columns.geographic:
         system = system or WGS84
-    delimiter = _delimiter(lines[0][1])
     rows = []
-    for number, line in lines[1:]:
-        fields = next(csv.reader([line], delimiter=delimiter))
-        if len(fields) != len(columns):
+    for number, line in lines:
+        fields = columns.fields(line)
+        if len(fields) != len(names):
             raise UserError(
-                f"{where}, line {number}: must have {len(columns)} fields, as its first line; got "
+                f"{where}, line {number}: must have {len(names)} fields, as its first line; got "
                 f"{len(fields)}"
             )
-        named = dict(zip(columns, fields, strict=True))
-        rows.append(_Row(f"{where}, line {number}", number, named))
-    if "point" in columns:
-        if not {"px", "py"} <= set(columns):
-            raise UserError(f"{where}: control points need the columns px and py; got {columns}")
+        rows.append(_Row(f"{where}, line {number}", number, columns.named(fields)))
+    if columns.of_points:
+        if not {"px", "py"} <= columns.ours.keys():
+            raise UserError(f"{where}: control points need the columns px and py; got {names}")
         return PositionTable(system=system, points=_points(rows))
     return PositionTable(system=system, positions=_positions(rows))
 
@@ -182,21 +199,23 @@ def _read_blanks(lines: list[tuple[int, str]], system: str, where: str) -> Posit
     geo.txt."""
     points, cameras = [], []
     for number, line in lines:
-        at, fields = f"{where}, line {number}", line.split()
-        if not _is_number(fields[0]):
+        at = f"{where}, line {number}"
+        if not begins_with_point(line):
             names = ("image", "x", "y", "z", "yaw", "pitch", "roll", "deviation")
+            fields = camera_fields(line)
             if len(fields) < 3:
                 raise UserError(f"{at}: must be image x y [z ...]; got {shown_name(line)!r}")
             named = dict[str, str](zip(names, fields, strict=False))
-            if _is_number(named.get("deviation", "")) and float(named["deviation"]) <= 0:
+            if is_number(named.get("deviation", "")) and float(named["deviation"]) <= 0:
                 del named["deviation"]
             cameras.append(_Row(at, number, named))
             continue
-        if len(fields) < 6:
+        count = len(line.split())
+        if count < 6:
             raise UserError(
-                f"{at}: must be x y z px py image [name]; got {len(fields)} fields: "
-                f"{shown_name(line)!r}"
+                f"{at}: must be x y z px py image [name]; got {count} fields: {shown_name(line)!r}"
             )
+        fields = point_fields(line)
         names = ("x", "y", "z", "px", "py", "image")
         named = dict[str, str](zip(names, fields, strict=False))
         # Without a name, a point is known by its coordinates.
@@ -208,14 +227,6 @@ def _read_blanks(lines: list[tuple[int, str]], system: str, where: str) -> Posit
             f"(camera positions); got {len(points)} and {len(cameras)}"
         )
     return PositionTable(system=system, positions=_positions(cameras), points=_points(points))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _positions(rows: list[_Row]) -> dict[str, Position]:

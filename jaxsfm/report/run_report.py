@@ -155,8 +155,14 @@ class RunReport:
 
     @property
     def verdict(self) -> VerdictColour | None:
-        """The worst verdict on the models in `checked`; None if there are none."""
-        found = {check.verdict for _, check in self.checked}
+        """The worst verdict on the models in `checked`; None if there are none.
+
+        It is amber at least if the photos contradict the measured positions of a file.
+        """
+        found: set[VerdictColour] = {check.verdict for _, check in self.checked}
+        placed = self.georeference.models if self.georeference else []
+        if any(model.contradicted for model in placed):
+            found.add("amber")
         return next((colour for colour in _WORST_FIRST if colour in found), None)
 
     def to_json(self) -> dict[str, Json]:

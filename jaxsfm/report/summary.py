@@ -151,6 +151,8 @@ def summary_lines(report: RunReport) -> list[str]:
         lines += refinement_lines(refinement)
     lines += georeference_lines(report.georeference)
     lines += verdict_lines(model_verdicts(report.checked))
+    if report.georeference and any(each.contradicted for each in report.georeference.models):
+        lines.append(f"positions        {CONTRADICTED}")
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in report.seconds.items()))
     if pairs.overflowed:
         lines.append(
@@ -168,6 +170,13 @@ def summary_lines(report: RunReport) -> list[str]:
     if report.evaluation_failed:
         lines.append(f"not evaluated    {report.evaluation_failed}")
     return lines
+
+
+CONTRADICTED = (
+    "amber: the photos contradict the file of --georeference, so the model has no scale; correct "
+    "the file, and run the same command again: only the move is made anew"
+)
+"""What follows from positions that contradict the photos."""
 
 
 def frame_in_words(frame: Frame) -> str:
@@ -220,6 +229,12 @@ def _model_lines(found: Georeference, best: ModelGeoreference) -> list[str]:
             f"{up:.3f} m vertical, {sigma.turn_deg:.2f} deg, {100 * sigma.scale:.2g} % of the scale"
             + "; the direction is not certain"
             * (sigma.turn_deg > MAX_TURN_DEG)
+        )
+    if best.upside_down:
+        lines.append(
+            "upside down      most cameras hang upside down in these coordinates: if the photos "
+            "were taken upright, heights count downwards, or an axis is exchanged or has the "
+            "other sign"
         )
     wrong = [row for row in best.anchors if not row.used]
     for row in wrong[:MAX_NAMED]:

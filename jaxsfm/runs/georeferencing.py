@@ -18,6 +18,7 @@ from jaxsfm.io.position_tables import (
 )
 from jaxsfm.sfm.georeference.coordinate_system import GPS, CoordinateSystem, coordinate_system
 from jaxsfm.sfm.georeference.georeference import MeasuredPositions
+from jaxsfm.sfm.georeference.readings import misnamed
 from jaxsfm.sfm.georeference.robust_similarity import LEAST
 
 logger = logging.getLogger("jaxsfm")
@@ -55,7 +56,10 @@ def measured_positions(choice: str, images: list[ImageFile]) -> MeasuredPosition
     system = coordinate_system(table.system, f"{OPTION} {path}")
     _check_angles(table, system, path)
     every = [*table.positions.values(), *(point.position for point in table.points)]
-    system.check(np.asarray([(at.x, at.y, at.z or 0.0) for at in every]))
+    given = np.asarray([(at.x, at.y, at.z or 0.0) for at in every])
+    if (meant := misnamed(given, system)) is not None:
+        raise UserError(f"{OPTION} {path}: {meant}")
+    system.check(given)
     names = _MatchedNames(images)
     if table.points:
         points = _points_of(table, names, {image.name: image for image in images}, path)

@@ -14,7 +14,7 @@ from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.measured_positions import write_pose_priors
 from jaxsfm.colmap.model_files import write_models
 from jaxsfm.config import Config
-from jaxsfm.io.images import ImageFile
+from jaxsfm.io.images import ImageFile, orientations
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.work_folder import WorkFolder
@@ -141,4 +141,6 @@ class RunStages:
         geographic = measured.system.kind == "geographic"
         priors = measured.positions if geographic else measured.local(measured.frame())
         write_pose_priors(database, priors, geographic=geographic)
-        return move_models(made.models, measured) if made.models else None
+        if not made.models:
+            return None
+        return move_models(made.models, measured, orientations(self.images))

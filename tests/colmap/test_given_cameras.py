@@ -51,6 +51,19 @@ def test_one_camera_of_all_photos_is_read_as_before(tmp_path, monkeypatch, text)
     assert parse_cameras(text) == parse_intrinsics(text)
 
 
+def test_what_rounding_leaves_in_a_matrix_is_no_skew(tmp_path):
+    path = tmp_path / "K.txt"
+
+    def read(skew: str, last: str = "0 0 1"):
+        path.write_text(f"500 {skew} 319.5\n0 500 239.5\n{last}\n")
+        return parse_intrinsics(str(path))
+
+    assert read("-7e-05") == read("0") == read("0", "1e-9 0 1.00000001")
+    for skew, last in (("0.002", "0 0 1"), ("0", "0 1e-5 1"), ("0", "0 0 2")):
+        with pytest.raises(UserError, match=r"skew|not a camera matrix"):
+            read(skew, last)
+
+
 @pytest.mark.parametrize(
     ("lines", "message"),
     [

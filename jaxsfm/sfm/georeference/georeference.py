@@ -1,23 +1,26 @@
 """Models moved onto measured positions of their photos, or onto ground control points."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from jaxsfm.colmap.poses import model_poses
-from jaxsfm.colmap.reconstruction import move_model
+from jaxsfm.colmap.reconstruction import move_model, usual_distance
 from jaxsfm.colmap.view import View
 from jaxsfm.io.photos import Pixels
 from jaxsfm.io.position_tables import ControlPoint, Position
+from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.georeference.coordinate_system import CoordinateSystem, Frame
 from jaxsfm.sfm.georeference.model_georeference import (
     ModelGeoreference,
     NamedAnchors,
+    contradicted,
     georeferenced,
 )
+from jaxsfm.sfm.georeference.readings import Fit, is_upside_down, misread
 from jaxsfm.sfm.georeference.robust_similarity import Anchors
 
 if TYPE_CHECKING:
@@ -31,6 +34,9 @@ _WORDS = {
 }
 CLICK_PX = 2.0
 """Errors of measurements well beyond this many pixels lose their weight (soft L1)."""
+NEAREST, FARTHEST = 1e-3, 1e5
+"""Half of what photos show is not nearer and not farther, metres: lenses that see more than a
+millimetre at once do not focus nearer, and the air hides what is 100 km away."""
 PARALLEL = 1e-6
 """Rays with a smaller squared sine between them leave the depth of a point unknown."""
 BEHIND_PX = 1e6
@@ -134,6 +140,13 @@ class MeasuredPositions:
         x, y, z = self.system.into(frame, np.asarray([[at.x, at.y, at.z]], np.float64))[0].tolist()
         return Position(x, y, z, at.deviation)
 
+    def raw(self, names: list[str]) -> np.ndarray:
+        """float64 (n, 3): the positions of photos or of control points in the file's own numbers.
+        All of them have a height."""
+        points = {point.name: point.position for point in self.points}
+        given = points or self.positions
+        return np.asarray([given[name][:3] for name in names], np.float64).reshape(-1, 3)
+
     def anchors(self, model: "pycolmap.Reconstruction", frame: Frame | None) -> NamedAnchors:
         """What a model, in the frame of the mapper, has of the measured positions."""
         if self.points and frame is not None:
@@ -196,14 +209,49 @@ class Georeference:
 
 
 def move_models(
-    models: "list[pycolmap.Reconstruction]", measured: MeasuredPositions
+    models: "list[pycolmap.Reconstruction]",
+    measured: MeasuredPositions,
+    turned: Mapping[str, int] | None = None,
 ) -> Georeference:
-    """Move models, each by itself, onto measured positions. The models change in place."""
+    """Move models, each by itself, onto measured positions. The models change in place.
+
+    A model stays where it is if the photos contradict the positions of a file.
+
+    Args:
+      turned: how photos are turned that are not stored upright, by name.
+    """
     frame, placed = measured.frame(), []
     for model in models:
         given = measured.anchors(model, frame)
         figures, similarity = georeferenced(given, _WORDS[measured.source], sure=measured.sure)
+        if similarity is not None and measured.file is not None:
+            against = _contradiction(model, measured, given, similarity)
+            if against is not None:
+                figures, similarity = contradicted(figures, against), None
         if similarity is not None:
+            rotations = {name: pose.rotation for name, pose in model_poses(model).items()}
+            hang = measured.system.kind != "local" and is_upside_down(
+                rotations, turned or {}, similarity
+            )
+            figures = replace(figures, upside_down=hang)
             move_model(model, *similarity)
         placed.append(figures)
     return Georeference(source=measured.source, file=measured.file, frame=frame, models=placed)
+
+
+def _contradiction(
+    model: "pycolmap.Reconstruction",
+    measured: MeasuredPositions,
+    given: NamedAnchors,
+    similarity: Similarity,
+) -> str | None:
+    """Why the photos contradict the positions of a file, in words; None if they do not."""
+    distance = similarity.scale * usual_distance(model)
+    if distance < NEAREST or distance > FARTHEST:  # not so if the model has no points
+        return (
+            f"the photos would show what is {distance:.2g} m away, which no camera does; is the "
+            "unit of the positions the one that the file says?"
+        )
+    fit = Fit(given.anchors, similarity)
+    meant = misread(fit, measured.raw(given.names), measured.system)
+    return meant and f"the {_WORDS[measured.source]} contradict the photos: {meant}"

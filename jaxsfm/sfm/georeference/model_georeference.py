@@ -83,6 +83,10 @@ class ModelGeoreference:
     """None: the model stays in the frame of the mapper."""
     why_not: str | None = None
     """Why the model was not moved, in words."""
+    contradicted: bool = False
+    """Whether it was not moved because the photos contradict the positions of a file."""
+    upside_down: bool = False
+    """Whether most cameras hang upside down after the move."""
     anchors: list[AnchorRow] = field(default_factory=list)
     """Sorted by name."""
     unused: dict[str, str] = field(default_factory=dict)
@@ -172,6 +176,11 @@ def georeferenced(
         expected=Expected(shift=_vector(sigma.shift), turn_deg=sigma.turn_deg, scale=sigma.scale),
     )
     return found, similarity
+
+
+def contradicted(figures: ModelGeoreference, why: str) -> ModelGeoreference:
+    """The figures of a model that is not moved, because the photos contradict the positions."""
+    return ModelGeoreference(similarity=None, why_not=why, contradicted=True, unused=figures.unused)
 
 
 def _on_line(anchors: Anchors) -> bool:
