@@ -89,8 +89,8 @@ def exif_camera(tags: Mapping[int, object], size: tuple[int, int]) -> ExifCamera
     """
     written = {tag: tags[tag] for tag in _LENS if tag in tags}
     unknown = {tag for tag in _FOCAL if not number(written.get(tag))}
-    lens = {tag: value for tag, value in written.items() if tag not in unknown}
-    camera = {tag: tags[tag] for tag in _CAMERA if tag in tags}
+    lens: dict[int, object] = {k: value for k, value in written.items() if k not in unknown}
+    camera: dict[int, object] = {tag: tags[tag] for tag in _CAMERA if tag in tags}
     believed, doubt = _believed(lens, tags, size)
     return ExifCamera(camera, believed, doubt, whole=believed == written)
 

@@ -65,11 +65,19 @@ def test_another_datum_is_brought_to_wgs84():
         ("EPSG:999999", "no known coordinate system"),
         ("WGS84 UTM 99N", "no known coordinate system"),
         ("+proj=nonsense", "no known coordinate system"),
-        ("EPSG:2263", "the unit of EPSG:2263 must be the metre; got US survey foot"),
         ("EPSG:4978", "EPSG:4978 is not a projection"),
     ],
 )
-def test_what_is_no_projection_in_metres_is_refused(text, says):
+def test_what_is_no_projection_is_refused(text, says):
     pytest.importorskip("pyproj")
     with pytest.raises(UserError, match=says):
         coordinate_system(text, "--georeference gcp_list.txt")
+
+
+def test_survey_feet_are_converted_to_metres():
+    pytest.importorskip("pyproj")
+    system = coordinate_system("EPSG:2263", "--georeference gcp_list.txt")
+    feet = np.asarray([[984_250.0, 196_850.0, 0.0], [985_250.0, 196_850.0, 300.0]])
+    one, two = system.into(system.frame(feet), feet)
+    foot = 1200 / 3937  # the definition of the US survey foot
+    np.testing.assert_allclose(two - one, [1000 * foot, 0, 300 * foot], atol=1e-6)
