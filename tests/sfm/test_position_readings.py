@@ -59,8 +59,8 @@ def test_a_usual_mistake_is_named(change, meant, seed):
 
 @pytest.mark.parametrize("noise", [0.01, 0.5, 5.0])
 def test_right_positions_are_not_doubted_however_noisy(noise):
-    """At most 1 % of the draws would be by chance; there is none."""
-    for seed in range(60):
+    """By chance, one draw in a hundred may be."""
+    for seed in range(20):
         rng = rng_of(seed)
         places = walk(rng)
         raw = degrees(places + rng.normal(0, noise, places.shape))
