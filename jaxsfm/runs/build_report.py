@@ -25,6 +25,7 @@ from jaxsfm.report.run_inputs import (
     LowResolution,
     RecordedOptions,
     RunIdentity,
+    SamePixels,
     UsedExternalMatches,
     UsedWeights,
 )
@@ -63,6 +64,7 @@ class StageResults:
     """How the models were moved into metres."""
     weights: UsedWeights
     low_resolution: LowResolution | None
+    same_pixels: SamePixels | None
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -108,6 +110,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         given=None if about is None else msgspec.convert(about, UsedExternalMatches),
         low_resolution=stages.low_resolution,
         turned=_turned(stages.usable, stages.identity.orientations),
+        same_pixels=stages.same_pixels,
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,
