@@ -26,6 +26,9 @@ from jaxsfm.report.pair_outcomes import (
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, PairStatus, Stage
 
+_ONE_PLACE = "the photos were taken from one place, turned about, so nothing gives depth"
+_MOVE = "move sideways between photos"
+
 
 class _Refused(NamedTuple):
     """Why a photo has no place although places were looked for after the mapping."""
@@ -66,6 +69,16 @@ def explained(
         lost=_lost_photos(groups, models, pairs, _refused(report)),
         no_model=None if models else _no_model(pairs),
     )
+
+
+def from_one_place(report: RunReport) -> RunReport:
+    """The report of a run that found that a turn of the camera explains its pairs, and ended."""
+    help = [Advice(option=None, reason=_MOVE)]
+    lost = [
+        dataclasses.replace(photo, stage="no pose", detail="it shows no depth", help=help)
+        for photo in report.lost
+    ]
+    return dataclasses.replace(report, lost=lost, no_model=f"{_ONE_PLACE}; {_MOVE}")
 
 
 def _lost_photos(

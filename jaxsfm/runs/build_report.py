@@ -19,7 +19,7 @@ from jaxsfm.io.orientation import UPRIGHT, quarters_between
 from jaxsfm.io.pairs import Pair, PairCounts
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
-from jaxsfm.report.lost_photos import explained
+from jaxsfm.report.lost_photos import explained, from_one_place
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     LowResolution,
@@ -120,7 +120,8 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         seconds=stages.seconds,
     )
     sizes = {image.name: image.size for image in stages.usable}
-    return explained(report, config, sizes, made.verification.angles)
+    report = explained(report, config, sizes, made.verification.angles)
+    return from_one_place(report) if made.verification.one_place else report
 
 
 def _turned(images: Sequence[ImageFile], orientations: Mapping[str, int]) -> dict[str, int]:

@@ -153,7 +153,8 @@ def reconstruct_folder(
             low_resolution = None
             if matched.described != config:
                 low_resolution = LowResolution(px=matched.described.max_size)
-            if low_resolution and not _has_model(models.made, good):
+            flat = models.made.verification.one_place
+            if low_resolution and not flat and not _has_model(models.made, good):
                 # Nothing that photos could be registered in was made of small photos.
                 logger.info("no model was made of small photos; matching them at full size")
                 low_resolution = dataclasses.replace(low_resolution, whole=True)
