@@ -50,6 +50,11 @@ class OnePlaceLimits:
     eigenvalues: float = 0.001
     """Largest logarithm of an eigenvalue of a turn. Pairs of turned photos have 0.0002 or less, and
     neighbouring frames of kitchen 0.0018 in the median."""
+    singular_values: float = 0.01
+    """Largest logarithm of a singular value of a turn, for the focal length that fits most pairs.
+    Pairs of turned photos have 0.005 or less: half of it is the step of `FOCALS`, the rest what the
+    principal point and a lens may do. Parts of one photo, as a camera takes them that moves along a
+    plane without turning, have 0.02 or more."""
     share: float = 0.75
     """Photos are from one place if at least this share of the pairs differs by a turn only: all
     pairs of turned photos do, and 0 to 33 % of those of other sets."""
