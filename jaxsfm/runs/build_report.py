@@ -19,7 +19,7 @@ from jaxsfm.io.orientation import UPRIGHT, quarters_between
 from jaxsfm.io.pairs import Pair, PairCounts
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
-from jaxsfm.report.lost_photos import explained, from_one_place
+from jaxsfm.report.lost_photos import explained, without_depth
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     LowResolution,
@@ -121,7 +121,9 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
     )
     sizes = {image.name: image.size for image in stages.usable}
     report = explained(report, config, sizes, made.verification.angles)
-    return from_one_place(report) if made.verification.one_place else report
+    if made.models or not made.verification.no_depth:
+        return report
+    return without_depth(report, one_place=made.verification.one_place)
 
 
 def _turned(images: Sequence[ImageFile], orientations: Mapping[str, int]) -> dict[str, int]:

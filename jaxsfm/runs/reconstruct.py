@@ -153,8 +153,7 @@ def reconstruct_folder(
             low_resolution = None
             if matched.described != config:
                 low_resolution = LowResolution(px=matched.described.max_size)
-            flat = models.made.verification.one_place
-            if low_resolution and not flat and not _has_model(models.made, good):
+            if low_resolution and _lacks_detail(models.made, good):
                 # Nothing that photos could be registered in was made of small photos.
                 logger.info("no model was made of small photos; matching them at full size")
                 low_resolution = dataclasses.replace(low_resolution, whole=True)
@@ -234,10 +233,13 @@ def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]
         raise UserError(f"{folder}: {len(images)} usable images, at least 2 are needed{why}")
 
 
-def _has_model(made: Reconstructed, images: Sequence[ImageFile]) -> bool:
-    """Whether there is a model that others can judge: two photos say nothing about each other."""
+def _lacks_detail(made: Reconstructed, images: Sequence[ImageFile]) -> bool:
+    """Whether larger photos may give a model that small ones did not give.
+
+    A model of two photos is none: they say nothing about each other.
+    """
     largest = max((model.num_reg_images() for model in made.models), default=0)
-    return largest >= min(MIN_VIEWS, len(images))
+    return largest < min(MIN_VIEWS, len(images)) and not made.verification.no_depth
 
 
 def _retrieve(

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import LOW_ANGLE_DEG
 from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
@@ -80,7 +81,15 @@ class VerificationFigures:
     angles: dict[Pair, float]
     """Degrees at which the rays of a verified pair's points meet (median); 0: unknown."""
     one_place: bool = False
-    """Whether all photos were taken from one place, so that nothing gives depth."""
+    """Whether all photos were taken from one place."""
+
+    @property
+    def no_depth(self) -> bool:
+        """Whether nothing gives depth: photos from one place, or something that stays as it is in
+        all of them. The mapper has no pair to start from then, at whatever size photos are
+        matched."""
+        known = [angle for angle in self.angles.values() if angle > 0]
+        return self.one_place or (bool(known) and max(known) < LOW_ANGLE_DEG)
 
 
 class VerifiedStage(NamedTuple):
