@@ -37,10 +37,10 @@ def random_scores(seed: int) -> dict:
 @settings(max_examples=10, deadline=None)
 @given(seeds)
 def test_untrained_scores_are_squared_norms_to_the_last_bit(seed):
-    maps = random_maps(seed)
-    params = init_scores(jax.random.key(seed))
+    params = core.init_scores(jax.random.key(seed))
+    maps = jax.tree.map(jnp.asarray, random_maps(seed))
     for ours, x in zip(Scores().apply(params, maps), maps, strict=True):
-        np.testing.assert_array_equal(ours, squared_norm(jnp.asarray(x)))
+        np.testing.assert_array_equal(ours, squared_norm(x))
 
 
 @settings(max_examples=10, deadline=None)
@@ -93,7 +93,7 @@ def test_scores_stay_finite_whatever_was_learned():
 
 @pytest.mark.slow
 def test_the_network_scores_strip_by_strip_as_on_whole_maps():
-    weights, params = load_weights(), random_scores(3)
+    weights, params = load_weights(), jax.tree.map(jnp.asarray, random_scores(3))
     rng = rng_of(0)
     size = np.asarray([[57, 71]], np.int32)
     image = np.zeros((1, 64, 80, 3), np.float32)
