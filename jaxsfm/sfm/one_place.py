@@ -21,7 +21,7 @@ import numpy as np
 from jaxsfm.colmap.two_views import ImageKeypoints, read_inliers
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair
-from jaxsfm.io.photos import Photos
+from jaxsfm.io.photos import Photos, Pixels
 from jaxsfm.sfm.limits import ONE_PLACE
 
 ITERATIONS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-5)
@@ -71,11 +71,11 @@ def _turn(
         (first, scale), (second, _) = (photos.gray(name) for name in pair)
     except ImageError:
         return None
-    xy = [
-        (keypoints[name].xy[matches[:, side]] + 0.5) / np.asarray(scale) - 0.5
+    a, b = (
+        Pixels(scale).from_original(keypoints[name].xy[matches[:, side]])
         for side, name in enumerate(pair)
-    ]
-    start, _ = cv2.findHomography(*xy, cv2.RANSAC, ONE_PLACE.start_px)
+    )
+    start, _ = cv2.findHomography(a, b, cv2.RANSAC, ONE_PLACE.start_px)
     found = None if start is None else turn_between(first, second, start)
     return None if found is None else singular_spreads(found, first.shape)
 
