@@ -101,6 +101,23 @@ def test_things_at_two_distances_are_not_aligned():
     assert not aligned(FIRST, second, rough(TURNED))
 
 
+def test_where_a_third_shows_something_else_a_turn_does_not_explain_the_photos():
+    """The rest is aligned as well as before, so the homography is that of the turn."""
+    second = seen(TURNED)
+    second[:, :100] = np.random.default_rng(1).normal(128, 40, (SIZE[1], 100))
+    assert not aligned(FIRST, second, rough(TURNED))
+
+
+def test_plain_areas_do_not_count():
+    """Their noise is another one in each photo."""
+    first, second = FIRST.copy(), seen(TURNED)
+    noise = np.random.default_rng(3).normal(200, 2, (2, *first.shape)).astype(np.float32)
+    first[:, 170:] = noise[0][:, 170:]
+    edge = cv2.warpPerspective((first == noise[0]).astype(np.uint8), TURNED, SIZE) > 0
+    second[edge] = noise[1][edge]
+    assert aligned(first, second, rough(TURNED))
+
+
 @pytest.mark.parametrize(
     "second",
     [seen(np.eye(3), 7), np.full_like(FIRST, 90), np.full_like(FIRST, np.nan)],
@@ -224,6 +241,28 @@ def test_a_quarter_of_the_pairs_may_be_others(asked):
     for broken, answer in ((allowed, True), (allowed + 1, False)):
         shuffled = {pairs[k]: found.matches[pairs[k]] * [1, 0] for k in at[:broken]}
         assert asked(turned, Inliers(found.keypoints, found.matches | shuffled)) == answer
+
+
+def test_neighbours_that_look_like_turns_are_not_enough(asked):
+    """A third of the pairs of neighbouring photos may: of kitchen, a quarter do."""
+    turned = Seen(turns(6))
+    found = turned.inliers()
+    pairs = sorted(found.matches)
+    at = np.linspace(0, len(pairs) - 1, ONE_PLACE.pairs).round().astype(int)
+    shuffled = {pairs[k]: found.matches[pairs[k]] * [1, 0] for k in at[4:]}
+    assert not asked(turned, Inliers(found.keypoints, found.matches | shuffled))
+
+
+def test_turns_of_different_cameras_are_not_from_one_place(asked):
+    """What looks like a turn, but of another focal length in each pair, is no turn."""
+    focals = [0.5, 0.8, 1.2, 1.8, 2.6]
+    moves = [np.diag([f, f, 1.0]) for f in focals]
+    centre = np.asarray([[1, 0, 159.5], [0, 1, 119.5], [0, 0, 1]])
+    cameras = [centre @ (FOCAL * move / move[2, 2]) @ np.diag([1, 1, 1 / FOCAL]) for move in moves]
+    zoomed = Seen([np.eye(3), *(k @ turn(0, 9, 5) @ np.linalg.inv(k) for k in cameras)])
+    found = zoomed.inliers()
+    each = {pair: rows for pair, rows in found.matches.items() if pair[0] == "00"}
+    assert not asked(zoomed, Inliers(found.keypoints, each))
 
 
 def test_without_pairs_of_one_size_nothing_is_said(asked):
