@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxsfm.io.images import ImageFile, inspect_image
+from jaxsfm.io import still_pattern
+from jaxsfm.io.images import ImageFile, WorkingImage, inspect_image, read_image
 from jaxsfm.io.masks import open_mask, read_mask
 from jaxsfm.io.photo_folder import with_mask
 from jaxsfm.io.still_pattern import (
@@ -117,11 +118,17 @@ def test_what_is_masked_already_is_not_found(tmp_path):
     assert find_still_pattern(masked) is None
 
 
-def test_only_some_of_many_photos_are_read(tmp_path):
-    images = photos(tmp_path, [view(k) for k in range(2 * MOST_PHOTOS + 1)])
-    for k in range(1, len(images), 2):
-        (tmp_path / images[k].name).unlink()
+def test_only_some_of_many_photos_are_read(tmp_path, monkeypatch):
+    images, read = photos(tmp_path, [view(k) for k in range(2 * MOST_PHOTOS + 1)]), []
+
+    def counted(image: ImageFile, **how) -> WorkingImage:
+        read.append(image.name)
+        return read_image(image, **how)
+
+    monkeypatch.setattr(still_pattern, "read_image", counted)
     assert find_still_pattern(images) is None
+    assert len(read) == MOST_PHOTOS
+    assert {read[0], read[-1]} == {images[0].name, images[-1].name}
 
 
 def test_the_mask_hides_what_stays(tmp_path):

@@ -1,6 +1,9 @@
 """Photos from one place are told from photos that give depth."""
 
 import functools
+import itertools
+from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -8,8 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxsfm.colmap.two_views import ImageKeypoints, Inliers
+from jaxsfm.io.images import ImageError
+from jaxsfm.io.photos import Photos
+from jaxsfm.sfm import one_place
 from jaxsfm.sfm.limits import ONE_PLACE
-from jaxsfm.sfm.one_place import FOCALS, eigenvalue_spread, singular_spreads, turn_between
+from jaxsfm.sfm.one_place import (
+    FOCALS,
+    eigenvalue_spread,
+    from_one_place,
+    singular_spreads,
+    turn_between,
+)
 
 SIZE, FOCAL = (320, 240), 300.0
 K = np.asarray([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1]])
@@ -88,6 +101,23 @@ def test_things_at_two_distances_are_not_aligned():
     assert not aligned(FIRST, second, rough(TURNED))
 
 
+def test_where_a_third_shows_something_else_a_turn_does_not_explain_the_photos():
+    """The rest is aligned as well as before, so the homography is that of the turn."""
+    second = seen(TURNED)
+    second[:, :100] = np.random.default_rng(1).normal(128, 40, (SIZE[1], 100))
+    assert not aligned(FIRST, second, rough(TURNED))
+
+
+def test_plain_areas_do_not_count():
+    """Their noise is another one in each photo."""
+    first, second = FIRST.copy(), seen(TURNED)
+    noise = np.random.default_rng(3).normal(200, 2, (2, *first.shape)).astype(np.float32)
+    first[:, 170:] = noise[0][:, 170:]
+    edge = cv2.warpPerspective((first == noise[0]).astype(np.uint8), TURNED, SIZE) > 0
+    second[edge] = noise[1][edge]
+    assert aligned(first, second, rough(TURNED))
+
+
 @pytest.mark.parametrize(
     "second",
     [seen(np.eye(3), 7), np.full_like(FIRST, 90), np.full_like(FIRST, np.nan)],
@@ -145,3 +175,101 @@ def test_a_camera_that_moves_along_a_wall_is_told_by_the_singular_values():
 def test_a_homography_without_an_inverse_is_no_turn():
     assert eigenvalue_spread(np.diag([1.0, 1.0, 0.0])) == np.inf
     assert (singular_spreads(np.diag([1.0, 1.0, 0.0]), (9, 9)) == np.inf).all()
+
+
+# -- whole sets ------------------------------------------------------------------------------------
+
+
+class Seen:
+    """Photos of a wall, one for each homography from a first photo, without files."""
+
+    def __init__(self, moves: list[np.ndarray]) -> None:
+        self.moves = {f"{k:02}": move for k, move in enumerate(moves)}
+
+    def gray(self, name: str) -> tuple[np.ndarray, tuple[float, float]]:
+        if name == "gone":
+            raise ImageError("gone: cannot be read")
+        return seen(self.moves[name]), (1.0, 1.0)
+
+    def inliers(self, off_px: float = 0.7) -> Inliers:
+        """Matches of a grid of points between all photos, each a little off."""
+        random = np.random.default_rng(0)
+        x, y = np.meshgrid(np.linspace(40, 280, 9), np.linspace(40, 200, 7))
+        grid = np.stack([x.ravel(), y.ravel()], -1)
+        keypoints = {}
+        for name, move in self.moves.items():
+            xy = cv2.perspectiveTransform(grid[None], move)[0]
+            keypoints[name] = ImageKeypoints(xy + random.normal(0, off_px, xy.shape), SIZE)
+        same = np.repeat(np.arange(len(grid))[:, None], 2, axis=1)
+        return Inliers(keypoints, dict.fromkeys(itertools.combinations(self.moves, 2), same))
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """A function that asks whether photos are from one place, given their matches."""
+
+    def ask(photos: Seen, found: Inliers) -> bool:
+        monkeypatch.setattr(one_place, "read_inliers", lambda _: found)
+        return from_one_place(Path(), cast(Photos, photos))
+
+    return ask
+
+
+def turns(count: int) -> list[np.ndarray]:
+    return [plane_homography(turn(1.5 * (k % 3), 2.0 * k - 4, 3.0 * (k % 2))) for k in range(count)]
+
+
+def test_turned_photos_are_from_one_place_and_others_are_not(asked):
+    turned = Seen(turns(6))
+    assert asked(turned, turned.inliers())
+    walked = Seen([plane_homography(turn(0, 3.0 * k, 0), (-0.05 * k, 0, 0)) for k in range(6)])
+    assert not asked(walked, walked.inliers())
+
+
+def test_a_camera_that_slides_along_a_wall_is_not_on_one_spot(asked):
+    slid = Seen([np.asarray([[1, 0, 45.0 * k], [0, 1, 10.0 * k], [0, 0, 1]]) for k in range(5)])
+    assert not asked(slid, slid.inliers())
+
+
+def test_a_quarter_of_the_pairs_may_be_others(asked):
+    """False pairs, moving things and photos that cannot be read hide turns."""
+    turned = Seen(turns(6))
+    found = turned.inliers()
+    pairs = sorted(found.matches)
+    at = np.linspace(0, len(pairs) - 1, ONE_PLACE.pairs).round().astype(int)
+    allowed = int((1 - ONE_PLACE.share) * ONE_PLACE.pairs)
+    for broken, answer in ((allowed, True), (allowed + 1, False)):
+        shuffled = {pairs[k]: found.matches[pairs[k]] * [1, 0] for k in at[:broken]}
+        assert asked(turned, Inliers(found.keypoints, found.matches | shuffled)) == answer
+
+
+def test_neighbours_that_look_like_turns_are_not_enough(asked):
+    """A third of the pairs of neighbouring photos may: of kitchen, a quarter do."""
+    turned = Seen(turns(6))
+    found = turned.inliers()
+    pairs = sorted(found.matches)
+    at = np.linspace(0, len(pairs) - 1, ONE_PLACE.pairs).round().astype(int)
+    shuffled = {pairs[k]: found.matches[pairs[k]] * [1, 0] for k in at[4:]}
+    assert not asked(turned, Inliers(found.keypoints, found.matches | shuffled))
+
+
+def test_turns_of_different_cameras_are_not_from_one_place(asked):
+    """What looks like a turn, but of another focal length in each pair, is no turn."""
+    focals = [0.5, 0.8, 1.2, 1.8, 2.6]
+    moves = [np.diag([f, f, 1.0]) for f in focals]
+    centre = np.asarray([[1, 0, 159.5], [0, 1, 119.5], [0, 0, 1]])
+    cameras = [centre @ (FOCAL * move / move[2, 2]) @ np.diag([1, 1, 1 / FOCAL]) for move in moves]
+    zoomed = Seen([np.eye(3), *(k @ turn(0, 9, 5) @ np.linalg.inv(k) for k in cameras)])
+    found = zoomed.inliers()
+    each = {pair: rows for pair, rows in found.matches.items() if pair[0] == "00"}
+    assert not asked(zoomed, Inliers(found.keypoints, each))
+
+
+def test_without_pairs_of_one_size_nothing_is_said(asked):
+    turned = Seen(turns(3))
+    found = turned.inliers()
+    assert not asked(turned, Inliers(found.keypoints, {}))
+    sizes = {n: each._replace(size=(320, 240 + int(n))) for n, each in found.keypoints.items()}
+    assert not asked(turned, Inliers(sizes, found.matches))
+    gone = {"gone": found.keypoints["00"], "01": found.keypoints["01"]}
+    assert not asked(turned, Inliers(gone, {("01", "gone"): found.matches["00", "01"]}))
