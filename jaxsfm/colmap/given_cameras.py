@@ -25,7 +25,8 @@ SMALLEST_PX = 1e-3
 ROUNDING = 1e-7
 """The last row of a matrix may be so far off: in a photo of 8000 pixels, it moves none by more than
 `SMALLEST_PX`."""
-_LINE = re.compile(rf"(.+?)\s+({'|'.join(MODELS)})\s+(\d+)\s+(\d+)\s+(.+)")
+_SIDE = r"([+-]?\d[\d.eE+-]*)"
+_LINE = re.compile(rf"(.+?)\s+({'|'.join(MODELS)})\s+{_SIDE}\s+{_SIDE}\s+(.+)")
 """A line of a list of cameras."""
 
 
@@ -173,8 +174,20 @@ def _listed(line: str) -> tuple[str, Intrinsics]:
     if match is None:
         raise ValueError("no camera model")
     name, model, width, height, params = match.groups()
+    size = _side(width), _side(height)
     camera = parse_intrinsics(f"{model}:{','.join(params.split())}")
-    return name, dataclasses.replace(camera, size=(int(width), int(height)))
+    return name, dataclasses.replace(camera, size=size)
+
+
+def _side(text: str) -> int:
+    """Whole pixels: tables that know one kind of number write 1024 as 1024.0. ValueError if not."""
+    try:
+        side = float(text)
+    except ValueError:
+        side = 0.0
+    if not side.is_integer() or side < 1:
+        raise ValueError(f"width and height must be whole numbers of pixels; got {text}")
+    return int(side)
 
 
 def listed_name(path: Path, known: Mapping[str, Intrinsics]) -> str | None:

@@ -1,5 +1,8 @@
 """The position that a camera wrote into its photo: EXIF's GPS fields.
 
+What no place on Earth has is not believed: such a photo runs as one without GPS, or without an
+altitude. Each reason is named once, with its photos.
+
 Source: CIPA DC-008-2023 (EXIF 3.0), section 4.6.6.
 """
 
@@ -15,10 +18,17 @@ from jaxsfm.io.position_tables import Position
 METRES_PER_DOP = 5.0
 """The error of a range to a satellite, metres. A dilution of precision (GPSDOP) times this is the
 expected deviation of the position. It is a rule of thumb for receivers without corrections."""
-LOWEST, HIGHEST = -11_000.0, 100_000.0
-"""Altitudes that photos are taken at, metres: from the deepest sea to the border of space."""
+LOWEST, HIGHEST = -500.0, 20_000.0
+"""Altitudes at which photos with GPS are taken, metres. The lowest shore is that of the Dead Sea,
+at -430 m, and satellites are not heard below water or in mines. Many receivers for civil use stop
+at 18,000 m, because export rules ask for it, and few aircraft fly higher."""
+_PLACE = "GPSLatitude and GPSLongitude"
 Tag = ExifTags.GPS
 logger = logging.getLogger("jaxsfm")
+
+
+class _NotBelieved(ValueError):
+    """The tag that is not believed and why, in words that are the same for all such photos."""
 
 
 def read_gps(images: Iterable[ImageFile]) -> dict[str, Position]:
@@ -26,16 +36,22 @@ def read_gps(images: Iterable[ImageFile]) -> dict[str, Position]:
 
     x is the longitude and y is the latitude, degrees (WGS 84). z is the altitude, metres, as the
     camera gives it: usually above sea level. It is None if the photo has none.
+
+    If all photos have one and the same position, none is used. Phones without a fix repeat their
+    last one; and photos that were taken at one place say nothing of scale and direction either.
     """
     found, doubts = {}, dict[str, list[str]]()
     for image in images:
-        fields = _fields_of(image)
-        if (position := position_of(fields)) is not None:
+        position, doubt = _told(_fields_of(image))
+        if position is not None:
             found[image.name] = position
-        if (doubt := _doubt(fields)) is not None:
+        if doubt is not None:
             doubts.setdefault(doubt, []).append(image.name)
-    for tag, names in doubts.items():
-        logger.warning("%s: EXIF is not believed about %s, so it is not used", named(names), tag)
+    if len(found) > 1 and len({(at.x, at.y, at.z) for at in found.values()}) == 1:
+        doubts[_of_position(f"{_PLACE} (all photos have the same)")] = list(found)
+        found = {}
+    for doubt, names in doubts.items():
+        logger.warning("%s: EXIF is not believed about %s", named(names), doubt)
     return found
 
 
@@ -51,26 +67,28 @@ def _fields_of(image: ImageFile) -> Mapping[int, object]:
         return {}
 
 
-def _doubt(fields: Mapping[int, object]) -> str | None:
-    """The first tag whose numbers no place has. Receivers without a fix write no finite ones."""
-    for tag, largest in ((Tag.GPSLatitude, 90), (Tag.GPSLongitude, 180)):
-        value = fields.get(tag)
-        parts = [number(part) for part in value] if isinstance(value, list | tuple) else []
-        if len(parts) == 3 and None not in parts and _degrees(value, largest) is None:
-            return tag.name
-    altitude = number(fields.get(Tag.GPSAltitude))
-    return Tag.GPSAltitude.name if altitude is not None and _altitude(fields) is None else None
-
-
 def position_of(fields: Mapping[int, object]) -> Position | None:
     """The position in the fields of EXIF's GPS directory, by tag."""
-    lat = _angle(fields.get(Tag.GPSLatitude), fields.get(Tag.GPSLatitudeRef), "N", "S", 90)
-    lon = _angle(fields.get(Tag.GPSLongitude), fields.get(Tag.GPSLongitudeRef), "E", "W", 180)
-    if lat is None or lon is None:
-        return None
+    return _told(fields)[0]
+
+
+def _told(fields: Mapping[int, object]) -> tuple[Position | None, str | None]:
+    """The position, None if there is none; and the first tag that is not believed, in words."""
+    if fields.get(Tag.GPSLatitude) is None or fields.get(Tag.GPSLongitude) is None:
+        return None, None
+    try:
+        lat = _angle(fields, Tag.GPSLatitude, "NS", 90)
+        lon = _angle(fields, Tag.GPSLongitude, "EW", 180)
+    except _NotBelieved as why:
+        return None, _of_position(str(why))
     if lat == 0 and lon == 0:  # what receivers write that have no fix; it lies in the Atlantic
-        return None
-    return Position(lon, lat, _altitude(fields), _deviation(fields))
+        return None, _of_position(f"{_PLACE} (0, 0)")
+    altitude, doubt = _altitude(fields)
+    return Position(lon, lat, altitude, _deviation(fields)), doubt
+
+
+def _of_position(doubt: str) -> str:
+    return f"{doubt}, so the position is not used"
 
 
 def _letter(value: object) -> str:
@@ -79,47 +97,48 @@ def _letter(value: object) -> str:
     return text.strip("\0 ")[:1].upper() if isinstance(text, str) else ""
 
 
-def _angle(
-    value: object, reference: object, positive: str, negative: str, largest: float
-) -> float | None:
-    """Degrees, minutes and seconds as signed degrees; None if they are no angle.
+def _angle(fields: Mapping[int, object], tag: ExifTags.GPS, sides: str, largest: int) -> float:
+    """Degrees, minutes and seconds as signed degrees; the second of two sides is negative.
 
     Without a letter that says on which side of the equator (or of Greenwich) a photo was taken, its
-    place is not known.
+    place is not known. Raises _NotBelieved.
     """
-    side, angle = _letter(reference), _degrees(value, largest)
-    if angle is None or side not in (positive, negative):
-        return None
-    return angle if side == positive else -angle
+    value = fields[tag]
+    parts = [number(part) for part in value] if isinstance(value, list | tuple) else []
+    dms = [part for part in parts if part is not None]
+    if len(parts) != 3 or len(dms) != 3:
+        raise _NotBelieved(f"{tag.name} (not three numbers)")
+    if min(dms) < 0:
+        raise _NotBelieved(f"{tag.name} (negative; {tag.name}Ref tells the side)")
+    if max(dms[1:]) >= 60:
+        raise _NotBelieved(f"{tag.name} (60 minutes or seconds, or more)")
+    angle = dms[0] + dms[1] / 60 + dms[2] / 3600
+    if angle > largest:
+        raise _NotBelieved(f"{tag.name} (beyond {largest} degrees)")
+    side = _letter(fields.get(tag - 1))  # the tag before an angle's is its reference
+    if not side or side not in sides:
+        raise _NotBelieved(f"{tag.name}Ref (neither {sides[0]} nor {sides[1]})")
+    return angle if side == sides[0] else -angle
 
 
-def _degrees(value: object, largest: float) -> float | None:
-    """Degrees, minutes and seconds as degrees; None if they are no angle up to the largest one."""
-    if not isinstance(value, list | tuple):
-        return None
-    parts = [number(part) for part in value]
-    if len(parts) != 3 or None in parts:
-        return None
-    degrees, minutes, seconds = (part for part in parts if part is not None)
-    if min(degrees, minutes, seconds) < 0 or minutes > 60 or seconds > 60:
-        return None
-    angle = degrees + minutes / 60 + seconds / 3600
-    return angle if angle <= largest else None
-
-
-def _altitude(fields: Mapping[int, object]) -> float | None:
+def _altitude(fields: Mapping[int, object]) -> tuple[float | None, str | None]:
     """Metres; negative below the reference (GPSAltitudeRef 1: sea level, 3: the ellipsoid).
 
-    None if there is none, or no photo can be taken there.
+    None if there is none, or no photo can be taken there; and why it is not believed.
     """
-    altitude = number(fields.get(Tag.GPSAltitude))
-    reference = fields.get(Tag.GPSAltitudeRef, 0)
+    value, reference = fields.get(Tag.GPSAltitude), fields.get(Tag.GPSAltitudeRef, 0)
+    if value is None:
+        return None, None
+    unused = "so the altitude is not used"
+    altitude = number(value)
+    if altitude is None:
+        return None, f"GPSAltitude (not a number), {unused}"
     if isinstance(reference, bytes):
         reference = reference[0] if reference else 0
-    if altitude is None:
-        return None
     altitude = -altitude if reference in (1, 3) else altitude
-    return altitude if LOWEST <= altitude <= HIGHEST else None
+    if LOWEST <= altitude <= HIGHEST:
+        return altitude, None
+    return None, f"GPSAltitude (below {LOWEST:g} m or above {HIGHEST:,.0f} m), {unused}"
 
 
 def _deviation(fields: Mapping[int, object]) -> float | None:

@@ -7,6 +7,7 @@ columns; a line that names the coordinate system may come before them. See docs/
 Source: https://docs.opendronemap.org/gcp/ and https://docs.opendronemap.org/geo/.
 """
 
+import dataclasses
 import math
 import re
 from dataclasses import dataclass, field
@@ -24,6 +25,7 @@ from jaxsfm.io.position_columns import (
     is_number,
     point_fields,
 )
+from jaxsfm.io.written_coordinates import Coordinates, Written, neighbourhood, written
 
 OPTION = "--georeference"
 WGS84 = "EPSG:4326"
@@ -98,32 +100,38 @@ class _Row(NamedTuple):
     line: int
     fields: dict[str, str]
 
-    def number(self, name: str) -> float:
+    def number(self, name: str) -> Written:
         """The number in a column; UserError if there is none."""
         text = self.fields.get(name, "").strip()
         try:  # where no comma separates fields, one may stand for the point
-            value = float(text.replace(",", ".", 1))
+            found = written(text.replace(",", ".", 1))
         except ValueError:
             raise UserError(f"{self.where}: {name} must be a number; got {text!r}") from None
-        if not math.isfinite(value):
+        if not math.isfinite(found.value):
             raise UserError(f"{self.where}: {name} must be finite; got {text!r}")
-        return value
+        return found
 
-    def optional(self, name: str) -> float | None:
+    def optional(self, name: str) -> Written | None:
         """The number in a column; None if it is empty, nan, or not there."""
         text = self.fields.get(name, "").strip()
         return None if text.lower() in ("", "nan") else self.number(name)
 
-    def position(self) -> Position:
-        """The position in the row, with longitude and latitude as x and y."""
+    def coordinates(self) -> Coordinates:
+        """x, y and z, with longitude and latitude as x and y."""
         geographic = "lat" in self.fields
         x, y, z = ("lon", "lat", "alt") if geographic else ("x", "y", "z")
-        found = Position(
-            self.number(x), self.number(y), self.optional(z), self.optional("deviation")
-        )
-        if found.deviation is not None and found.deviation <= 0:
-            raise UserError(f"{self.where}: deviation must be positive; got {found.deviation:g}")
-        return found
+        return Coordinates(self.number(x), self.number(y), self.optional(z))
+
+    def deviation(self) -> float | None:
+        """The expected error; None if it is not known."""
+        found = self.optional("deviation")
+        if found is not None and found.value <= 0:
+            raise UserError(f"{self.where}: deviation must be positive; got {found.value:g}")
+        return None if found is None else found.value
+
+    def position(self) -> Position:
+        """The position in the row."""
+        return Position(*self.coordinates().values, self.deviation())
 
 
 def read_position_table(path: Path) -> PositionTable:
@@ -218,8 +226,8 @@ def _read_blanks(lines: list[tuple[int, str]], system: str, where: str) -> Posit
         fields = point_fields(line)
         names = ("x", "y", "z", "px", "py", "image")
         named = dict[str, str](zip(names, fields, strict=False))
-        # Without a name, a point is known by its coordinates.
-        named["point"] = fields[6] if len(fields) > 6 else " ".join(fields[:3])
+        if len(fields) > 6:
+            named["point"] = fields[6]
         points.append(_Row(at, number, named))
     if points and cameras:
         raise UserError(
@@ -241,18 +249,39 @@ def _positions(rows: list[_Row]) -> dict[str, Position]:
 
 def _points(rows: list[_Row]) -> list[ControlPoint]:
     found: dict[str, ControlPoint] = {}
+    known: dict[str, Coordinates] = {}
+    unnamed: dict[str, str] = {}  # names of points by the text of their coordinates
+    if not rows:
+        return []
+    most = neighbourhood([row.coordinates() for row in rows])
     for row in rows:
-        name, position = row.fields["point"].strip(), row.position()
-        point = found.setdefault(name, ControlPoint(name=name, position=position))
-        if point.position != position:
+        at, deviation, image = row.coordinates(), row.deviation(), row.fields["image"].strip()
+        if "point" in row.fields:
+            name = row.fields["point"].strip()
+        else:  # the point is known by its coordinates, and no photo shows it twice
+            text = " ".join(row.fields[axis] for axis in "xyz")
+            if text not in unnamed:
+                others = (each for each in unnamed.values() if image not in found[each].photos)
+                same = (each for each in others if at.rounds(known[each], most))
+                unnamed[text] = next(same, text)
+            name = unnamed[text]
+        first = ControlPoint(name=name, position=Position(*at.values, deviation))
+        point, before = found.setdefault(name, first), known.setdefault(name, at)
+        if "point" in row.fields and not (
+            at.equal(before) and deviation == point.position.deviation
+        ):
             raise UserError(
                 f"{row.where}: the point {shown_name(name)} has another position in an earlier line"
             )
-        image = row.fields["image"].strip()
         if image in point.photos:
             raise UserError(
                 f"{row.where}: the point {shown_name(name)} is measured twice in "
                 f"{shown_name(image)}"
             )
-        point.seen.append(Measurement(image, row.number("px"), row.number("py"), row.line))
-    return list(found.values())
+        known[name] = before.finest(at)
+        px, py = row.number("px").value, row.number("py").value
+        point.seen.append(Measurement(image, px, py, row.line))
+    return [
+        dataclasses.replace(point, position=Position(*known[name].values, point.position.deviation))
+        for name, point in found.items()
+    ]

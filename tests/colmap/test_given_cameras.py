@@ -70,7 +70,20 @@ def test_what_rounding_leaves_in_a_matrix_is_no_skew(tmp_path):
         ([FIRST, "b.jpg SIMPLE_PINHOLE 640 480 500 320"], "line 2 is not NAME MODEL WIDTH HEIGHT"),
         ([FIRST, "b.jpg LENS 640 480 500 320 240"], "line 2 is not NAME MODEL"),
         ([FIRST, "SIMPLE_PINHOLE 640 480 500 320 240"], "line 2 is not NAME MODEL"),
-        ([FIRST, "b.jpg SIMPLE_PINHOLE 640.5 480 500 320 240"], "line 2 is not NAME MODEL"),
+        (
+            [FIRST, "b.jpg SIMPLE_PINHOLE 640.5 480 500 320 240"],
+            "whole numbers of pixels; got 640.5",
+        ),
+        (
+            [FIRST, "b.jpg SIMPLE_PINHOLE 640 1e999 500 320 240"],
+            "whole numbers of pixels; got 1e999",
+        ),
+        (
+            [FIRST, "b.jpg SIMPLE_PINHOLE 640 4.8.0 500 320 240"],
+            "whole numbers of pixels; got 4.8.0",
+        ),
+        ([FIRST, "b.jpg SIMPLE_PINHOLE 0 480 500 320 240"], "whole numbers of pixels; got 0"),
+        ([FIRST, "b.jpg SIMPLE_PINHOLE -640 480 500 320 240"], "whole numbers of pixels; got -640"),
         ([FIRST, "b.jpg SIMPLE_PINHOLE 640 480 -500 320 240"], "line 2 is not NAME MODEL"),
         ([LAST, FIRST, FIRST.replace("500", "501")], "line 3 is a second camera of day/a.jpg"),
         (["# nothing"], "neither a 3 x 3 matrix nor a list of cameras"),
@@ -82,7 +95,14 @@ def test_a_damaged_list_is_refused_naming_file_and_line(tmp_path, lines, message
     with pytest.raises(UserError) as raised:
         parse_cameras(str(path))
     assert str(raised.value).startswith(f"--intrinsics {path}")
-    assert message in str(raised.value)
+    assert message in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_whole_sizes_may_be_written_with_decimals(tmp_path):
+    text = FIRST.replace("640 480", "640.0 4.80e2")
+    assert parse_cameras(str(written(tmp_path, text))) == parse_cameras(
+        str(written(tmp_path, FIRST))
+    )
 
 
 @pytest.mark.parametrize("first", ["\ufeff", ""])

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image, TiffImagePlugin
 
-from jaxsfm.io.exif_gps import METRES_PER_DOP, gps_of, position_of
-from jaxsfm.io.images import ImageFile, inspect_image
+from jaxsfm.io import exif_gps
+from jaxsfm.io.exif_gps import METRES_PER_DOP, gps_of, position_of, read_gps
+from jaxsfm.io.images import ExifData, ImageFile, inspect_image
 
 G = ExifTags.GPS
 GOOD = {
@@ -19,7 +20,7 @@ GOOD = {
     G.GPSAltitudeRef: b"\x00",
     G.GPSAltitude: 198.309,
 }
-ZERO = TiffImagePlugin.IFDRational(1, 0)
+ZERO, NAN = TiffImagePlugin.IFDRational(1, 0), TiffImagePlugin.IFDRational(0, 0)
 
 
 def photo(path: Path, fields: dict) -> Path:
@@ -44,24 +45,116 @@ def test_a_photo_of_the_real_flight_has_its_place(data_folder):
     assert (found.y, found.x) == pytest.approx((46.842607, -91.994560), abs=1e-6)
 
 
+def told(tmp_path: Path, caplog, *each: dict) -> tuple[dict, list[str]]:
+    """The positions of photos a.jpg, b.jpg, ... with these fields, and the sentences about them."""
+    images = [
+        inspect_image(photo(tmp_path / f"{name}.jpg", fields))
+        for name, fields in zip("abcdefgh", each, strict=False)
+    ]
+    caplog.clear()
+    return read_gps(images), [record.getMessage() for record in caplog.records]
+
+
 @pytest.mark.parametrize(
-    "change",
+    ("change", "said"),
     [
-        {G.GPSLatitudeRef: None},  # on which side of the equator?
-        {G.GPSLongitudeRef: "?"},
-        {G.GPSLatitude: (46.0, 50.0, ZERO)},
-        {G.GPSLatitude: (46.0, 50.0)},
-        {G.GPSLatitude: (91.0, 0.0, 0.0)},
-        {G.GPSLongitude: (180.0, 0.0, 1.0)},
-        {G.GPSLongitude: (1.0, 61.0, 0.0)},
-        {G.GPSLatitude: (0.0, 0.0, 0.0), G.GPSLongitude: (0.0, 0.0, 0.0)},  # no fix
-        {G.GPSLatitude: None},
-        {G.GPSLatitude: "46 50"},
+        ({G.GPSLatitudeRef: "?"}, "GPSLatitudeRef (neither N nor S)"),
+        ({G.GPSLatitudeRef: "E"}, "GPSLatitudeRef (neither N nor S)"),
+        ({G.GPSLatitudeRef: None}, "GPSLatitudeRef (neither N nor S)"),
+        ({G.GPSLongitudeRef: "N"}, "GPSLongitudeRef (neither E nor W)"),
+        ({G.GPSLongitudeRef: ""}, "GPSLongitudeRef (neither E nor W)"),
+        ({G.GPSLatitude: (46.0, 50.0, ZERO)}, "GPSLatitude (not three numbers)"),
+        ({G.GPSLatitude: (NAN, 50.0, 0.0)}, "GPSLatitude (not three numbers)"),
+        ({G.GPSLatitude: (46.0, 50.0)}, "GPSLatitude (not three numbers)"),
+        ({G.GPSLatitude: (90.0, 0.0, 0.001)}, "GPSLatitude (beyond 90 degrees)"),
+        ({G.GPSLongitude: (180.0, 0.0, 0.001)}, "GPSLongitude (beyond 180 degrees)"),
+        ({G.GPSLongitude: (1.0, 60.0, 0.0)}, "GPSLongitude (60 minutes or seconds"),
+        ({G.GPSLatitude: (1.0, 0.0, 60.0)}, "GPSLatitude (60 minutes or seconds"),
+        (
+            {G.GPSLatitude: (0.0, 0.0, 0.0), G.GPSLongitude: (0.0, 0.0, 0.0)},  # no fix
+            "GPSLatitude and GPSLongitude (0, 0)",
+        ),
     ],
 )
-def test_what_is_no_place_is_no_position(change):
+def test_what_is_no_place_is_no_position_and_its_tag_is_named(tmp_path, caplog, change, said):
     assert position_of(GOOD) is not None
     assert position_of(GOOD | change) is None
+    damaged = {tag: value for tag, value in (GOOD | change).items() if value is not None}
+    found, (sentence,) = told(tmp_path, caplog, GOOD, damaged)
+    assert list(found) == ["a.jpg"]  # it costs no other photo
+    assert sentence.startswith(f"b.jpg: EXIF is not believed about {said}")
+    assert sentence.endswith("so the position is not used")
+
+
+@pytest.mark.parametrize(
+    ("latitude", "said"),
+    [
+        ((float("nan"), 50.0, 0.0), "(not three numbers)"),
+        ((46.0, float("inf"), 0.0), "(not three numbers)"),
+        ("46 50", "(not three numbers)"),
+        ((-46.0, 50.0, 0.0), "(negative"),
+    ],
+)
+def test_what_pillow_reads_but_does_not_write_is_named_too(
+    tmp_path, caplog, monkeypatch, latitude, said
+):
+    fields = GOOD | {G.GPSLatitude: latitude}
+    monkeypatch.setattr(exif_gps, "exif_data", lambda _: ExifData({}, fields))
+    found, (sentence,) = told(tmp_path, caplog, {})
+    assert not found and f"GPSLatitude {said}" in sentence
+
+
+def test_photos_with_the_same_fault_are_named_in_one_sentence(tmp_path, caplog):
+    wrong = [GOOD | {G.GPSLatitude: (91.0 + k, 0.0, 0.0)} for k in range(6)]
+    found, (sentence,) = told(tmp_path, caplog, *wrong)
+    assert not found
+    assert sentence.startswith("a.jpg, b.jpg, ") and "more: EXIF is not believed" in sentence
+
+
+def test_photos_without_a_position_are_not_doubted(tmp_path, caplog):
+    only_altitude = {G.GPSAltitude: ZERO, G.GPSAltitudeRef: b"\x00"}
+    assert told(tmp_path, caplog, {}, only_altitude, {G.GPSLatitude: (1.0, 2.0, 3.0)}) == ({}, [])
+
+
+@pytest.mark.parametrize(
+    ("lat", "lon"), [((90.0, 0.0, 0.0), (180.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (9.0, 59.0, 59.999))]
+)
+def test_the_borders_of_what_can_be_are_believed(tmp_path, caplog, lat, lon):
+    found, said = told(tmp_path, caplog, GOOD | {G.GPSLatitude: lat, G.GPSLongitude: lon})
+    assert list(found) == ["a.jpg"] and not said
+
+
+@pytest.mark.parametrize("altitude", [-501.0, 20_001.0, 4_294_967_295.0])
+def test_an_altitude_that_cannot_be_leaves_the_position_without_one(tmp_path, caplog, altitude):
+    reference = b"\x01" if altitude < 0 else b"\x00"
+    high = GOOD | {G.GPSAltitudeRef: reference, G.GPSAltitude: abs(altitude)}
+    found, (sentence,) = told(tmp_path, caplog, GOOD, high)
+    assert found["b.jpg"] == found["a.jpg"]._replace(z=None) and found["a.jpg"].full
+    assert sentence == (
+        "b.jpg: EXIF is not believed about GPSAltitude (below -500 m or above 20,000 m), so the "
+        "altitude is not used"
+    )
+
+
+@pytest.mark.parametrize("altitude", [-430.0, 19_900.0])
+def test_altitudes_of_deep_shores_and_high_flights_are_believed(altitude):
+    fields = {G.GPSAltitudeRef: int(altitude < 0), G.GPSAltitude: abs(altitude)}
+    found = position_of(GOOD | fields)
+    assert found is not None and found.z == altitude
+
+
+def test_one_position_for_all_photos_says_nothing(tmp_path, caplog):
+    found, (sentence,) = told(tmp_path, caplog, GOOD, {}, GOOD, GOOD)
+    assert not found
+    assert sentence == (
+        "a.jpg, c.jpg, d.jpg: EXIF is not believed about GPSLatitude and GPSLongitude (all photos "
+        "have the same), so the position is not used"
+    )
+    moved = GOOD | {G.GPSLatitude: (46.0, 50.0, 33.3856)}
+    found, said = told(tmp_path, caplog, GOOD, GOOD, moved)
+    assert list(found) == ["a.jpg", "b.jpg", "c.jpg"] and not said
+    found, said = told(tmp_path, caplog, GOOD)
+    assert list(found) == ["a.jpg"] and not said
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,16 @@ def test_a_note_that_is_no_code_is_ignored(tmp_path, code):
     assert inspect_image(tagged(tmp_path / "a.jpg", pixels(), code, "JPEG")).orientation == 1
 
 
+@pytest.mark.parametrize("kind", ["PNG", "TIFF"])
+@pytest.mark.parametrize("code", [0, 9, 65535])
+def test_a_photo_with_a_note_that_is_no_code_runs_as_an_upright_one(tmp_path, code, kind):
+    image = inspect_image(tagged(tmp_path / f"a.{kind.lower()}", pixels(), code, kind))
+    assert (image.orientation, image.upright_size) == (1, SIZE)
+    assert image.content == image.sha256 and orientations([image]) == {}
+    for upright in (False, True):
+        np.testing.assert_array_equal(read_image(image, max_size=60, upright=upright).rgb, pixels())
+
+
 def test_damaged_exif_is_ignored(tmp_path):
     Image.fromarray(pixels()).save(tmp_path / "a.jpg", exif=b"Exif\x00\x00MM\x00*\xff\xff\xff\xff")
     assert inspect_image(tmp_path / "a.jpg").orientation == 1

@@ -18,6 +18,7 @@ from jaxsfm.bench.synthetic import render, room
 from jaxsfm.cli.main import main
 from jaxsfm.colmap.model_files import read_model
 from jaxsfm.colmap.poses import model_poses, read_poses
+from jaxsfm.errors import UserError
 from jaxsfm.io.images import inspect_image
 from jaxsfm.report.finished_run import read_run
 from jaxsfm.report.page.write import page
@@ -208,6 +209,13 @@ def test_gps_and_auto_read_the_positions_in_photos(tmp_path):
         local = found.local(found.frame())
         assert local["1.jpg"].y - local["0.jpg"].y == pytest.approx(111.2, abs=0.2)
     assert measured_positions("off", images) is None
+
+
+def test_positions_that_say_nothing_are_as_none(tmp_path):
+    images = gps_photos(tmp_path, [PLACES[0]] * 4)
+    assert measured_positions("auto", images) is None
+    with pytest.raises(UserError, match="gps: 0 photos have a GPS position"):
+        measured_positions("gps", images)
 
 
 def refusal(capsys, *args: str) -> str:
