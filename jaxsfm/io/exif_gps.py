@@ -110,8 +110,8 @@ def _angle(fields: Mapping[int, object], tag: ExifTags.GPS, sides: str, largest:
         raise _NotBelieved(f"{tag.name} (not three numbers)")
     if min(dms) < 0:
         raise _NotBelieved(f"{tag.name} (negative; {tag.name}Ref tells the side)")
-    if max(dms[1:]) >= 60:
-        raise _NotBelieved(f"{tag.name} (60 minutes or seconds, or more)")
+    if max(dms[1:]) > 60:  # 60 itself is what programs write that round 59.99999
+        raise _NotBelieved(f"{tag.name} (more than 60 minutes or seconds)")
     angle = dms[0] + dms[1] / 60 + dms[2] / 3600
     if angle > largest:
         raise _NotBelieved(f"{tag.name} (beyond {largest} degrees)")

@@ -68,8 +68,8 @@ def told(tmp_path: Path, caplog, *each: dict) -> tuple[dict, list[str]]:
         ({G.GPSLatitude: (46.0, 50.0)}, "GPSLatitude (not three numbers)"),
         ({G.GPSLatitude: (90.0, 0.0, 0.001)}, "GPSLatitude (beyond 90 degrees)"),
         ({G.GPSLongitude: (180.0, 0.0, 0.001)}, "GPSLongitude (beyond 180 degrees)"),
-        ({G.GPSLongitude: (1.0, 60.0, 0.0)}, "GPSLongitude (60 minutes or seconds"),
-        ({G.GPSLatitude: (1.0, 0.0, 60.0)}, "GPSLatitude (60 minutes or seconds"),
+        ({G.GPSLongitude: (1.0, 60.5, 0.0)}, "GPSLongitude (more than 60 minutes"),
+        ({G.GPSLatitude: (1.0, 0.0, 60.1)}, "GPSLatitude (more than 60 minutes"),
         (
             {G.GPSLatitude: (0.0, 0.0, 0.0), G.GPSLongitude: (0.0, 0.0, 0.0)},  # no fix
             "GPSLatitude and GPSLongitude (0, 0)",
