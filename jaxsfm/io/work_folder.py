@@ -88,7 +88,7 @@ class WorkFolder(Store):
                 _make_own(database)
             logger.info("%s: as before, nothing it depends on has changed", name)
             return folder
-        with atomic_folder(folder) as fresh:
+        with writing(f"--out {self.path}"), atomic_folder(folder) as fresh:
             compute(fresh)
             (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
         return folder

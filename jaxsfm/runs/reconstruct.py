@@ -21,7 +21,7 @@ from jaxsfm.io.entries import FAILED, FRAMES
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
-from jaxsfm.io.photo_folder import masks_of, with_masks
+from jaxsfm.io.photo_folder import masks_of, too_few, with_masks
 from jaxsfm.io.video import open_video
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import lock_folder, open_folder
@@ -212,8 +212,7 @@ def reconstruct_video(video: Path, out: Path, *, config: Config, options: RunOpt
 
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:
     if len(images) < 2:
-        why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
-        raise UserError(f"{folder}: {len(images)} usable images, at least 2 are needed{why}")
+        raise UserError(too_few(folder, len(images), skipped))
 
 
 def _has_model(made: Reconstructed, images: Sequence[ImageFile]) -> bool:
