@@ -117,20 +117,21 @@ class WorkFolder(Store):
         If the process is killed while it moves them, the next run moves the rest first. Results
         without a model do not replace results with one: they are put into the folder `failed`.
         """
-        fresh = entry(self.path, FRESH)
-        remove(fresh)
-        fresh.mkdir()
-        yield fresh
-        failed = (self.path / "sparse").exists() and not (fresh / "sparse").exists()
-        if failed:
-            logger.warning(
-                "this run made no model, so the earlier model stays; its report is in %s",
-                self.path / FAILED,
-            )
-        moves = {"failed": failed, "names": [n for n in RESULTS if (fresh / n).exists()]}
-        write_atomic(fresh / _MOVES, json.dumps(moves).encode())
-        fresh.rename(entry(self.path, PUBLISHING))  # from here on they are the results
-        self.finish_publishing()
+        with writing(f"--out {self.path}"):
+            fresh = entry(self.path, FRESH)
+            remove(fresh)
+            fresh.mkdir()
+            yield fresh
+            failed = (self.path / "sparse").exists() and not (fresh / "sparse").exists()
+            if failed:
+                logger.warning(
+                    "this run made no model, so the earlier model stays; its report is in %s",
+                    self.path / FAILED,
+                )
+            moves = {"failed": failed, "names": [n for n in RESULTS if (fresh / n).exists()]}
+            write_atomic(fresh / _MOVES, json.dumps(moves).encode())
+            fresh.rename(entry(self.path, PUBLISHING))  # from here on they are the results
+            self.finish_publishing()
 
     def finish_publishing(self) -> None:
         """Move those of the complete results that have not been moved yet."""
