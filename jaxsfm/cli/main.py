@@ -49,6 +49,8 @@ COMMANDS = {
 }
 UNREAD = 128 + 13
 """The exit status if nobody reads the output: what a shell says of a program that SIGPIPE ends."""
+NO_MEMORY = ("RESOURCE_EXHAUSTED", "can't start new thread")
+"""What exceptions of other types say if there is not enough memory."""
 for _command in COMMANDS.values():
     unwrapped(_command)
 
@@ -127,9 +129,9 @@ def _reported(argv: list[str]) -> int:
         print(f"jaxsfm: {named}{error.strerror or error}", file=sys.stderr)
         return 2
     except Exception as error:
-        # XLA's allocator raises an exception type of its own. Any other exception is a fault in
-        # jaxsfm, and its traceback is shown.
-        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+        # XLA's allocator raises an exception type of its own, and Python one for the memory of a
+        # thread. Any other exception is a fault in jaxsfm, and its traceback is shown.
+        if not isinstance(error, MemoryError) and not any(each in str(error) for each in NO_MEMORY):
             raise
         print(
             "jaxsfm: out of memory. A smaller --max-size needs less memory; reconstruct also "
