@@ -5,14 +5,17 @@ it is about: `["open", "/matches/"]` is the first file of matches that is opened
 """
 
 import ctypes
+import functools
 import os
 import resource
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
+_BEGUN = [0.0]
 _EVENTS = ("open", "os.mkdir", "os.rename")
 
 
@@ -25,9 +28,12 @@ def begin(wanted: dict) -> None:
     memory: bytes that the process may take more than now.
     unread: [1], [2]: numbers of outputs that nobody reads.
     plain: root may write no more than other users may.
+    usage: the seconds and the memory that were needed until the signal are printed.
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    for name, act in (("full", _fill), ("signal", _send), ("remove", _delete)):
+    _BEGUN[:] = [time.monotonic()]
+    send = functools.partial(_send, usage=wanted.get("usage", False))
+    for name, act in (("full", _fill), ("signal", send), ("remove", _delete)):
         if name in wanted:
             event, path, what = wanted[name]
             _at(event, path, lambda act=act, what=what: act(what))
@@ -65,7 +71,11 @@ def _fill(most: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
 
 
-def _send(number: int) -> None:
+def _send(number: int, usage: bool) -> None:
+    if usage:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        seconds = time.monotonic() - _BEGUN[0]
+        print(f"usage: {seconds:.1f} s, {used.ru_maxrss * 1024} bytes", flush=True)
     os.kill(os.getpid(), number)
 
 

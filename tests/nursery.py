@@ -8,12 +8,16 @@ when it has ended. Run it as a script with the folder of compiled programs.
 import contextlib
 import json
 import os
+import re
 import select
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+_BAR = re.compile(r"\r?[a-z ]+: +(\d+%\|[^\]]*|\d+pass \[[^\]]*)\]|\r|\x1b\[A")
+"""A progress bar, from the beginning of its line."""
 
 
 class Nursery:
@@ -47,9 +51,10 @@ class Nursery:
         """Exit status of a command, and what it said, without its progress bars."""
         before = self.log.stat().st_size if self.log.exists() else 0
         status, _ = self.run(argv, faults=faults)
-        text = self.log.read_bytes()[before:].decode("utf-8", "replace").replace("\r", "\n")
-        lines = [line for line in text.splitlines() if line.strip() and "%|" not in line]
-        return status, "\n".join(line for line in lines if "pass [" not in line)
+        text = self.log.read_bytes()[before:].decode("utf-8", "replace")
+        # A progress bar ends with what moves the cursor, and what is said may follow at once.
+        lines = _BAR.sub("\n", text).splitlines()
+        return status, "\n".join(line for line in lines if line.strip())
 
     def end(self) -> None:
         self._process.communicate(timeout=60)
