@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from databases import content
+from kept_runs import results
 from nursery import Nursery
 
 from jaxsfm.bench.synthetic import write_scene
@@ -28,19 +28,6 @@ def nursery(tmp_path):
     made = Nursery(tmp_path / "compiled")
     yield made
     made.end()
-
-
-def results(out: Path) -> dict[str, object]:
-    """What a run leaves that must not depend on how it came there."""
-    files = [*out.glob("matches/*/*"), *out.glob("sparse/*/*")]
-    report = json.loads((out / "report.json").read_text())
-    return {
-        **{str(file.relative_to(out)): file.read_bytes() for file in files},
-        "database": content(out / "database.db"),
-        "report": {
-            name: report[name] for name in ("identity", "pairs", "models", "lost", "refinement")
-        },
-    }
 
 
 def assert_whole(out: Path) -> None:

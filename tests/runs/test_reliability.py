@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from databases import content
+from kept_runs import results
 from nursery import Nursery
 
 from jaxsfm.bench.synthetic import write_scene
@@ -50,18 +50,6 @@ def photos(tmp_path_factory) -> Path:
 
 def command(photos: Path, out: Path) -> list[str]:
     return ["reconstruct", str(photos), *OPTIONS, "--out", str(out)]
-
-
-def results(out: Path) -> dict[str, object]:
-    """What must not depend on what happened on the way."""
-    files = [*out.glob("matches/*/*"), *out.glob("sparse/*/*")]
-    report = json.loads((out / "report.json").read_text())
-    same = ("identity", "pairs", "models", "lost", "refinement")
-    return {
-        **{str(file.relative_to(out)): file.read_bytes() for file in files},
-        "database": content(out / "database.db"),
-        "report": {name: report[name] for name in same},
-    }
 
 
 @pytest.fixture(scope="module")
