@@ -110,8 +110,8 @@ class ReconstructionChoice:
         in which the centre of the top-left pixel is (0, 0), or with a line NAME MODEL WIDTH HEIGHT
         p1 p2 .. for each photo. MODEL:p1,p2,..: a COLMAP camera model with its parameters, in
         COLMAP's pixels, in which that centre is (0.5, 0.5). Without it, cameras are estimated.
-      masks: Folder with masks, images of the size of the photos. Black pixels are not used. The
-        mask of sub/a.jpg is sub/a.jpg.png.
+      masks: Folder with masks, images of the size of the photos, or one mask for all photos. Black
+        pixels are not used. In a folder, the mask of sub/a.jpg is sub/a.jpg.png.
       cameras: Which photos share a camera. single: all photos. folder: the photos of each
         sub-folder. photo: none. auto: those whose EXIF names the same camera, lens and focal
         length; photos of one size without any EXIF share one camera, too.

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from compiled import compiled
 from strategies import rng_of, unit_rows
 
 import jaxsfm.core
@@ -208,7 +209,7 @@ def _pair_shape(preset: str):
 
 def _aligned(seed: int) -> tuple:
     image, size = 120 + _floats(seed, 40, 44, 1, scale=20), np.asarray([40, 44], np.int32)
-    patch = jax.tree.map(np.asarray, align.square_patch(3))
+    patch = compiled(align.square_patch, "radius")(radius=3)
     return image, size, _floats(seed + 1, 6, 2) + np.float32(20), patch
 
 
@@ -335,7 +336,7 @@ def calls() -> dict[str, Call]:
     affine = np.eye(2, dtype=np.float32) + _floats(4, 6, 2, 2, scale=0.1)
     f = _floats(8, 3, 3)
     vgg16 = _parameters("vgg16")
-    learned = jax.device_get(scores.init_scores(KEY, hidden=3))
+    learned = compiled(scores.init_scores, "hidden")(KEY, hidden=3)
     photo = _photo(64, 64).astype(np.float32)
     one = np.float32(1)
     soft = {"temperature": 0.7}

@@ -1,6 +1,5 @@
 """Hypothesis strategies: values are drawn, shapes come from a short menu (each shape compiles)."""
 
-import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
@@ -45,13 +44,13 @@ def random_features(seed: int, shape: tuple[int, int], octaves: int) -> DenseFea
             cells = (grid[0] >> k) * (grid[1] >> k)
             x = rng.normal(size=(cells, 6)) * (rng.random((cells, 1)) > 0.1)
             x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
-            yield jnp.asarray(np.pad(x, ((0, -(-room // 4**k) - cells), (0, 0))), jnp.float32)
+            yield np.float32(np.pad(x, ((0, -(-room // 4**k) - cells), (0, 0))))
 
     fine = (2 * shape[0] + 1, 2 * shape[1])
     return DenseFeatures(
         tuple(levels(shape, 112)),
         tuple(levels(fine, 448)),
-        jnp.zeros((448, 2)),
-        jnp.asarray(shape, jnp.int32),
-        jnp.asarray(fine, jnp.int32),
+        np.zeros((448, 2), np.float32),
+        np.int32(shape),
+        np.int32(fine),
     )

@@ -30,6 +30,8 @@ FRAMES_RECORD = "frames.json"
 """The file in it that says what the frames were made from."""
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
+STILL = "still.png"
+"""The mask of what shows at the same pixels in all photos (`jaxsfm.io.still_pattern`)."""
 DATABASE = "database.db"
 RESULTS = (PAGE, "report.json", "sparse", "alternative", DATABASE)
 LOGS = ("-journal", "-wal", "-shm")
@@ -46,7 +48,7 @@ ENTRIES = frozenset(
     [
         *RESULTS,
         *(DATABASE + end for end in LOGS),
-        *(RECORD, LOCK, UNUSABLE, FAILED, FRESH, PUBLISHING, FRAMES, FRAMES + PARTIAL),
+        *(RECORD, LOCK, UNUSABLE, STILL, FAILED, FRESH, PUBLISHING, FRAMES, FRAMES + PARTIAL),
         *(FEATURES, MATCHES, DESCRIPTORS, STAGES),
     ]
 )

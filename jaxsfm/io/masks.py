@@ -1,7 +1,8 @@
 """Which pixels of a photo are used: all but those of its mask, and but blank borders.
 
 A mask has COLMAP's convention: it is an image of the photo's size whose black pixels are ignored,
-and the mask of the photo `sub/a.jpg` is the file `sub/a.jpg.png` in the folder of the masks.
+and the mask of the photo `sub/a.jpg` is the file `sub/a.jpg.png` in the folder of the masks. One
+file may be the mask of all photos of its size.
 """
 
 import dataclasses
@@ -31,9 +32,13 @@ class MaskFile:
     """The SHA-256 of the file's bytes, hexadecimal."""
 
 
-def mask_path(folder: Path, name: str) -> Path:
-    """Where the mask of a photo lies."""
-    return folder / f"{name}.png"
+def mask_path(masks: Path, name: str) -> Path:
+    """Where the mask of a photo lies.
+
+    Args:
+      masks: a folder with the mask of each photo, or the file of one mask for all photos.
+    """
+    return masks if masks.is_file() else masks / f"{name}.png"
 
 
 def open_mask(path: Path, size: tuple[int, int]) -> MaskFile:
@@ -64,6 +69,12 @@ def _decoded(path: Path) -> tuple[np.ndarray | None, str]:
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     gray = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     return None if gray is None else gray > 0, hashlib.sha256(data).hexdigest()
+
+
+def mask_size(path: Path) -> tuple[int, int] | None:
+    """(width, height) of a mask; None if the file is no image. UserError if it cannot be read."""
+    used, _ = _decoded(path)
+    return None if used is None else (used.shape[1], used.shape[0])
 
 
 def read_mask(mask: MaskFile) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 from jaxsfm.errors import UserError
 from jaxsfm.io import decoders
 from jaxsfm.io.images import ImageFile, named
-from jaxsfm.io.masks import mask_path, open_mask
+from jaxsfm.io.masks import mask_path, mask_size, open_mask
 
 logger = logging.getLogger(__name__)
 
@@ -81,29 +81,39 @@ def masks_of(images: Iterable[ImageFile]) -> dict[str, str]:
     return {image.name: image.mask.sha256 for image in images if image.mask is not None}
 
 
-def with_masks(images: Iterable[ImageFile], folder: Path) -> tuple[list[ImageFile], list[str]]:
+def with_masks(images: Iterable[ImageFile], masks: Path) -> tuple[list[ImageFile], list[str]]:
     """The images with their masks, and the names of those that have none.
 
     Of a photo without a mask, all pixels but a blank border are used.
 
+    Args:
+      masks: a folder with the masks of the images, or the file of one mask for all images that have
+        its size.
+
     Raises:
-      UserError: there is no such folder, it has no mask of any image, or a mask cannot be used.
+      UserError: there is no such folder or file, it has no mask of any image, or a mask cannot be
+        used.
     """
+    if not masks.exists():
+        raise UserError(f"--masks {masks}: no such folder or file")
     images = list(images)
-    if not folder.is_dir():
-        raise UserError(f"--masks {folder}: no such folder")
-    bare = [image.name for image in images if not mask_path(folder, image.name).is_file()]
+    found = {image.name: mask_of(image, masks) for image in images}
+    bare = [name for name, path in found.items() if path is None]
     if len(bare) == len(images):
-        raise UserError(
-            f"--masks {folder}: no mask of any photo (the mask of {bare[0]} would be "
-            f"{mask_path(Path(), bare[0])})"
-        )
-    lacking = set(bare)
-    masked = [
-        image if image.name in lacking else with_mask(image, mask_path(folder, image.name))
-        for image in images
-    ]
-    return masked, bare
+        its = f"would be {mask_path(Path(), bare[0])}" if masks.is_dir() else "has another size"
+        raise UserError(f"--masks {masks}: no mask of any photo (the mask of {bare[0]} {its})")
+    return [with_mask(image, found[image.name]) for image in images], bare
+
+
+def mask_of(image: ImageFile, masks: Path) -> Path | None:
+    """Where the mask of an image lies; None if it has none.
+
+    Args:
+      masks: as `with_masks` takes it.
+    """
+    path = mask_path(masks, image.name)
+    fits = masks.is_dir() or mask_size(masks) in (None, image.size)
+    return path if fits and path.is_file() else None
 
 
 def with_mask(image: ImageFile, path: Path | None) -> ImageFile:

@@ -6,14 +6,12 @@ There is at most one sentence for each cause. Where no option would help, photos
 import re
 from collections.abc import Collection, Iterable
 
+from jaxsfm.colmap.mapper import LOW_ANGLE_DEG
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import describe
 from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, PairOutcomes, furthest
 from jaxsfm.report.run_results import Advice, PairRow
 
-LEAST_ANGLE_DEG = 4.0
-"""The least angle at which the rays of a pair's points must meet to give the mapper depth to start
-from: the last and lowest of the mapper's demands."""
 _SHORTLIST = re.compile(r"\b(retrieval|sequential):(\d+)")
 
 
@@ -55,7 +53,7 @@ def without_pose(
       model: whether there is a model. Photos from one spot cannot start a model, but fit into one.
     """
     widest = None if model else pairs.widest_deg(own)
-    if widest is not None and widest < LEAST_ANGLE_DEG:
+    if widest is not None and widest < LOW_ANGLE_DEG:
         why = f"the rays of its points meet at {widest:.1f} deg at most"
         return [_photos(f"photos a step to the side: {why}")]
     found = [*_more_pairs([name], own, pairs), *_more_handed_on(own)]

@@ -26,7 +26,7 @@ from jaxsfm.io.images import (
     size_and_scale,
 )
 from jaxsfm.io.masks import MaskFile, mask_path
-from jaxsfm.io.photo_folder import with_mask
+from jaxsfm.io.photo_folder import mask_of, with_mask
 from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
 from jaxsfm.report.run_report import RunReport, read_report
@@ -89,12 +89,11 @@ class RecordedPhotos:
         return "" if image is None else image.taken_with
 
     def with_own_mask(self, image: ImageFile) -> ImageFile:
-        """A new photo with its mask, if there is one in the folder of the run's masks.
+        """A new photo with its mask, if there is one among the run's masks.
 
         Raises UserError if the mask cannot be used.
         """
-        path = None if self._masks is None else mask_path(self._masks, image.name)
-        return with_mask(image, path if path is not None and path.is_file() else None)
+        return with_mask(image, self._masks and mask_of(image, self._masks))
 
     def _mask(self, name: str) -> MaskFile | None:
         sha256 = self._identity.masks.get(name)
@@ -211,7 +210,7 @@ def evaluation_report(
 
 
 def masks_folder(report: RunReport) -> Path | None:
-    """The folder of the run's masks."""
+    """The folder of the run's masks, or the file of its one mask."""
     folder = report.options.get("masks")
     return Path(folder) if isinstance(folder, str) else None
 

@@ -13,9 +13,10 @@ import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
+from jaxsfm.colmap.mapper import LOW_ANGLE_DEG
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair, describe
-from jaxsfm.report.advice import LEAST_ANGLE_DEG, towards_others, without_pose
+from jaxsfm.report.advice import towards_others, without_pose
 from jaxsfm.report.pair_outcomes import (
     PairOutcomes,
     PhotoGroup,
@@ -25,6 +26,10 @@ from jaxsfm.report.pair_outcomes import (
 )
 from jaxsfm.report.run_report import RunReport
 from jaxsfm.report.run_results import Advice, LostPhoto, PairRow, PairStatus, Stage
+
+_ONE_PLACE = "the photos were taken from one place, turned about, so nothing gives depth"
+_MOVE = "move sideways between photos"
+_MASK = "mask what stays at the same pixels in all photos: it gives no depth"
 
 
 class _Refused(NamedTuple):
@@ -66,6 +71,29 @@ def explained(
         lost=_lost_photos(groups, models, pairs, _refused(report)),
         no_model=None if models else _no_model(pairs),
     )
+
+
+def without_depth(report: RunReport, *, one_place: bool) -> RunReport:
+    """The report of a run without a model because nothing gives depth: what to do is the same for
+    all photos.
+
+    Args:
+      one_place: whether the photos were taken from one place. Otherwise something that shows the
+        same in all photos may outweigh the rest.
+    """
+    if one_place:
+        why, detail = f"{_ONE_PLACE}; {_MOVE}", "it shows no depth"
+        help = Advice(option=None, reason=_MOVE)
+    elif report.same_pixels is not None:
+        why, detail = f"{report.no_model}, or {_MASK}", ""
+        help = Advice(option="--masks", reason=_MASK)
+    else:
+        return report
+    lost = [
+        dataclasses.replace(each, stage="no pose", detail=detail or each.detail, help=[help])
+        for each in report.lost
+    ]
+    return dataclasses.replace(report, lost=lost, no_model=why)
 
 
 def _lost_photos(
@@ -213,9 +241,9 @@ def _no_model(pairs: PairOutcomes) -> str:
         return f"the view graph trusts none of the {verified} verified pairs: {lack}"
     start = f"the mapper found no pair to start from among {len(used)}"
     widest = pairs.widest_deg(used)
-    if widest is not None and widest < LEAST_ANGLE_DEG:
+    if widest is not None and widest < LOW_ANGLE_DEG:
         return (
             f"{start}: the rays of their points meet at {widest:.1f} deg at most, so nothing "
-            "gives depth; move sideways between photos"
+            f"gives depth; {_MOVE}"
         )
     return f"{start}; the best, {describe(best.pair)}, has {best.colmap_inliers} inliers"

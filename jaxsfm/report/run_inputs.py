@@ -7,9 +7,10 @@ from typing import Annotated, TypeVar
 
 from msgspec import Meta
 
+from jaxsfm.io.entries import STILL
 from jaxsfm.io.images import ImageFile, orientations
 from jaxsfm.io.photo_folder import masks_of
-from jaxsfm.report.typed_json import OMITTED, Count
+from jaxsfm.report.typed_json import OMITTED, Count, Number
 
 T = TypeVar("T")
 
@@ -118,6 +119,25 @@ class LowResolution:
         if self.whole:
             return f"no model was made of photos of {self.px} px, so they were matched at full size"
         return f"photos were described at {self.px} px"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SamePixels:
+    """Pixels at which all photos of one size show the same (`jaxsfm.io.still_pattern`)."""
+
+    share: Number
+    """Their share of all pixels."""
+    photos: Count
+    """The number of photos of this size."""
+
+    def in_words(self) -> str:
+        """What they are and what to do, in a sentence without a full stop."""
+        return (
+            f"{100 * self.share:.0f} % of the pixels show the same in {self.photos} photos; if "
+            "this is no part of the scene (a watermark, a dashboard, the wall behind a turntable), "
+            f"leave it out: run the same command again with --masks and the file {STILL} of this "
+            "folder"
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

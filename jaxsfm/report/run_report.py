@@ -24,6 +24,7 @@ from jaxsfm.report.run_inputs import (
     LowResolution,
     RecordedOptions,
     RunIdentity,
+    SamePixels,
     UsedExternalMatches,
     UsedWeights,
 )
@@ -96,6 +97,8 @@ class RunReport:
     )
     """By how many degrees photos are turned clockwise to be upright, by name: those that the run
     found to be stored sideways without a note in EXIF."""
+    same_pixels: SamePixels | None = field(default=None, metadata=OMITTED)
+    """What shows at the same pixels in all photos; None: nothing, or masks were given."""
     models: list[ModelRow]
     """The one with most photos first, as the run made them; `jaxsfm extend` keeps this order. Empty
     if there is none."""

@@ -130,6 +130,8 @@ def summary_lines(report: RunReport) -> list[str]:
             f"given            {given.matches} matches in {given.pairs} pairs of {given.images} "
             "images, mapped together with the run's own"
         )
+    if same := report.same_pixels:
+        lines.append(f"same pixels      {same.in_words()}")
     if models:
         best, others = models[0], len(models) - 1
         smaller = f" (and {others} smaller model{'s' * (others > 1)})"

@@ -19,12 +19,13 @@ from jaxsfm.io.orientation import UPRIGHT, quarters_between
 from jaxsfm.io.pairs import Pair, PairCounts
 from jaxsfm.io.store import SavedMatches
 from jaxsfm.report.finished_run import FinishedRun, evaluation_report
-from jaxsfm.report.lost_photos import explained
+from jaxsfm.report.lost_photos import explained, without_depth
 from jaxsfm.report.run_inputs import (
     FoundPhotos,
     LowResolution,
     RecordedOptions,
     RunIdentity,
+    SamePixels,
     UsedExternalMatches,
     UsedWeights,
 )
@@ -63,6 +64,7 @@ class StageResults:
     """How the models were moved into metres."""
     weights: UsedWeights
     low_resolution: LowResolution | None
+    same_pixels: SamePixels | None
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -108,6 +110,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         given=None if about is None else msgspec.convert(about, UsedExternalMatches),
         low_resolution=stages.low_resolution,
         turned=_turned(stages.usable, stages.identity.orientations),
+        same_pixels=stages.same_pixels,
         models=[_model_row(model) for model in made.models],
         mapping=made.mapping.attempts,
         refinement=made.refinement,
@@ -117,7 +120,10 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         seconds=stages.seconds,
     )
     sizes = {image.name: image.size for image in stages.usable}
-    return explained(report, config, sizes, made.verification.angles)
+    report = explained(report, config, sizes, made.verification.angles)
+    if made.models or not made.verification.no_depth:
+        return report
+    return without_depth(report, one_place=made.verification.one_place)
 
 
 def _turned(images: Sequence[ImageFile], orientations: Mapping[str, int]) -> dict[str, int]:

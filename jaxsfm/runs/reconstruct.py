@@ -15,13 +15,14 @@ from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.intrinsics import used_cameras
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
-from jaxsfm.errors import UserError
-from jaxsfm.io.atomic import Json
-from jaxsfm.io.entries import FAILED, FRAMES
+from jaxsfm.errors import UserError, remark
+from jaxsfm.io.atomic import Json, write_atomic
+from jaxsfm.io.entries import FAILED, FRAMES, STILL, entry
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.photo_folder import masks_of, too_few, with_masks
+from jaxsfm.io.still_pattern import find_still_pattern
 from jaxsfm.io.video import open_video
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import lock_folder, open_folder
@@ -30,7 +31,7 @@ from jaxsfm.matching.pipeline import open_images
 from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page import page_after_run
-from jaxsfm.report.run_inputs import LowResolution, RunIdentity, UsedWeights
+from jaxsfm.report.run_inputs import LowResolution, RunIdentity, SamePixels, UsedWeights
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
@@ -118,6 +119,7 @@ def reconstruct_folder(
             seed=options.seed,
             progress=options.progress,
         )
+        same_pixels = None if options.masks else _same_pixels(usable, out)
         skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
         if selection.retrieval:
             with timed(seconds, "retrieval"):
@@ -151,7 +153,7 @@ def reconstruct_folder(
             low_resolution = None
             if matched.described != config:
                 low_resolution = LowResolution(px=matched.described.max_size)
-            if low_resolution and not _has_model(models.made, good):
+            if low_resolution and _lacks_detail(models.made, good):
                 # Nothing that photos could be registered in was made of small photos.
                 logger.info("no model was made of small photos; matching them at full size")
                 low_resolution = dataclasses.replace(low_resolution, whole=True)
@@ -172,6 +174,7 @@ def reconstruct_folder(
                     georeference=moved,
                     weights=msgspec.convert(weights.described(config), UsedWeights),
                     low_resolution=low_resolution,
+                    same_pixels=same_pixels,
                     seconds=seconds,
                 ),
                 config=config,
@@ -210,15 +213,32 @@ def reconstruct_video(video: Path, out: Path, *, config: Config, options: RunOpt
     return reconstruct_folder(out / FRAMES, out, config=config, options=options)
 
 
+def _same_pixels(images: Sequence[ImageFile], out: Path) -> SamePixels | None:
+    """What shows at the same pixels in all photos; its mask is written into the work folder.
+
+    It is only told: whoever sees the mask knows whether it is part of the scene.
+    """
+    found = remark("what stays at the same pixels", lambda: find_still_pattern(images))
+    if found is None:
+        return None
+    write_atomic(entry(out, STILL), found.mask())
+    same = SamePixels(share=found.share, photos=found.photos)
+    logger.warning("%s (%s)", same.in_words(), out / STILL)
+    return same
+
+
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:
     if len(images) < 2:
         raise UserError(too_few(folder, len(images), skipped))
 
 
-def _has_model(made: Reconstructed, images: Sequence[ImageFile]) -> bool:
-    """Whether there is a model that others can judge: two photos say nothing about each other."""
+def _lacks_detail(made: Reconstructed, images: Sequence[ImageFile]) -> bool:
+    """Whether larger photos may give a model that small ones did not give.
+
+    A model of two photos is none: they say nothing about each other.
+    """
     largest = max((model.num_reg_images() for model in made.models), default=0)
-    return largest >= min(MIN_VIEWS, len(images))
+    return largest < min(MIN_VIEWS, len(images)) and not made.verification.no_depth
 
 
 def _retrieve(

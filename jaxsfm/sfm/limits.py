@@ -31,6 +31,36 @@ class UprightLimits:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class OnePlaceLimits:
+    """Whether all photos were taken from one place.
+
+    The figures are those of docs/decisions/photos.md: five sets that were turned on one spot, and
+    33 others. Of the others, the neighbouring frames of a video come nearest to a turn.
+    """
+
+    pairs: int = 12
+    """So many pairs are compared, spread over all verified ones."""
+    start_px: float = 4.0
+    """Largest error of a match with the homography that the alignment starts from, pixels of the
+    described photos: COLMAP's own limit for verified matches."""
+    correlation: float = 0.8
+    """A window is aligned if its pixels correlate better."""
+    aligned: float = 0.9
+    """A turn aligns at least this share of the windows. Moving things may hide some."""
+    eigenvalues: float = 0.001
+    """Largest logarithm of an eigenvalue of a turn. Pairs of turned photos have 0.0002 or less, and
+    neighbouring frames of kitchen 0.0018 in the median."""
+    singular_values: float = 0.01
+    """Largest logarithm of a singular value of a turn, for the focal length that fits most pairs.
+    Pairs of turned photos have 0.005 or less: half of it is the step of `FOCALS`, the rest what the
+    principal point and a lens may do. Parts of one photo, as a camera takes them that moves along a
+    plane without turning, have 0.02 or more."""
+    share: float = 0.75
+    """Photos are from one place if at least this share of the pairs differs by a turn only: all
+    pairs of turned photos do, and 0 to 33 % of those of other sets."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class TrustLimits:
     """Which pairs are trusted."""
 
@@ -136,5 +166,6 @@ class RegisterLimits:
     full size: those with which it has most matches."""
 
 
-UPRIGHT, TRUST, ORDER = UprightLimits(), TrustLimits(), OrderLimits()
+UPRIGHT, ONE_PLACE = UprightLimits(), OnePlaceLimits()
+TRUST, ORDER = TrustLimits(), OrderLimits()
 CHECK, POSE_AMBIGUITY, REGISTER = CheckLimits(), PoseAmbiguityLimits(), RegisterLimits()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.map_options import MapOptions
+from jaxsfm.colmap.mapper import LOW_ANGLE_DEG
 from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
@@ -27,6 +28,7 @@ from jaxsfm.sfm.check.check_model import CHECKED_BY, MIN_CHECKED_POINTS, Checked
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
+from jaxsfm.sfm.one_place import from_one_place
 
 if TYPE_CHECKING:
     import pycolmap
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 DATABASE, SPARSE, ALTERNATIVE = "database.db", "sparse", "alternative"
 FIGURES = "figures.msgpack"
 """What a stage leaves beside its models."""
-FORMAT = 23
+FORMAT = 24
 """The version of what the stages leave. It is part of their keys, so that stages of another version
 are not used."""
 
@@ -82,6 +84,16 @@ class VerificationFigures:
     """Number of two-view inliers, by pair that has any."""
     angles: dict[Pair, float]
     """Degrees at which the rays of a verified pair's points meet (median); 0: unknown."""
+    one_place: bool = False
+    """Whether all photos were taken from one place."""
+
+    @property
+    def no_depth(self) -> bool:
+        """Whether nothing gives depth: photos from one place, or something that stays as it is in
+        all of them. The mapper has no pair to start from then, at whatever size photos are
+        matched."""
+        known = [angle for angle in self.angles.values() if angle > 0]
+        return self.one_place or (bool(known) and max(known) < LOW_ANGLE_DEG)
 
 
 class VerifiedStage(NamedTuple):
@@ -129,6 +141,7 @@ def verify_matches(given: MatchedPhotos, kept: StageCache) -> VerifiedStage:
       UserError: COLMAP fails.
     """
     config, options = given.config, given.options
+    photos = Photos(given.images, given.described)
 
     def compute(folder: Path) -> None:
         write_database(folder / DATABASE, given.images, given.matches, given.cameras)
@@ -137,16 +150,16 @@ def verify_matches(given: MatchedPhotos, kept: StageCache) -> VerifiedStage:
         figures = VerificationFigures(
             verified={pair: view.geometry.num_inliers for pair, view in views.items()},
             angles={pair: view.tri_angle_deg for pair, view in views.items()},
+            one_place=config.checked and from_one_place(folder / DATABASE, photos),
         )
         write_figures(folder / FIGURES, figures)
 
     by_image = [[image.name, image.content, image.size] for image in given.images]
     camera = given.cameras.plain()
-    settings = [options.seed, options.threads, options.scale, config.view_graph]
+    settings = [options.seed, options.threads, options.scale, config.view_graph, config.checked]
     key = digest(kept.matches_key, FORMAT, by_image, camera, settings, package_versions())
     folder = kept.folder.stage("verified", key, compute)
     views = read_two_views(folder / DATABASE)
-    photos = Photos(given.images, given.described)
     pairs = VerifiedPairs(folder / DATABASE, views, given.matches, photos)
     return VerifiedStage(read_figures(folder / FIGURES, VerificationFigures), pairs, key)
 

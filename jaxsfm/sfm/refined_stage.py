@@ -45,6 +45,14 @@ class Reconstructed:
     refinement: list[RefinementFigures | None]
     """For each model; None where it was not refined."""
 
+    @classmethod
+    def nothing(cls, verification: VerificationFigures) -> "Reconstructed":
+        """No model of verified matches."""
+        mapping = MappingFigures(verdicts={}, attempts=[], checks=[])
+        return cls(
+            verification=verification, mapping=mapping, models=[], alternative=[], refinement=[]
+        )
+
 
 class RefinedFigures(NamedTuple):
     """What a stage leaves beside refined models."""

@@ -8,6 +8,7 @@ written. A step in `Step` can be skipped by name, which says what it is worth (`
 
 import contextlib
 import logging
+import shutil
 import tempfile
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
@@ -72,8 +73,11 @@ def walk(
     """
     watch = watch or Watch()
     with watch.stage("mapping"):
-        # 3. Let COLMAP verify each pair.
+        # 3. Let COLMAP verify each pair. Photos from one place give no model.
         verified = verify_matches(given, kept)
+        if verified.figures.one_place:
+            shutil.copyfile(verified.pairs.database, database)
+            return Reconstructed.nothing(verified.figures)
         mapper = mapper_of(given, verified)
         # 4. Trust the pairs on which most others agree.
         trust = mapper.trust_votes()

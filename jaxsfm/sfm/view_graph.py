@@ -178,7 +178,8 @@ def _grow(
     """Camera rotations (world to camera). Each connected group of images has a world of its own."""
     names = sorted({image for pair in ranked for image in pair})
     index = {name: k for k, name in enumerate(names)}
-    ends = np.asarray([[index[a], index[b]] for a, b in ranked]).reshape(-1, 2)
+    joined = [(index[a], index[b]) for a, b in ranked]
+    ends = np.asarray(joined).reshape(-1, 2)
     relative = np.asarray([_rotation(pair, geometries) for pair in ranked]).reshape(-1, 3, 3)
     votes = np.asarray([edge_weight[pair] for pair in ranked])
     rotations = np.tile(np.eye(3), (len(names), 1, 1))
@@ -187,10 +188,10 @@ def _grow(
     # The pairs between any two groups that vote, the strongest first, are kept, not searched for
     # each time: the search took 49 of the 79 s that the view graph of 10 000 photos needed.
     between: list[dict[int, list[int]]] = [{} for _ in names]
-    for rank, (i, j) in enumerate(ends.tolist()):
+    for rank, (i, j) in enumerate(joined):
         between[i].setdefault(j, []).append(rank)
         between[j][i] = between[i][j]
-    for i, j in ends.tolist():
+    for i, j in joined:
         a, b = group[i], group[j]
         if a == b:
             continue

@@ -5,15 +5,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 from hypothesis import given, settings
 from strategies import rng_of, seeds
 from tolerances import ALIGNED_PX
 
-from jaxsfm.core.align import Templates, align, make_templates, square_patch
-from jaxsfm.core.interpolate import pixels, sample, sample_linear, slopes
+from jaxsfm.core import align as core
+from jaxsfm.core import interpolate
 
+align, make_templates = compiled(core.align, "iterations"), compiled(core.make_templates)
+square_patch = compiled(core.square_patch, "radius")
+sample, sample_linear = compiled(interpolate.sample), compiled(interpolate.sample_linear)
 SIZE = (64, 80)
-PATCH = square_patch(7)
+PATCH = square_patch(radius=7)
 
 
 def texture(rng, channels: int = 1):
@@ -42,10 +46,10 @@ def views(rng, *, channels: int = 1):
 
 
 def run(one, two, ref, a, start, *, patch=PATCH, size=SIZE, **options):
-    size = jnp.asarray(size, jnp.int32)
-    ref, start, a = (jnp.asarray(v, jnp.float32)[None] for v in (ref, start, a))
-    templates = make_templates(jnp.asarray(one, jnp.float32), size, ref, patch)
-    return align(jnp.asarray(two, jnp.float32), size, templates, start, a, patch, **options)
+    size = np.int32(size)
+    one, two, ref, start, a = map(np.float32, (one, two, ref[None], start[None], a[None]))
+    templates = make_templates(one, size, ref, patch)
+    return align(two, size, templates, start, a, patch, **options)
 
 
 def error(result, truth) -> float:
@@ -150,8 +154,8 @@ def test_the_stated_deviation_is_the_real_one():
 def test_what_looks_like_gain_or_offset_is_no_information():
     """Templates' derivatives have no part along the patch itself (gain) or a constant (offset)."""
     one, _, ref, _, _ = views(rng_of(11), channels=3)
-    at = jnp.asarray(np.stack([ref, ref + 3.5]), jnp.float32)
-    t = make_templates(jnp.asarray(one, jnp.float32), jnp.asarray(SIZE, jnp.int32), at, PATCH)
+    at = np.float32([ref, ref + 3.5])
+    t = make_templates(np.float32(one), np.int32(SIZE), at, PATCH)
     values, descent = np.asarray(t.values, np.float64), np.asarray(t.descent, np.float64)
     w, size = np.asarray(PATCH.weights), np.abs(descent).max()
     np.testing.assert_allclose(np.einsum("q,nqck->nck", w, descent) / size, 0, atol=1e-6)
@@ -165,8 +169,9 @@ def test_a_shift_that_is_only_a_change_of_gain_leaves_the_place_open():
     """exp(x / 5) moved along x is itself times a number: nothing tells where it lies along x."""
     x, y = grid()[..., 0], grid()[..., 1]
     image = np.exp((x - 40) / 5) * (2 + np.cos(y / 2))
-    size, at = jnp.asarray(SIZE, jnp.int32), jnp.asarray([[40.0, 32.0]], jnp.float32)
-    t = make_templates(jnp.asarray(image[..., None], jnp.float32), size, at, PATCH)
+    t = make_templates(
+        np.float32(image[..., None]), np.int32(SIZE), np.float32([[40.0, 32.0]]), PATCH
+    )
     hessian = np.asarray(t.hessian[0])
     assert hessian[0, 0] < 1e-3 * hessian[1, 1]
 
@@ -175,9 +180,7 @@ def test_templates_descend_as_their_values_do():
     """The derivative, from the texture's own: per pixel, before gain and offset are taken out."""
     rng = rng_of(12)
     f, ref = texture(rng), np.asarray([40.0, 32.0])
-    size = jnp.asarray(SIZE, jnp.int32)
-    at = jnp.asarray(ref, jnp.float32)[None]
-    t = make_templates(jnp.asarray(f(grid()), jnp.float32), size, at, PATCH)
+    t = make_templates(np.float32(f(grid())), np.int32(SIZE), np.float32(ref[None]), PATCH)
     places = ref + np.asarray(PATCH.offsets, np.float64)
     w = np.asarray(PATCH.weights, np.float64)
     values = f(places)
@@ -217,12 +220,10 @@ def test_a_batch_is_its_members():
     rng = rng_of(5)
     one, two, ref, a, truth = views(rng)
     starts = truth + rng.uniform(-1, 1, (6, 2))
-    size = jnp.asarray(SIZE, jnp.int32)
-    refs = jnp.asarray(np.tile(ref, (6, 1)), jnp.float32)
-    templates = make_templates(jnp.asarray(one, jnp.float32), size, refs, PATCH)
-    affine = jnp.asarray(np.tile(a, (6, 1, 1)), jnp.float32)
-    image = jnp.asarray(two, jnp.float32)
-    batch = align(image, size, templates, jnp.asarray(starts, jnp.float32), affine, PATCH)
+    size, refs = np.int32(SIZE), np.float32(np.tile(ref, (6, 1)))
+    templates = make_templates(np.float32(one), size, refs, PATCH)
+    affine = np.float32(np.tile(a, (6, 1, 1)))
+    batch = align(np.float32(two), size, templates, np.float32(starts), affine, PATCH)
     for k, start in enumerate(starts):
         alone = run(one, two, ref, a, start)
         np.testing.assert_allclose(batch.xy[k], alone.xy[0], atol=1e-4)
@@ -230,9 +231,9 @@ def test_a_batch_is_its_members():
 
 def test_sampling_is_exact_on_pixels_and_parabolas_and_clamped_outside():
     rng = rng_of(0)
-    image = jnp.asarray(rng.normal(size=(5, 6, 2)), jnp.float32)
-    size = jnp.asarray([5, 6], jnp.int32)
-    at = jnp.asarray([[0.0, 0.0], [5.0, 4.0], [2.0, 3.0], [-3.0, 2.0], [7.0, 9.0]], jnp.float32)
+    image = np.float32(rng.normal(size=(5, 6, 2)))
+    size = np.int32([5, 6])
+    at = np.float32([[0.0, 0.0], [5.0, 4.0], [2.0, 3.0], [-3.0, 2.0], [7.0, 9.0]])
     values, inside = sample(image, size, at)
     np.testing.assert_array_equal(np.asarray(inside), [True, True, True, False, False])
     np.testing.assert_allclose(values[0], image[0, 0])
@@ -241,23 +242,38 @@ def test_sampling_is_exact_on_pixels_and_parabolas_and_clamped_outside():
     np.testing.assert_allclose(values[3], image[2, 0], rtol=1e-6)
     np.testing.assert_allclose(values[4], image[4, 5], rtol=1e-6)
     y, x = np.mgrid[:9, :9].astype(np.float32)
-    parabola = jnp.asarray((0.3 * x * x - y * y + x * y)[..., None])
-    at = jnp.asarray([[2.3, 4.8], [5.5, 3.25]], jnp.float32)
+    parabola = np.float32(0.3 * x * x - y * y + x * y)[..., None]
+    at = np.float32([[2.3, 4.8], [5.5, 3.25]])
     want = 0.3 * at[:, 0] ** 2 - at[:, 1] ** 2 + at[:, 0] * at[:, 1]
-    got = sample(parabola, jnp.asarray([9, 9], jnp.int32), at)[0][:, 0]
+    got = sample(parabola, np.int32([9, 9]), at)[0][:, 0]
     np.testing.assert_allclose(got, want, rtol=1e-5)
 
 
 def test_bilinear_sampling_is_exact_on_pixels_and_planes_and_clamped_outside():
     rng = rng_of(0)
-    image = jnp.asarray(rng.normal(size=(5, 6, 2)), jnp.float32)
-    size = jnp.asarray([4, 5], jnp.int32)  # the last row and column are padding
-    at = jnp.asarray([[0.0, 0.0], [4.0, 3.0], [-3.0, 2.0], [7.0, 9.0], [3.5, 0.25]], jnp.float32)
+    image = np.float32(rng.normal(size=(5, 6, 2)))
+    size = np.int32([4, 5])  # the last row and column are padding
+    at = np.float32([[0.0, 0.0], [4.0, 3.0], [-3.0, 2.0], [7.0, 9.0], [3.5, 0.25]])
     got = sample_linear(image, size, at)
-    want = jnp.stack([image[0, 0], image[3, 4], image[2, 0], image[3, 4]])
+    want = np.stack([image[0, 0], image[3, 4], image[2, 0], image[3, 4]])
     np.testing.assert_allclose(got[:4], want, rtol=1e-6)
     between = 0.375 * image[0, 3:5].sum(0) + 0.125 * image[1, 3:5].sum(0)
     np.testing.assert_allclose(got[4], between, rtol=1e-5)
+
+
+@jax.jit
+def pixels_slopes_and_samples(image, size, at, outside):
+    """Of a map, at whole pixels; samples half a pixel around them, by axis; pixels outside."""
+    place = at.astype(jnp.float32)
+    half = 0.5 * np.eye(2, dtype=np.float32)
+    around = [[interpolate.sample(image, size, place + s * h)[0] for s in (1, -1)] for h in half]
+    return (
+        interpolate.pixels(image, size, at, jnp.float32),
+        interpolate.sample(image, size, place)[0],
+        interpolate.slopes(image, size, at, jnp.float32),
+        around,
+        interpolate.pixels(image, size, outside, jnp.float32),
+    )
 
 
 @given(seeds)
@@ -265,19 +281,15 @@ def test_bilinear_sampling_is_exact_on_pixels_and_planes_and_clamped_outside():
 def test_pixels_and_slopes_are_what_cubic_sampling_gives(seed):
     """Inside; a slope at the edge would look outside."""
     rng = rng_of(seed)
-    image = jnp.asarray(rng.normal(size=(9, 11, 2)), jnp.float32)
-    size = jnp.asarray([9, 11], jnp.int32)
-    at = jnp.asarray(rng.integers([2, 2], [9, 7], (6, 2)), jnp.int32)
-    place = at.astype(jnp.float32)
-    np.testing.assert_array_equal(
-        pixels(image, size, at, jnp.float32), sample(image, size, place)[0]
+    image, size = np.float32(rng.normal(size=(9, 11, 2))), np.int32([9, 11])
+    at = np.int32(rng.integers([2, 2], [9, 7], (6, 2)))
+    values, sampled, slope, around, outside = jax.device_get(
+        pixels_slopes_and_samples(image, size, at, np.int32([[-4, 3], [20, 30]]))
     )
-    slope = slopes(image, size, at, jnp.float32)
-    for axis, half in enumerate(0.5 * jnp.eye(2, dtype=jnp.float32)):
-        want = sample(image, size, place + half)[0] - sample(image, size, place - half)[0]
-        np.testing.assert_allclose(slope[..., axis], want, atol=1e-5)
-    outside = pixels(image, size, jnp.asarray([[-4, 3], [20, 30]], jnp.int32), jnp.float32)
-    np.testing.assert_array_equal(outside, jnp.stack([image[3, 0], image[8, 10]]))
+    np.testing.assert_array_equal(values, sampled)
+    for axis, (after, before) in enumerate(around):
+        np.testing.assert_allclose(slope[..., axis], after - before, atol=1e-5)
+    np.testing.assert_array_equal(outside, np.stack([image[3, 0], image[8, 10]]))
 
 
 def alike_in_part(rng, share: float, count: int):
@@ -297,15 +309,15 @@ def test_patches_that_are_alike_only_in_part_converge_as_soon(share, least):
     """Their scores are 0.84 and 0.73. Without corrections of the system, 85 and 63 of 100 come
     within a hundredth of a pixel of where many steps end, instead of 97 and 91."""
     one, two, places = alike_in_part(rng_of(1), share, 96)
-    size = jnp.asarray(one.shape[:2], jnp.int32)
-    one, two, at = (jnp.asarray(v, jnp.float32) for v in (one, two, places))
-    same = jnp.broadcast_to(jnp.eye(2, dtype=jnp.float32), (len(places), 2, 2))
+    size = np.int32(one.shape[:2])
+    one, two, at = map(np.float32, (one, two, places))
+    same = np.tile(np.eye(2, dtype=np.float32), (len(places), 1, 1))
     templates = make_templates(one, size, at, PATCH)
     found, end = (
         align(two, size, templates, at + 1.5, same, PATCH, **steps)
         for steps in ({}, {"iterations": 80})
     )
-    away = np.linalg.norm(np.asarray(found.xy) - np.asarray(end.xy), axis=1)
+    away = np.linalg.norm(found.xy - end.xy, axis=1)
     assert (away < 0.01).mean() > least
 
 
@@ -320,9 +332,9 @@ def test_where_a_keypoint_ends_follows_the_map_and_its_gradient_is_finite():
     pixels = jnp.asarray(grid(), jnp.float32)
 
     def end(t, image):
-        moved = sample(image, size, pixels - t)[0]
-        templates = make_templates(one, size, at, PATCH)
-        return align(moved, size, templates, at, affine, PATCH).xy[0]
+        moved = interpolate.sample(image, size, pixels - t)[0]
+        templates = core.make_templates(one, size, at, PATCH)
+        return core.align(moved, size, templates, at, affine, PATCH).xy[0]
 
     jacobian = jax.jacobian(end)(jnp.asarray([0.3, -0.4], jnp.float32), one)
     np.testing.assert_allclose(jacobian, np.eye(2), atol=0.1)
@@ -334,38 +346,32 @@ def test_where_a_keypoint_ends_follows_the_map_and_its_gradient_is_finite():
 def test_gradients_with_respect_to_keypoints_vanish_once_converged():
     """The end does not depend on the start: its derivative is finite and near zero."""
     one, two, ref, a, truth = views(rng_of(6))
-    size = jnp.asarray(SIZE, jnp.int32)
-    templates = make_templates(
-        jnp.asarray(one, jnp.float32), size, jnp.asarray(ref, jnp.float32)[None], PATCH
-    )
+    size = np.int32(SIZE)
+    templates = make_templates(np.float32(one), size, np.float32(ref[None]), PATCH)
 
     def end(start):
-        image = jnp.asarray(two, jnp.float32)
-        affine = jnp.asarray(a, jnp.float32)[None]
-        return align(image, size, templates, start[None], affine, PATCH).xy[0]
+        image, affine = np.float32(two), np.float32(a[None])
+        return core.align(image, size, templates, start[None], affine, PATCH).xy[0]
 
-    jacobian = jax.jacobian(end)(jnp.asarray(truth + 0.4, jnp.float32))
-    assert jnp.isfinite(jacobian).all() and jnp.abs(jacobian).max() < 0.05
+    jacobian = compiled(jax.jacobian(end))(np.float32(truth + 0.4))
+    assert np.isfinite(jacobian).all() and np.abs(jacobian).max() < 0.05
 
 
 def test_templates_are_normalised_and_a_patch_weighs_one():
     one, _, ref, _, _ = views(rng_of(7), channels=3)
-    size = jnp.asarray(SIZE, jnp.int32)
-    t = make_templates(
-        jnp.asarray(one, jnp.float32), size, jnp.asarray(ref, jnp.float32)[None], PATCH
-    )
-    assert isinstance(t, Templates)
+    t = make_templates(np.float32(one), np.int32(SIZE), np.float32(ref[None]), PATCH)
+    assert isinstance(t, core.Templates)
     w = PATCH.weights
     np.testing.assert_allclose(w.sum(), 1, rtol=1e-5)
-    np.testing.assert_allclose(jnp.einsum("q,nqc->nc", w, t.values), np.zeros((1, 3)), atol=1e-5)
-    np.testing.assert_allclose(jnp.einsum("q,nqc->n", w, t.values**2), [1.0], rtol=1e-4)
+    np.testing.assert_allclose(np.einsum("q,nqc->nc", w, t.values), np.zeros((1, 3)), atol=1e-5)
+    np.testing.assert_allclose(np.einsum("q,nqc->n", w, t.values**2), [1.0], rtol=1e-4)
     with pytest.raises(ValueError, match="radius"):
-        square_patch(0)
+        core.square_patch(0)
 
 
 @pytest.mark.parametrize("radius", [2, 3])
 def test_weights_of_a_patch_fall_like_a_gaussian_around_its_centre(radius):
-    patch = square_patch(radius)
+    patch = square_patch(radius=radius)
     side = 2 * radius + 1
     weights = np.asarray(patch.weights, np.float64).reshape(side, side)
     steps = np.arange(side) - radius

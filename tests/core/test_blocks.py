@@ -9,13 +9,15 @@ import numpy as np
 import oracles
 import pytest
 import tolerances
+from compiled import compiled
 from strategies import rng_of
 
 from jaxsfm.core import blocks
 from jaxsfm.core.blocks import Layer
 from jaxsfm.core.scores import Head
 
-SIZES = jnp.asarray([[40, 24], [27, 19]], jnp.int32)
+SIZES = np.int32([[40, 24], [27, 19]])
+clear_padding = compiled(blocks.clear_padding)
 
 
 @pytest.fixture
@@ -36,22 +38,19 @@ def way(monkeypatch):
 def layers(rng, *channels: int) -> list[Layer]:
     def layer(inputs, outputs):
         kernel = rng.normal(size=(3, 3, inputs, outputs)) / (3 * inputs**0.5)
-        return Layer(
-            jnp.asarray(kernel, jnp.float32),
-            jnp.asarray(rng.normal(size=outputs) / 10, jnp.float32),
-        )
+        return Layer(np.float32(kernel), np.float32(rng.normal(size=outputs) / 10))
 
     return [layer(*each) for each in zip(channels, channels[1:], strict=False)]
 
 
 def images(rng, channels: int):
     x = rng.normal(size=(2, 40, 24, channels)).astype(np.float32)
-    return blocks.clear_padding(jnp.asarray(x), SIZES)
+    return clear_padding(x, SIZES)
 
 
 def head_of(rng, channels: int) -> Head:
     shapes = ((channels, 4), (4,), (4,), (8, 8))
-    return Head(*(jnp.asarray(rng.normal(size=s) / 4, jnp.float32) for s in shapes))
+    return Head(*(np.float32(rng.normal(size=s) / 4) for s in shapes))
 
 
 def score_of(x: np.ndarray, head: Head | None) -> np.ndarray:
@@ -67,7 +66,7 @@ def score_of(x: np.ndarray, head: Head | None) -> np.ndarray:
 
 def assert_close(ours, expected):
     scale = np.abs(expected).max()
-    np.testing.assert_allclose(np.asarray(ours) / scale, expected / scale, **tolerances.FEATURES)
+    np.testing.assert_allclose(ours / scale, expected / scale, **tolerances.FEATURES)
 
 
 @pytest.mark.parametrize("name", ["cpu", "default"])
@@ -78,17 +77,17 @@ def test_a_block_is_its_convolutions_one_after_the_other(way, name, learned):
     first, second = stack = layers(rng, 3, 6, 5)
     x, head = images(rng, 3), head_of(rng, 5) if learned else None
     way(name)
-    run = jax.jit(lambda x: blocks.scores_and_pool(x, SIZES, stack, large=True, head=head))
-    scores, pooled = run(x)
-    for i, (rows, cols) in enumerate(np.asarray(SIZES)):
-        one = oracles.convolution(np.asarray(x[i, :rows, :cols]), *map(np.asarray, first))
-        two = oracles.convolution(np.maximum(one, 0), *map(np.asarray, second))
+    run = compiled(lambda *given, head: blocks.scores_and_pool(*given, large=True, head=head))
+    scores, pooled = run(x, SIZES, stack, head=head)
+    for i, (rows, cols) in enumerate(SIZES):
+        one = oracles.convolution(x[i, :rows, :cols], *first)
+        two = oracles.convolution(np.maximum(one, 0), *second)
         assert_close(scores[i, :rows, :cols], score_of(two, head))
         expected = oracles.max_pool(np.maximum(two, 0))
         assert_close(pooled[i, : rows // 2, : cols // 2], expected)
-        assert not np.asarray(scores[i, rows:]).any() and not np.asarray(scores[i, :, cols:]).any()
-        assert not np.asarray(pooled[i, rows // 2 :]).any()
-        assert not np.asarray(pooled[i, :, cols // 2 :]).any()
+        assert not scores[i, rows:].any() and not scores[i, :, cols:].any()
+        assert not pooled[i, rows // 2 :].any()
+        assert not pooled[i, :, cols // 2 :].any()
 
 
 def whole_numbers(rng, *channels: int):
@@ -96,9 +95,9 @@ def whole_numbers(rng, *channels: int):
     kernels = [
         rng.integers(-1, 2, (3, 3, *each)) for each in zip(channels, channels[1:], strict=False)
     ]
-    stack = [Layer(jnp.asarray(k, jnp.float32), jnp.ones(k.shape[3], jnp.float32)) for k in kernels]
-    x = jnp.asarray(rng.integers(-2, 3, (2, 40, 24, channels[0])), jnp.float32)
-    return stack, blocks.clear_padding(x, SIZES)
+    stack = [Layer(np.float32(k), np.ones(k.shape[3], np.float32)) for k in kernels]
+    x = np.float32(rng.integers(-2, 3, (2, 40, 24, channels[0])))
+    return stack, clear_padding(x, SIZES)
 
 
 @pytest.mark.optimized
@@ -111,12 +110,10 @@ def test_whole_maps_and_strips_are_equal_bit_for_bit(way, monkeypatch, bfloat16)
         if (name, large) != ("cpu", True):
             monkeypatch.setattr(blocks, "_strips", None)
         run = jax.jit(
-            lambda x, large: blocks.scores_and_pool(
-                x, SIZES, stack, large=large, bfloat16=bfloat16
-            ),
-            static_argnums=1,
+            lambda *given, large: blocks.scores_and_pool(*given, large=large, bfloat16=bfloat16),
+            static_argnames="large",
         )
-        made.append(run(x, large))
+        made.append(run(x, SIZES, stack, large=large))
     for scores, pooled in made[1:]:
         np.testing.assert_array_equal(scores, made[0][0])
         np.testing.assert_array_equal(pooled, made[0][1])
@@ -149,18 +146,16 @@ def test_deep_layers_are_the_plain_sum_on_either_platform(way, monkeypatch, bflo
     conv3x3 = blocks.conv3x3
     monkeypatch.setattr(blocks, "conv3x3", lambda *a: (used.append(1), conv3x3(*a))[1])
     for shape, deep in (((1, 10, 9, 4), True), ((1, 10, 8, 4), False)):
-        x = jnp.asarray(rng.normal(size=shape), jnp.float32)
-        operands = [np.asarray(x[0]), np.asarray(layer.kernel)]
+        x = np.float32(rng.normal(size=shape))
+        operands = [x[0], layer.kernel]
         if bfloat16:
-            operands = [
-                np.asarray(jnp.asarray(a).astype(jnp.bfloat16).astype(jnp.float32))
-                for a in operands
-            ]
-        expected = oracles.convolution(*operands, np.asarray(layer.bias))
+            operands = [a.astype(jnp.bfloat16).astype(np.float32) for a in operands]
+        expected = oracles.convolution(*operands, layer.bias)
         for name in ("cpu", "default"):
             way(name)
             used.clear()
-            ours = np.asarray(blocks.conv(x, layer, bfloat16=bfloat16)[0])
+            conv = compiled(lambda *given: blocks.conv(*given, bfloat16=bfloat16))
+            ours = conv(x, layer)[0]
             scale = np.abs(expected).max()
             # The result too is rounded to bfloat16's eight bits: a 256th, and half of that.
             np.testing.assert_allclose(ours, expected, atol=scale / (400 if bfloat16 else 1e5))

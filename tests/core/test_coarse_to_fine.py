@@ -1,11 +1,10 @@
 """Laws of the windowed coarse-to-fine step and of one-to-one selection."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
 import tolerances
+from compiled import compiled
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import rng_of, seeds, unit_rows
@@ -13,6 +12,11 @@ from strategies import rng_of, seeds, unit_rows
 from jaxsfm.core import coarse_to_fine as c2f
 from jaxsfm.core.types import JoinedFeatures
 
+match_windows = compiled(c2f.match_windows, "chunk")
+correspondences = compiled(c2f.correspondences, "capacity")
+candidates = compiled(c2f.candidates)
+similarities = compiled(c2f.similarities, "chunk")
+one_to_one = compiled(c2f.one_to_one, "num_cells")
 GRIDS = [((4, 5), (8, 10)), ((4, 5), (9, 11)), ((3, 3), (6, 7)), ((5, 4), (10, 9))]
 N, M = 24, 128
 
@@ -23,11 +27,11 @@ def features(rng, coarse_grid, fine_grid) -> JoinedFeatures:
     fine[:used] = unit_rows(rng, used, 8)
     fine[rng.integers(0, used)] = 0  # a cell where nothing is seen
     return JoinedFeatures(
-        coarse=jnp.zeros((N, 8), jnp.float32),
-        fine=jnp.asarray(fine),
-        keypoints=jnp.zeros((M, 2), jnp.float32),
-        coarse_grid=jnp.asarray(coarse_grid, jnp.int32),
-        fine_grid=jnp.asarray(fine_grid, jnp.int32),
+        coarse=np.zeros((N, 8), np.float32),
+        fine=fine,
+        keypoints=np.zeros((M, 2), np.float32),
+        coarse_grid=np.int32(coarse_grid),
+        fine_grid=np.int32(fine_grid),
     )
 
 
@@ -39,10 +43,10 @@ def problem(seed, grids0, grids1):
     rows, cols = rng.permutation(n0), rng.permutation(n1)
     k = min(n0, n1) // 2
     coarse[rows[:k]] = cols[:k]
-    return f0, f1, jnp.asarray(coarse)
+    return f0, f1, coarse
 
 
-@jax.jit
+@compiled
 def run(f0, f1, coarse):
     table = c2f.candidates(c2f.match_windows(f0, f1, coarse, chunk=5), f0)
     return c2f.correspondences(table, capacity=1024)
@@ -50,7 +54,7 @@ def run(f0, f1, coarse):
 
 def as_list(f0, f1, coarse):
     cells, count = run(f0, f1, coarse)
-    return [tuple(row) for row in np.asarray(cells)[: int(count)].tolist()]
+    return [tuple(row) for row in cells[:count].tolist()]
 
 
 @settings(max_examples=40, deadline=None)
@@ -58,8 +62,7 @@ def as_list(f0, f1, coarse):
 def test_the_correspondences_are_those_of_a_plain_loop(seed, grids0, grids1):
     f0, f1, coarse = problem(seed, grids0, grids1)
     expected = oracles.coarse_to_fine(
-        np.asarray(coarse), np.asarray(f0.fine), np.asarray(f1.fine), *grids0[:1], *grids1[:1],
-        grids0[1], grids1[1],
+        coarse, f0.fine, f1.fine, *grids0[:1], *grids1[:1], grids0[1], grids1[1],
     )  # fmt: skip
     ours = as_list(f0, f1, coarse)
     assert set(ours) == expected
@@ -69,10 +72,10 @@ def test_the_correspondences_are_those_of_a_plain_loop(seed, grids0, grids1):
 def test_swapping_the_images_swaps_the_correspondences():
     f0, f1, coarse = problem(3, GRIDS[0], GRIDS[2])
     back = np.full(N, -1, np.int32)
-    for i, j in enumerate(np.asarray(coarse)):
+    for i, j in enumerate(coarse):
         if j >= 0:
             back[j] = i
-    swapped = {(j, i) for i, j in as_list(f1, f0, jnp.asarray(back))}
+    swapped = {(j, i) for i, j in as_list(f1, f0, back)}
     assert swapped == set(as_list(f0, f1, coarse))
 
 
@@ -86,40 +89,40 @@ def test_odd_last_rows_and_columns_are_never_matched():
 
 def test_no_coarse_matches_give_nothing():
     f0, f1, coarse = problem(0, GRIDS[0], GRIDS[0])
-    assert as_list(f0, f1, jnp.full_like(coarse, -1)) == []
+    assert as_list(f0, f1, np.full_like(coarse, -1)) == []
 
 
 def test_a_full_list_is_cut_and_says_so():
     f0, f1, coarse = problem(0, GRIDS[0], GRIDS[0])
-    table = c2f.candidates(c2f.match_windows(f0, f1, coarse), f0)
-    cells, count = c2f.correspondences(table, capacity=10)
-    assert int(count) > 10
-    np.testing.assert_array_equal(cells, c2f.correspondences(table, capacity=1024)[0][:10])
+    table = candidates(match_windows(f0, f1, coarse), f0)
+    cells, count = correspondences(table, capacity=10)
+    assert count > 10
+    np.testing.assert_array_equal(cells, correspondences(table, capacity=1024)[0][:10])
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 24])
 def test_the_chunk_size_changes_nothing(chunk):
     f0, f1, coarse = problem(5, GRIDS[0], GRIDS[1])
     np.testing.assert_array_equal(
-        c2f.match_windows(f0, f1, coarse, chunk=chunk), c2f.match_windows(f0, f1, coarse, chunk=5)
+        match_windows(f0, f1, coarse, chunk=chunk), match_windows(f0, f1, coarse, chunk=5)
     )
 
 
 def test_the_last_chunk_holds_the_last_matches():
     """Every cell is matched, so that the chunks end where the list does, or past it."""
     f0, f1, coarse = problem(5, GRIDS[0], GRIDS[0])
-    coarse = jnp.arange(len(coarse), dtype=jnp.int32) % 6
-    whole = c2f.match_windows(f0, f1, coarse, chunk=len(coarse))
+    coarse = np.arange(len(coarse), dtype=np.int32) % 6
+    whole = match_windows(f0, f1, coarse, chunk=len(coarse))
     for chunk in (5, 7, len(coarse) - 1):
-        np.testing.assert_array_equal(c2f.match_windows(f0, f1, coarse, chunk=chunk), whole)
+        np.testing.assert_array_equal(match_windows(f0, f1, coarse, chunk=chunk), whole)
 
 
 @pytest.mark.parametrize("found", [0, 1, 7, 8, 61, 100])
 def test_similarities_are_products_as_far_as_there_are_correspondences(found):
     f0, f1, _ = problem(5, GRIDS[0], GRIDS[2])
-    cells = jnp.asarray(rng_of(0).integers(0, 48, (61, 2)), jnp.int32)
-    ours = c2f.similarities(f0, f1, cells, jnp.int32(found), chunk=8)
-    expected = (np.asarray(f0.fine)[cells[:, 0]] * np.asarray(f1.fine)[cells[:, 1]]).sum(1)
+    cells = np.int32(rng_of(0).integers(0, 48, (61, 2)))
+    ours = similarities(f0, f1, cells, np.int32(found), chunk=8)
+    expected = (f0.fine[cells[:, 0]] * f1.fine[cells[:, 1]]).sum(1)
     np.testing.assert_allclose(ours[:found], expected[:found], **tolerances.UNIT)
 
 
@@ -130,9 +133,7 @@ def test_one_to_one_keeps_no_cell_twice_and_wastes_none(seed):
     cells = rng.integers(0, 12, (30, 2)).astype(np.int32)
     keep = rng.random(30) < 0.7
     score = rng.integers(0, 3, 30).astype(np.float32)
-    ours = np.asarray(
-        c2f.one_to_one(jnp.asarray(cells), jnp.asarray(keep), jnp.asarray(score), num_cells=12)
-    )
+    ours = one_to_one(cells, keep, score, num_cells=12)
     assert not (ours & ~keep).any()
     for side in (0, 1):
         assert len(set(cells[ours, side])) == ours.sum()
@@ -144,7 +145,7 @@ def test_one_to_one_keeps_no_cell_twice_and_wastes_none(seed):
 
 
 def test_one_to_one_with_equal_scores_keeps_the_first():
-    cells = jnp.asarray([[0, 1], [0, 2], [1, 1], [2, 2]], jnp.int32)
-    ours = c2f.one_to_one(cells, jnp.ones(4, bool), jnp.zeros(4), num_cells=3)
+    cells = np.int32([[0, 1], [0, 2], [1, 1], [2, 2]])
+    ours = one_to_one(cells, np.ones(4, bool), np.zeros(4, np.float32), num_cells=3)
     # (0, 1) is first for cell 0 and for cell 1 of image 1; (0, 2) has gone, so (2, 2) stays.
     np.testing.assert_array_equal(ours, [True, False, False, True])

@@ -2,26 +2,24 @@
 
 import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
 import tolerances
+from compiled import compiled
 
+from jaxsfm.core import retrieval
 from jaxsfm.core.retrieval import (
     NetVLADHead,
     Vocabulary,
     fit_vocabulary,
-    gem,
-    lloyd,
-    netvlad,
-    vlad,
-    whitened,
 )
 
 N, C, D, K = 30, 12, 6, 5
-fit = jax.jit(functools.partial(fit_vocabulary, words=4, directions=3))
+fit = compiled(functools.partial(fit_vocabulary, words=4, directions=3))
+gem = compiled(retrieval.gem, "power")
+vlad, netvlad = compiled(retrieval.vlad), compiled(retrieval.netvlad)
+lloyd, whitened = compiled(retrieval.lloyd), compiled(retrieval.whitened)
 
 
 def units(rng, n: int = N, c: int = C) -> np.ndarray:
@@ -46,16 +44,15 @@ def given() -> dict[str, np.ndarray]:
 
 
 def ours(given, kind: str, x: np.ndarray) -> np.ndarray:
-    make = {name: jnp.asarray(value) for name, value in given.items()}
     if kind == "gem":
-        return np.asarray(gem(jnp.asarray(x), power=3.0))
+        return gem(x, power=3.0)
     if kind == "vlad":
-        words = Vocabulary(make["mean"], make["whitening"], make["centres"])
-        return np.asarray(vlad(jnp.asarray(x), words))
+        words = Vocabulary(given["mean"], given["whitening"], given["centres"])
+        return vlad(x, words)
     head = NetVLADHead(
-        make["assignment"], make["net_centres"], make["net_whitening"], make["net_bias"]
+        given["assignment"], given["net_centres"], given["net_whitening"], given["net_bias"]
     )
-    return np.asarray(netvlad(jnp.asarray(x), head))
+    return netvlad(x, head)
 
 
 def expected(given, kind: str) -> np.ndarray:
@@ -102,15 +99,15 @@ def sample(n: int = 128, c: int = 8) -> np.ndarray:
 def test_centres_equal_those_of_an_obvious_k_means():
     x = sample(60, 4)
     start = np.r_[x[:5], [[9.0, 9, 9, 9]]].astype(np.float32)  # the last one is nobody's
-    found = lloyd(jnp.asarray(np.r_[x, np.zeros((7, 4), np.float32)]), jnp.asarray(start))
+    found = lloyd(np.r_[x, np.zeros((7, 4), np.float32)], start)
     np.testing.assert_allclose(found, oracles.lloyd(x, start, 25), rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(found[5], start[5])
 
 
 def test_directions_are_whitened_and_of_the_largest_variance(key):
     x = sample()
-    words = fit(key, jnp.asarray(x))
-    flat = (x - x.mean(0)) @ np.asarray(words.whitening)
+    words = fit(key, x)
+    flat = (x - x.mean(0)) @ words.whitening
     np.testing.assert_allclose(flat.T @ flat / len(x), np.eye(3), atol=1e-3)
     largest = np.linalg.eigvalsh(np.cov(x.T, bias=True))[-3:]
     np.testing.assert_allclose(np.linalg.norm(words.whitening, axis=0), largest**-0.5, rtol=1e-3)
@@ -119,23 +116,23 @@ def test_directions_are_whitened_and_of_the_largest_variance(key):
 def test_zero_rows_of_a_sample_do_not_count(key):
     x = sample(100)
     padded = np.r_[x, np.zeros((28, 8), np.float32)]
-    words = fit(key, jnp.asarray(padded))
+    words = fit(key, padded)
     np.testing.assert_allclose(words.mean, x.mean(0), rtol=1e-5)
-    alone = np.abs(fit(key, jnp.asarray(x)).whitening)  # axes have no sign
+    alone = np.abs(fit(key, x).whitening)  # axes have no sign
     np.testing.assert_allclose(np.abs(words.whitening), alone, rtol=1e-3, atol=1e-4)
     assert np.all(np.linalg.norm(words.centres, axis=1) > 0.1)
-    assert not np.any(whitened(jnp.asarray(padded), words)[100:])
+    assert not np.any(whitened(padded, words)[100:])
 
 
 def test_a_sample_that_lies_in_a_plane_or_in_a_point_gives_finite_words(key):
     flat = np.zeros((128, 8), np.float32)
     flat[:, :2] = sample(128, 2)
     for x in (flat, np.tile(flat[:1], (128, 1)), np.zeros((128, 8), np.float32)):
-        words = fit(key, jnp.asarray(x))
+        words = fit(key, x)
         assert all(np.isfinite(part).all() for part in words)
 
 
 @pytest.mark.parametrize("shape", [(3, 8), (50, 2)])
 def test_too_small_a_sample_is_an_error(key, shape):
     with pytest.raises(ValueError, match=f"4 rows of 3 channels; got {shape[0]} of {shape[1]}"):
-        fit_vocabulary(key, jnp.zeros(shape, jnp.float32), words=4, directions=3)
+        fit(key, np.zeros(shape, np.float32))

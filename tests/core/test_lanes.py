@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 from jax import lax
 
 from jaxsfm.core.lanes import anywhere, in_turn_on_cpus
@@ -21,13 +22,13 @@ def counted(calls):
 
 def test_it_is_its_argument_for_one_and_any_for_a_batch():
     for wanted in (False, True):
-        assert bool(anywhere(jnp.bool_(wanted))) == wanted
+        assert compiled(anywhere)(np.bool_(wanted)) == wanted
     table = np.asarray([[False, False], [False, True], [True, True]])
-    seen = jax.vmap(lambda x: anywhere(x))(jnp.asarray(table[:, 0]))
+    seen = compiled(jax.vmap(anywhere))(table[:, 0])
     assert seen.tolist() == [True] * 3
-    seen = jax.vmap(jax.vmap(anywhere))(jnp.asarray(table[:2] & False))
-    assert not np.asarray(seen).any()
-    assert np.asarray(jax.vmap(jax.vmap(anywhere))(jnp.asarray(table))).all()
+    twice = compiled(jax.vmap(jax.vmap(anywhere)))
+    assert not twice(table & False).any()
+    assert twice(table).all()
 
 
 @pytest.mark.parametrize("wanted", [[False] * 3, [False, True, False]])
@@ -38,7 +39,7 @@ def test_a_branch_that_no_lane_wants_is_not_computed(wanted):
     def one(x, w):
         return lax.cond(anywhere(w), lambda: jnp.where(w, add(x), x), lambda: x)
 
-    found = jax.jit(jax.vmap(one))(jnp.arange(3), jnp.asarray(wanted))
+    found = jax.jit(jax.vmap(one))(np.arange(3), np.asarray(wanted))
     jax.effects_barrier()
     np.testing.assert_array_equal(found, np.arange(3) + np.asarray(wanted))
     assert bool(calls) == any(wanted)
@@ -52,12 +53,12 @@ def test_lanes_in_turn_are_the_function_with_and_without_batched_arguments():
 
     in_turn = in_turn_on_cpus(draw)
     keys = jax.random.split(jax.random.key(0), 6).reshape(2, 3)
-    pair = jnp.arange(6, dtype=jnp.float32).reshape(2, 3), jnp.float32(7)
+    pair = np.arange(6, dtype=np.float32).reshape(2, 3), np.float32(7)
     axes = 0, None, (0, None)
     for vmapped in (jax.vmap, lambda f, axes: jax.vmap(jax.vmap(f, axes), axes)):
         some = (keys, pair) if vmapped is not jax.vmap else (keys[0], (pair[0][0], pair[1]))
         ours, theirs = (
-            jax.jit(vmapped(f, axes))(some[0], jnp.float32(2), some[1]) for f in (in_turn, draw)
+            compiled(vmapped(f, axes))(some[0], np.float32(2), some[1]) for f in (in_turn, draw)
         )
         for name in ("x", "y"):
             np.testing.assert_array_equal(ours[name], theirs[name])
@@ -70,7 +71,7 @@ def test_on_a_cpu_each_lane_of_a_loop_takes_its_own_turns_only():
     def count_to(end):
         return lax.while_loop(lambda x: x < end, add, jnp.int32(0))
 
-    ends = jnp.asarray([1, 6, 0], jnp.int32)
+    ends = np.int32([1, 6, 0])
     found = jax.jit(jax.vmap(in_turn_on_cpus(count_to)))(ends)
     jax.effects_barrier()
     np.testing.assert_array_equal(found, ends)

@@ -3,15 +3,17 @@
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from compiled import compiled
 from strategies import rng_of
 
-from jaxsfm.core.naive import descend, match_naively
+from jaxsfm.core import naive
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.types import JoinedFeatures, Status, Thresholds
+
+descend, match_naively = compiled(naive.descend), compiled(naive.match_naively, "shape")
 
 
 def maps_of(rng, rows, columns, levels):
@@ -43,12 +45,7 @@ def test_a_match_goes_to_the_most_similar_children(seed):
     maps0, maps1 = maps_of(rng, 4, 5, 3), maps_of(rng, 3, 6, 3)
     cells0 = rng.integers([4, 5], size=(30, 2))
     cells1 = rng.integers([3, 6], size=(30, 2))
-    ours = descend(
-        [jnp.asarray(m) for m in maps0],
-        [jnp.asarray(m) for m in maps1],
-        jnp.asarray(cells0, jnp.int32),
-        jnp.asarray(cells1, jnp.int32),
-    )
+    ours = descend(maps0, maps1, np.int32(cells0), np.int32(cells1))
     for k in range(30):
         expected = slow_descent(maps0, maps1, cells0[k], cells1[k])
         np.testing.assert_array_equal([ours[0][k], ours[1][k]], expected)
@@ -60,23 +57,21 @@ def test_a_shifted_image_is_matched_pixel_by_pixel():
     wide = [rng.normal(size=(rows << k, (columns + shift) << k, 8)) for k in range(5)]
 
     def side(first):
-        maps = [jnp.asarray(m[:, first << k :][:, : columns << k]) for k, m in enumerate(wide)]
-        rows_of = [np.asarray(m).reshape(-1, 8) for m in maps[:2]]
-        flat = [jnp.asarray([oracles.length_one(x) for x in m], jnp.float32) for m in rows_of]
-        grids = [jnp.asarray([rows << k, columns << k], jnp.int32) for k in range(2)]
-        keypoints = jnp.zeros((len(flat[1]), 2), jnp.float32)
+        maps = [np.float32(m[:, first << k :][:, : columns << k]) for k, m in enumerate(wide)]
+        flat = [np.float32([oracles.length_one(x) for x in m.reshape(-1, 8)]) for m in maps[:2]]
+        grids = [np.int32([rows << k, columns << k]) for k in range(2)]
+        keypoints = np.zeros((len(flat[1]), 2), np.float32)
         features = JoinedFeatures(flat[0], flat[1], keypoints, grids[0], grids[1])
-        return features, [m.astype(jnp.float32) for m in maps[2:]]
+        return features, maps[2:]
 
     (f0, maps0), (f1, maps1) = side(0), side(shift)
     limits = Thresholds(np.float32(1.0), np.int32(26), np.float32(0.999))
     shape = PairShape(max_planes=1)
     found = match_naively(jax.random.key(0), (f0, f1), (maps0, maps1), limits, shape=shape)
     assert int(found.status) == Status.VERIFIED
-    kept = np.asarray(found.plane) >= 0
+    kept = found.plane >= 0
     xy0, xy1 = (
-        np.stack(np.divmod(np.asarray(found.cells)[kept, k], columns << 4)[::-1], axis=1)
-        for k in (0, 1)
+        np.stack(np.divmod(found.cells[kept, k], columns << 4)[::-1], axis=1) for k in (0, 1)
     )
     assert kept.sum() > 200
     np.testing.assert_array_equal(xy0 - xy1, np.tile([shift << 4, 0], (kept.sum(), 1)))

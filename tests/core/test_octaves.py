@@ -1,23 +1,24 @@
 """Laws of octaves: descriptors of smaller copies of the image, at the cells of the image."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
 import tolerances
+from compiled import compiled
 from described import compute_features
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import random_features, rng_of, seeds
 
 from jaxsfm.config import Config, preset
-from jaxsfm.core.octaves import halve, join_octaves, octave_capacity, smaller
+from jaxsfm.core import octaves as core
+from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.io.features import pad_features
 from jaxsfm.io.images import WorkingImage
 
-join = jax.jit(join_octaves)
+join, halve = compiled(core.join_octaves), compiled(core.halve)
+smaller = compiled(core.smaller, "octave")
 HALF = 0.5
 """An octave's products count half as much as those of the octave before."""
 SHAPES = [(8, 12), (5, 7), (9, 4), (1, 6), (3, 3)]
@@ -32,7 +33,7 @@ def test_joining_equals_interpolating_cell_by_cell(seed, shape, octaves):
         (joined.coarse, features.coarse, features.coarse_grid),
         (joined.fine, features.fine, features.fine_grid),
     ):
-        expected = oracles.join_octaves([np.asarray(x) for x in levels], np.asarray(grid), HALF)
+        expected = oracles.join_octaves(levels, grid, HALF)
         np.testing.assert_allclose(ours, expected, **tolerances.UNIT)
 
 
@@ -40,7 +41,7 @@ def test_joining_equals_interpolating_cell_by_cell(seed, shape, octaves):
 @given(seeds, st.sampled_from(SHAPES))
 def test_products_are_weighted_means_over_the_octaves(seed, shape):
     features = random_features(seed, shape, 3)
-    joined = np.asarray(join(features).coarse)
+    joined = join(features).coarse
     n = joined.shape[0]
     alive = joined.any(1)
     parts = joined.reshape(n, 3, -1)[alive]
@@ -62,7 +63,7 @@ def test_one_octave_is_left_as_it_is():
 
 def test_halving_takes_means_of_two_by_two_pixels():
     x = rng_of(1).random((6, 4, 3), np.float32)
-    ours = np.asarray(halve(jnp.asarray(x)))
+    ours = halve(x)
     np.testing.assert_allclose(ours[2, 1], x[4:6, 2:4].mean((0, 1)), **tolerances.UNIT)
     assert ours.shape == (3, 2, 3)
 
@@ -97,7 +98,7 @@ def test_a_smaller_image_is_had_without_describing_it(weights, photos):
     """All but the keypoints, which lie at the centres of their cells."""
     small = photos[2][:192, :256]
     whole = np.repeat(np.repeat(small, 2, axis=0), 2, axis=1)
-    ours = smaller(of(weights, whole, octaves=3), 1)
+    ours = smaller(of(weights, whole, octaves=3), octave=1)
     alone = of(weights, small, octaves=3)
     np.testing.assert_array_equal(ours.coarse_grid, alone.coarse_grid)
     np.testing.assert_array_equal(ours.fine_grid, alone.fine_grid)
@@ -114,7 +115,7 @@ def test_a_smaller_image_is_had_without_describing_it(weights, photos):
 @given(seeds, st.sampled_from([(8, 12), (5, 7), (9, 4)]), st.integers(0, 2))
 def test_lacking_octaves_add_nothing_to_a_product(seed, shape, octave):
     features = random_features(seed, shape, 3)
-    ours = join(smaller(features, octave))
+    ours = join(smaller(features, octave=octave))
     left = features._replace(
         coarse=features.coarse[octave:],
         fine=features.fine[octave:],
@@ -124,13 +125,13 @@ def test_lacking_octaves_add_nothing_to_a_product(seed, shape, octave):
     for few, all_of_them in ((join(left).coarse, ours.coarse), (join(left).fine, ours.fine)):
         channels = few.shape[1]
         np.testing.assert_allclose(all_of_them[:, :channels], few, **tolerances.UNIT)
-        assert not np.asarray(all_of_them[:, channels:]).any()
+        assert not all_of_them[:, channels:].any()
 
 
 @pytest.mark.parametrize("octave", [-1, 3])
 def test_an_image_has_no_octave_beyond_its_last(octave):
     with pytest.raises(ValueError, match="0..2"):
-        smaller(random_features(0, (8, 12), 3), octave)
+        smaller(random_features(0, (8, 12), 3), octave=octave)
 
 
 @pytest.mark.slow

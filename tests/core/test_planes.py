@@ -7,14 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from compiled import compiled
 from strategies import random_homography, rng_of
 
 from jaxsfm.config import PairShape
-from jaxsfm.core.planes import nearest_plane, settle
+from jaxsfm.core import planes as core
 from jaxsfm.core.ransac import peel_planes
 from jaxsfm.core.types import Correspondences, Thresholds
 
-peel = jax.jit(peel_planes, static_argnames=("shape",))
+peel = compiled(peel_planes, "shape")
+settle, nearest_plane = compiled(core.settle, "rounds"), compiled(core.nearest_plane)
 LIMITS = Thresholds(np.float32(4), np.int32(20), np.float32(0.999))
 GREEDY = PairShape(local_refits=4)
 FAIR = dataclasses.replace(GREEDY, plane_rounds=10)
@@ -33,11 +35,10 @@ def two_walls(seed: int, angle: float, *, noise: float = 0.5, outliers: int = 60
     xy0 = np.concatenate([*xy0, off[0]])
     xy1 = np.concatenate([*xy1, off[1]]) + rng.normal(size=xy0.shape) * noise
     label = np.r_[np.zeros(150, int), np.ones(150, int), np.full(outliers, -1)]
-    return jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32), label
+    return np.float32(xy0), np.float32(xy1), label
 
 
 def wrong(found, label) -> float:
-    found = np.asarray(found)
     named = [np.where(found >= 0, np.abs(found - flip), -1) for flip in (0, 1)]
     return min((x != label).mean() for x in named)
 
@@ -45,7 +46,7 @@ def wrong(found, label) -> float:
 @pytest.mark.parametrize("seed", range(5))
 def test_competing_planes_part_where_greedy_ones_take_too_much(seed):
     xy0, xy1, label = two_walls(seed, 0.1)
-    valid = jnp.ones(len(label), bool)
+    valid = np.ones(len(label), bool)
     greedy, fair = (
         peel(jax.random.key(seed), xy0, xy1, valid, LIMITS, shape=shape).plane
         for shape in (GREEDY, FAIR)
@@ -56,19 +57,19 @@ def test_competing_planes_part_where_greedy_ones_take_too_much(seed):
 
 def test_every_member_is_nearest_to_its_own_plane():
     xy0, xy1, _ = two_walls(0, 0.1)
-    valid = jnp.arange(len(xy0)) % 7 != 0
+    valid = np.arange(len(xy0)) % 7 != 0
     found = peel(jax.random.key(0), xy0, xy1, valid, LIMITS, shape=FAIR)
-    plane = np.asarray(found.plane)
+    plane = found.plane
     errors = np.stack(
         [
-            np.linalg.norm(oracles.transfer(h, np.asarray(xy0)) - np.asarray(xy1), axis=1)
-            for h in np.asarray(found.homographies, np.float64)[np.asarray(found.num_inliers) > 0]
+            np.linalg.norm(oracles.transfer(h, xy0) - xy1, axis=1)
+            for h in found.homographies.astype(np.float64)[found.num_inliers > 0]
         ]
     )
     best, least = errors.argmin(0), errors.min(0)
     clear = np.abs(np.sort(errors, axis=0)[1] - least) > 0.05
     clear &= np.abs(least - 4) > 0.05
-    expected = np.where((least < 4) & np.asarray(valid), best, -1)
+    expected = np.where((least < 4) & valid, best, -1)
     np.testing.assert_array_equal(plane[clear], expected[clear])
     counts = np.bincount(plane[plane >= 0], minlength=len(found.num_inliers))
     np.testing.assert_array_equal(found.num_inliers, counts)
@@ -79,16 +80,16 @@ def test_a_plane_without_points_of_its_own_is_given_up():
     xy0, xy1, _ = two_walls(1, 0.0, noise=0.1, outliers=0)
     h = np.asarray([[1.02, 0.01, 12], [-0.01, 0.99, 5], [1e-5, 0, 1]])
     off = h + np.asarray([[0, 0, 1.5], [0, 0, 0], [0, 0, 0]])
-    planes = jnp.asarray(np.stack([off, h, np.zeros((3, 3))]), jnp.float32)
+    planes = np.float32([off, h, np.zeros((3, 3))])
     homographies, num, plane = settle(
         planes,
-        jnp.asarray([300, 300, 0], jnp.int32),
-        Correspondences(xy0, xy1, jnp.ones(len(xy0), bool)),
-        jnp.float32(4),
-        jnp.int32(20),
+        np.int32([300, 300, 0]),
+        Correspondences(xy0, xy1, np.ones(len(xy0), bool)),
+        np.float32(4),
+        np.int32(20),
         rounds=10,
     )
-    assert num.tolist() == [300, 0, 0] and (np.asarray(plane) == 0).all()
+    assert num.tolist() == [300, 0, 0] and (plane == 0).all()
     at = np.asarray([[0, 0], [1000, 800]], np.float64)
     np.testing.assert_allclose(
         oracles.transfer(np.asarray(homographies[0], np.float64), at),
@@ -100,15 +101,11 @@ def test_a_plane_without_points_of_its_own_is_given_up():
 def alone(h, num, xy0, xy1, *, rounds, threshold=4.0, floor=20):
     """`settle` of planes over all points."""
     return settle(
-        jnp.asarray(h, jnp.float32),
-        jnp.asarray(num, jnp.int32),
-        Correspondences(
-            jnp.asarray(xy0, jnp.float32),
-            jnp.asarray(xy1, jnp.float32),
-            jnp.ones(len(xy0), bool),
-        ),
-        jnp.float32(threshold),
-        jnp.int32(floor),
+        np.float32(h),
+        np.int32(num),
+        Correspondences(np.float32(xy0), np.float32(xy1), np.ones(len(xy0), bool)),
+        np.float32(threshold),
+        np.int32(floor),
         rounds=rounds,
     )
 
@@ -121,7 +118,7 @@ def test_a_plane_is_fitted_again_to_its_own_points():
     xy1 = oracles.transfer(truth, xy0)
     shift = np.asarray([[1, 0, 3.0], [0, 1, 0], [0, 0, 1]])
     found, num, plane = alone((shift @ truth)[None], [200], xy0, xy1, rounds=1)
-    assert num.tolist() == [200] and (np.asarray(plane) == 0).all()
+    assert num.tolist() == [200] and (plane == 0).all()
     ends = oracles.transfer(np.asarray(found[0], np.float64), xy0)
     assert np.linalg.norm(ends - xy1, axis=1).max() < 0.1
     left, num, _ = alone((shift @ truth)[None], [200], xy0, xy1, rounds=0)
@@ -134,7 +131,7 @@ def test_a_member_is_nearer_than_the_threshold_and_no_further():
     turn = np.linspace(0, 6, 60)
     xy1 = xy0 + off[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     _, num, plane = alone(np.eye(3)[None], [60], xy0, xy1, rounds=0, floor=4)
-    np.testing.assert_array_equal(np.asarray(plane) == 0, off < 4)
+    np.testing.assert_array_equal(plane == 0, off < 4)
     assert num.tolist() == [20]
 
 
@@ -157,7 +154,7 @@ def test_a_plane_needs_as_many_members_as_are_asked_for(size):
     for rounds in (0, 1):
         _, num, plane = alone(np.eye(3)[None], [size], xy0, xy0, rounds=rounds)
         assert num.tolist() == [size if size >= 20 else 0]
-        assert (np.asarray(plane) == (0 if size >= 20 else -1)).all()
+        assert (plane == (0 if size >= 20 else -1)).all()
 
 
 def test_planes_end_in_order_of_their_members():
@@ -179,14 +176,14 @@ def test_planes_end_in_order_of_their_members():
 def test_without_planes_nothing_is_a_member():
     xy0, xy1, _ = two_walls(2, 0.1)
     none = nearest_plane(
-        jnp.zeros((3, 3, 3), jnp.float32),
-        jnp.zeros(3, bool),
-        Correspondences(xy0, xy1, jnp.ones(len(xy0), bool)),
-        jnp.float32(4),
+        np.zeros((3, 3, 3), np.float32),
+        np.zeros(3, bool),
+        Correspondences(xy0, xy1, np.ones(len(xy0), bool)),
+        np.float32(4),
     )
     assert (np.asarray(none) == -1).all()
     found = peel(
-        jax.random.key(0), xy0, xy1[::-1] * 3 % 997, jnp.ones(len(xy0), bool), LIMITS, shape=FAIR
+        jax.random.key(0), xy0, xy1[::-1] * 3 % 997, np.ones(len(xy0), bool), LIMITS, shape=FAIR
     )
     assert found.num_inliers[0] == 0 and not np.asarray(found.homographies).any()
 
@@ -196,7 +193,6 @@ def test_one_plane_keeps_its_points(seed):
     rng = rng_of(seed)
     xy0 = rng.uniform(0, 1000, (200, 2))
     xy1 = oracles.transfer(random_homography(rng, strength=0.5), xy0)
-    valid = jnp.ones(200, bool)
-    args = (jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32), valid, LIMITS)
+    args = (np.float32(xy0), np.float32(xy1), np.ones(200, bool), LIMITS)
     found = peel(jax.random.key(seed), *args, shape=FAIR)
     assert (np.asarray(found.plane) == 0).all() and found.num_inliers.tolist() == [200, 0, 0, 0, 0]

@@ -8,11 +8,13 @@ tests/core/test_ransac.py for planes, and here for the sizes of chunks.
 import dataclasses
 import functools
 import re
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 from jax import export
 from strategies import rng_of
 
@@ -25,6 +27,7 @@ from jaxsfm.core.scores import init_scores
 from jaxsfm.core.types import JoinedFeatures, Thresholds
 from jaxsfm.core.vgg import Preprocessing
 
+square_patch = compiled(align.square_patch, "radius")
 PLATFORMS = ("cpu", "cuda", "tpu")
 HEIGHT, WIDTH, COARSE = 128, 192, 96
 
@@ -56,12 +59,14 @@ def settings_of(preset: str, **changes) -> features.Extraction:
     return fixed._replace(**changes)
 
 
+@functools.cache
 def described(preset: str):
     settings = settings_of(preset)
     extract = functools.partial(features.extract, settings=settings)
     return jax.eval_shape(extract, parameters("vgg16"), IMAGE, SIZE)
 
 
+@functools.cache
 def joined(preset: str, products: Products = "float32"):
     return jax.eval_shape(functools.partial(join_octaves, products=products), described(preset))
 
@@ -209,57 +214,72 @@ extraction and matching, the sizes of photos and of lists of cells are not among
 (docs/decisions/accelerators.md)."""
 
 
+@functools.cache
+def traced(make: Callable[[], tuple]):
+    """A program like those of `PROGRAMS`, from which it is lowered."""
+    function, given = make()
+    return jax.jit(function).trace(*given)
+
+
+@functools.cache
+def exported(name: str) -> export.Exported:
+    """One of `SYMBOLIC`, lowered for all platforms."""
+    function, given = SYMBOLIC[name][0]()
+    return export.export(jax.jit(function), platforms=PLATFORMS)(*given)
+
+
 @pytest.mark.parametrize("name", SYMBOLIC)
 def test_one_program_serves_all_batches_and_lengths(name):
-    make, unknown = SYMBOLIC[name]
-    function, given = make()
-    exported = export.export(jax.jit(function), platforms=PLATFORMS)(*given)
-    sizes = {str(d) for x in exported.in_avals for d in x.shape if not isinstance(d, int)}
-    assert sizes == unknown
+    avals = exported(name).in_avals
+    sizes = {str(d) for x in avals for d in x.shape if not isinstance(d, int)}
+    assert sizes == SYMBOLIC[name][1]
 
 
 @pytest.mark.parametrize(("height", "width", "count"), [(64, 80, 1), (48, 48, 9)])
 def test_the_alignment_for_all_sizes_gives_what_that_for_one_size_gives(height, width, count):
     rng = rng_of(count)
-    patch, size = align.square_patch(7), np.int32([height, width])
+    patch, size = square_patch(radius=7), np.int32([height, width])
     image = np.float32(rng.normal(size=(height, width, 1)))
     xy = np.float32(rng.uniform(16, 32, (count, 2)))
     affine = np.float32(np.eye(2) + rng.uniform(-0.2, 0.2, (count, 2, 2)))
-    for program, given in (
-        ("templates", (image, size, xy, patch)),
-        ("align", (image, size, align.make_templates(image, size, xy, patch), xy, affine, patch)),
+    for program, function, given in (
+        ("templates", align.make_templates, (image, size, xy, patch)),
+        (
+            "align",
+            align.align,
+            (image, size, align.make_templates(image, size, xy, patch), xy, affine, patch),
+        ),
     ):
-        function, shapes = SYMBOLIC[program][0]()
-        any_size = export.export(jax.jit(function), platforms=PLATFORMS)(*shapes)
-        for x, y in zip(any_size.call(*given), function(*given), strict=True):
+        for x, y in zip(exported(program).call(*given), function(*given), strict=True):
             np.testing.assert_array_equal(x, y)
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_every_program_lowers_for_every_platform(name):
-    function, given = PROGRAMS[name]()
-    text = jax.jit(function).trace(*given).lower(lowering_platforms=PLATFORMS).as_text()
+    text = traced(PROGRAMS[name]).lower(lowering_platforms=PLATFORMS).as_text()
     assert "func.func public @main" in text
 
 
 def test_accelerators_score_more_hypotheses_at_once_than_cpus():
-    function, given = matching("paper")
-    traced = jax.jit(function).trace(*given)
     larger = PRESETS["paper"].pair.for_accelerators()
     at_once = larger.hypotheses_per_step * larger.steps_at_once
     assert at_once == 512
     for platform in PLATFORMS:
-        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        text = traced(PROGRAMS["match paper"]).lower(lowering_platforms=(platform,)).as_text()
         assert (f"tensor<{at_once}x3x3xf32>" in text) == (platform != "cpu")
 
 
-@pytest.mark.parametrize(("products", "short"), [("float16", "f16"), ("bfloat16", "bf16")])
-def test_accelerators_multiply_descriptors_of_16_bits_and_sum_in_float32(products, short):
+@pytest.mark.parametrize(
+    ("make", "short"),
+    [
+        pytest.param(PROGRAMS["match default, float16"], "f16", id="float16-f16"),
+        pytest.param(lambda: matching("default", "bfloat16"), "bf16", id="bfloat16-bf16"),
+    ],
+)
+def test_accelerators_multiply_descriptors_of_16_bits_and_sum_in_float32(make, short):
     """CPUs multiply in float32, because few of them have such products."""
-    function, given = matching("default", products)
-    traced = jax.jit(function).trace(*given)
     for platform in PLATFORMS:
-        text = traced.lower(lowering_platforms=(platform,)).as_text()
+        text = traced(make).lower(lowering_platforms=(platform,)).as_text()
         operands = {
             tuple(re.findall(r"tensor<(?:\d+x)*(\w+)>", line.rpartition(" : ")[2]))
             for line in text.splitlines()

@@ -8,6 +8,7 @@ import numpy as np
 import oracles
 import pytest
 import tolerances
+from compiled import compiled
 from hypothesis import given, settings
 from strategies import random_homography, rng_of, seeds
 
@@ -20,6 +21,8 @@ K = 400
 THRESHOLDS = Thresholds(np.float32(10), np.int32(26), np.float32(0.999))
 SHAPE = PairShape(max_hypotheses=2000)
 peel = jax.jit(ransac.peel_planes, static_argnames="shape")
+count_inliers = compiled(ransac.count_inliers, "shape")
+sample_indices = compiled(ransac.sample_indices, "num")
 
 
 def scene(seed, sizes, *, noise=1.0, capacity=K):
@@ -46,9 +49,7 @@ def scene(seed, sizes, *, noise=1.0, capacity=K):
 
 def run(key, xy0, xy1, valid=None, shape=SHAPE, thresholds=THRESHOLDS):
     valid = np.ones(len(xy0), bool) if valid is None else valid
-    return peel(
-        key, jnp.asarray(xy0), jnp.asarray(xy1), jnp.asarray(valid), thresholds, shape=shape
-    )
+    return jax.device_get(peel(key, xy0, xy1, valid, thresholds, shape=shape))
 
 
 def recovered(seed) -> list[tuple[float, float]]:
@@ -152,8 +153,8 @@ def pairs_of_a_batch():
     """Keys and correspondences of pairs that differ in all that decides about their loops."""
     scenes = [scene(s, sizes)[:2] for s, sizes in enumerate(([150, 80], [], [300], [60, 50, 40]))]
     live = np.asarray([K, K, 350, 10])
-    xy0, xy1 = (jnp.asarray(np.stack(xy)) for xy in zip(*scenes, strict=True))
-    return jax.random.split(jax.random.key(3), 4), xy0, xy1, jnp.arange(K) < live[:, None]
+    xy0, xy1 = map(np.stack, zip(*scenes, strict=True))
+    return jax.random.split(jax.random.key(3), 4), xy0, xy1, np.arange(K) < live[:, None]
 
 
 def counted(monkeypatch, module, name: str) -> list[int]:
@@ -217,9 +218,8 @@ def test_lanes_together_have_the_planes_of_each_and_refit_only_where_one_does(mo
 
 
 def problem_of(xy0, xy1, *, live: int, threshold: float) -> ransac._Problem:
-    points = jnp.asarray(xy0, jnp.float32), jnp.asarray(xy1, jnp.float32)
-    reach = jnp.float32(threshold)
-    return ransac._Problem(*points, jnp.int32(live), reach, reach)
+    reach = np.float32(threshold)
+    return ransac._Problem(np.float32(xy0), np.float32(xy1), np.int32(live), reach, reach)
 
 
 @pytest.mark.parametrize("live", [0, 1, 60, 64, 99, 100])
@@ -233,7 +233,7 @@ def test_every_correspondence_is_counted_once(live, chunk):
     xy1 = xy0 + rng.uniform(-0.4, 0.4, (100, 2))
     problem = problem_of(xy0, xy1, live=live, threshold=0.25)
     shape = dataclasses.replace(SHAPE, score_chunk=chunk)
-    ours = ransac.count_inliers(jnp.asarray(h, jnp.float32), problem, shape=shape)
+    ours = count_inliers(np.float32(h), problem, shape=shape)
     expected = [oracles.inliers(m, xy0[:live], xy1[:live], 0.25).sum() for m in h]
     np.testing.assert_array_equal(ours, expected)
 
@@ -241,7 +241,7 @@ def test_every_correspondence_is_counted_once(live, chunk):
 def test_a_refit_is_kept_only_while_it_gains():
     """What is returned has the inliers that are stated, whether or not the next fit would lose."""
     lost = 0
-    refit = jax.jit(ransac._refit, static_argnums=3)
+    refit = compiled(ransac._refit, "shape")
     for seed in range(12):
         rng = rng_of(seed)
         xy0 = rng.uniform(-1, 1, (100, 2)).astype(np.float32)
@@ -252,7 +252,7 @@ def test_a_refit_is_kept_only_while_it_gains():
         before = int(oracles.inliers(start, xy0[:90], xy1[:90], 0.15).sum())
         for refits in (1, 3):
             shape = dataclasses.replace(SHAPE, local_refits=refits)
-            h, num = refit(jnp.asarray(start), jnp.int32(before), problem, shape)
+            h, num = refit(start, np.int32(before), problem, shape=shape)
             member = oracles.inliers(h, xy0[:90], xy1[:90], 0.15)
             assert int(num) == member.sum() >= before
             if refits == 1:
@@ -316,24 +316,24 @@ def test_a_plane_of_inliers_alone_stops_after_one_step(key):
 @settings(max_examples=20, deadline=None)
 @given(seeds)
 def test_samples_are_four_different_live_indices(seed):
-    draw = jax.jit(ransac.sample_indices, static_argnums=1)
     for count in (4, 5, 30):
-        index = np.asarray(draw(jax.random.key(seed), 64, jnp.int32(count)))
+        index = sample_indices(jax.random.key(seed), num=64, count=np.int32(count))
         assert index.min() >= 0 and index.max() < count
         assert all(len(set(row)) == 4 for row in index.tolist())
 
 
 def test_samples_are_uniform(key):
-    index = np.asarray(ransac.sample_indices(key, 20_000, jnp.int32(8)))
+    index = sample_indices(key, num=20_000, count=np.int32(8))
     for position in range(4):
         share = np.bincount(index[:, position], minlength=8) / 20_000
         np.testing.assert_allclose(share, 1 / 8, atol=0.01)
 
 
 def test_the_stopping_rule_is_the_hypergeometric_one():
-    needed = ransac.hypotheses_needed(jnp.int32(50), jnp.int32(100), 0.999)
+    hypotheses_needed = compiled(ransac.hypotheses_needed)
+    needed = hypotheses_needed(np.int32(50), np.int32(100), np.float32(0.999))
     p = np.prod([(50 - k) / (100 - k) for k in range(4)])
     np.testing.assert_allclose(needed, np.log(0.001) / np.log(1 - p), rtol=1e-4)
-    assert np.isinf(ransac.hypotheses_needed(jnp.int32(3), jnp.int32(100), 0.999))
-    tiny = ransac.hypotheses_needed(jnp.int32(26), jnp.int32(100_000), 0.999)
+    assert np.isinf(hypotheses_needed(np.int32(3), np.int32(100), np.float32(0.999)))
+    tiny = hypotheses_needed(np.int32(26), np.int32(100_000), np.float32(0.999))
     assert np.isfinite(tiny) and tiny > 1e12

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
+from compiled import compiled
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import rng_of, seeds
@@ -42,17 +43,12 @@ def cells() -> tuple[np.ndarray, np.ndarray]:
 ends = jax.jit(relocalize, static_argnames=("children", "variant"))
 
 
-@functools.partial(jax.jit, static_argnames=("children", "variant"))
-def walk(maps, row, col, children=2, variant="hard", temperature=1.0):
-    scores = [squared_norm(jnp.asarray(m)) for m in maps]
-    return relocalize(
-        scores,
-        jnp.asarray(row),
-        jnp.asarray(col),
-        variant=variant,
-        temperature=temperature,
-        children=children,
-    )
+def _walk(maps, row, col, children=2, variant="hard", temperature=1.0):
+    scores = [squared_norm(m) for m in maps]
+    return relocalize(scores, row, col, variant=variant, temperature=temperature, children=children)
+
+
+walk = compiled(_walk, "children", "variant")
 
 
 def distinct_scores(seed: int) -> list[jnp.ndarray]:
@@ -76,7 +72,7 @@ def test_every_cell_ends_where_a_plain_loop_ends(seed):
         for k, levels in ((2, 3), (4, 3), (6, 3), (2, 1), (4, 2)):
             some = maps[:levels]
             expected = [oracles.relocalize(some, r, c, k) for r, c in zip(row, col, strict=True)]
-            np.testing.assert_array_equal(np.asarray(walk(some, row, col, children=k)), expected)
+            np.testing.assert_array_equal(walk(some, row, col, children=k), expected)
 
 
 @pytest.mark.slow
@@ -186,8 +182,8 @@ def test_scores_of_zero_walk_softly_to_the_middle_of_the_cell():
 
 
 def test_what_cannot_be_walked_is_refused():
-    scores = [jnp.ones((2 * 2**k, 2 * 2**k), jnp.float32) for k in range(3)]
-    row = col = jnp.zeros((1,), jnp.int32)
+    scores = [jnp.asarray(np.ones((2 * 2**k, 2 * 2**k), np.float32)) for k in range(3)]
+    row = col = jnp.asarray(np.zeros((1,), np.int32))
     for wrong, words in (
         ({"scores": []}, "at least one level"),
         ({"scores": scores[::2]}, "twice the size"),
@@ -204,7 +200,7 @@ def test_what_cannot_be_walked_is_refused():
 @given(seeds)
 def test_keypoints_stay_in_their_cell_and_never_coincide(seed):
     row, col = cells()
-    xy = np.asarray(walk(random_maps(seed), row, col)).astype(int)
+    xy = walk(random_maps(seed), row, col).astype(int)
     np.testing.assert_array_equal(xy // 8, np.stack([col, row], axis=1))
     assert len({tuple(p) for p in xy}) == len(xy)
 
@@ -222,10 +218,11 @@ def test_jit_equals_eager_and_vmap_equals_loop():
     maps = [random_maps(seed) for seed in range(3)]
     row, col = cells()
     loop = [walk(m, row, col) for m in maps]
-    np.testing.assert_array_equal(loop[0], walk.__wrapped__(maps[0], row, col))
+    eager = [jax.tree.map(jnp.asarray, x) for x in (maps[0], row, col)]
+    np.testing.assert_array_equal(loop[0], _walk(*eager))
     stacked = [np.stack([m[level] for m in maps]) for level in range(3)]
     np.testing.assert_array_equal(
-        jax.vmap(walk, in_axes=(0, None, None))(stacked, jnp.asarray(row), jnp.asarray(col)),
+        compiled(jax.vmap(_walk, in_axes=(0, None, None)))(stacked, row, col),
         np.stack(loop),
     )
 

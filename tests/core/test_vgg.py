@@ -1,34 +1,38 @@
 """Laws of the feature pyramid."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
 import tolerances
+from compiled import compiled
 
 from jaxsfm.core import blocks
+from jaxsfm.core import vgg as core
 from jaxsfm.core.pair_shape import FINE_STRIDES, PAPER_LAYERS
 from jaxsfm.core.types import Pyramid
-from jaxsfm.core.vgg import LAYERS, VGG16, Preprocessing, init_shapes, preprocess
+from jaxsfm.core.vgg import LAYERS, VGG16, Preprocessing, init_shapes
 from jaxsfm.core.winograd import conv3x3
 from jaxsfm.io.weights import TORCHVISION
 
+program, pool = compiled(VGG16().apply, "method", "layers"), compiled(blocks.pool)
+preprocess = compiled(core.preprocess, "p")
 
-def apply(params, images, sizes):
-    return jax.jit(VGG16().apply)(params, jnp.asarray(images), jnp.asarray(sizes, jnp.int32))
+
+def apply(params, images, sizes, **method):
+    """The pyramid, or what another method of the network gives."""
+    return program(params, images, np.int32(sizes), **method)
 
 
 def assert_maps_equal(ours, expected):
     scale = max(np.abs(expected).max(), 1e-6)
-    np.testing.assert_allclose(np.asarray(ours) / scale, expected / scale, **tolerances.FEATURES)
+    np.testing.assert_allclose(ours / scale, expected / scale, **tolerances.FEATURES)
 
 
 @pytest.fixture(scope="module")
 def photo(photos):
-    return np.asarray(preprocess(jnp.asarray(photos[0][100:164, 80:160]), TORCHVISION))
+    return preprocess(photos[0][100:164, 80:160], p=TORCHVISION)
 
 
 def test_every_level_equals_an_independent_convolution(weights, photo):
@@ -50,9 +54,7 @@ def test_padding_an_image_does_not_change_its_features(weights, photo, size):
     for level, (map_, reference) in enumerate(zip(ours, expected, strict=True)):
         rows, cols = reference.shape[:2]
         assert_maps_equal(map_[0, :rows, :cols], reference)
-        assert not np.asarray(map_[0, rows:]).any() and not np.asarray(map_[0, :, cols:]).any(), (
-            level
-        )
+        assert not map_[0, rows:].any() and not map_[0, :, cols:].any(), level
 
 
 @pytest.mark.parametrize("size", [(64, 80), (57, 71), (33, 66), (9, 80)])
@@ -60,13 +62,11 @@ def test_levels_are_the_pyramid_without_its_largest_maps(weights, photo, size):
     """On CPUs by strips: images that end inside one, at its edge, before the first ends."""
     images, sizes = np.stack([photo, photo[::-1]]), [size, (64, 80)]
     maps = apply(weights.params, images, sizes)
-    levels = jax.jit(functools.partial(VGG16().apply, method="levels"))(
-        weights.params, jnp.asarray(images), jnp.asarray(sizes, jnp.int32)
-    )
+    levels = apply(weights.params, images, sizes, method="levels")
     for ours, expected in zip(levels.scores, (maps.conv1_2, maps.pool1, maps.pool2), strict=True):
-        assert_maps_equal(ours, np.square(np.asarray(expected)).sum(-1))
-    assert_maps_equal(levels.pool3, np.asarray(maps.pool3))
-    assert_maps_equal(levels.pool4, np.asarray(maps.pool4))
+        assert_maps_equal(ours, np.square(expected).sum(-1))
+    assert_maps_equal(levels.pool3, maps.pool3)
+    assert_maps_equal(levels.pool4, maps.pool4)
 
 
 @pytest.mark.slow
@@ -93,13 +93,12 @@ def test_bfloat16_rounds_operands_and_results_and_adds_in_float32(weights, photo
 def test_strips_of_any_height_give_the_same(weights, photo, monkeypatch, rows):
     def levels():
         jax.clear_caches()  # what was compiled before has other strips
-        images, sizes = jnp.asarray(photo[None]), jnp.asarray([[50, 70]], jnp.int32)
-        return VGG16().apply(weights.params, images, sizes, method="levels")
+        return apply(weights.params, photo[None], [[50, 70]], method="levels")
 
     expected = levels()
     monkeypatch.setattr(blocks, "STRIP_ROWS", 2 * rows)
     for ours, want in zip(jax.tree.leaves(levels()), jax.tree.leaves(expected), strict=True):
-        assert_maps_equal(ours, np.asarray(want))
+        assert_maps_equal(ours, want)
     jax.clear_caches()
 
 
@@ -110,7 +109,7 @@ def test_a_batch_is_its_images_one_by_one(weights, photo):
     for i in range(2):
         single = apply(weights.params, images[i : i + 1], sizes[i : i + 1])
         for a, b in zip(batch, single, strict=True):
-            assert_maps_equal(a[i], np.asarray(b[0]))
+            assert_maps_equal(a[i], b[0])
 
 
 @pytest.mark.slow
@@ -131,8 +130,8 @@ def test_the_parameter_tree_has_the_thirteen_canonical_layers():
 
 def test_preprocessing_is_scale_then_mean_then_std():
     p = Preprocessing(scale=2.0, mean=(1.0, 2.0, 3.0), std=(1.0, 2.0, 4.0))
-    out = preprocess(jnp.full((1, 1, 3), 10, jnp.uint8), p)
-    np.testing.assert_allclose(np.asarray(out)[0, 0], [4.0, 1.5, 0.5])
+    out = preprocess(np.full((1, 1, 3), 10, np.uint8), p=p)
+    np.testing.assert_allclose(out[0, 0], [4.0, 1.5, 0.5])
 
 
 @pytest.mark.slow
@@ -155,27 +154,26 @@ def test_both_convolutions_give_the_same_maps(weights, photo, monkeypatch):
 def test_other_pairs_of_layers_are_maps_of_the_same_network(weights, photo, layers):
     """A convolution's map, pooled, is the pyramid's; scores are norms of what lies below."""
     size, stride = (57, 71), FINE_STRIDES[layers]
-    images, sizes = jnp.asarray(photo[None]), jnp.asarray([size], jnp.int32)
+    images, sizes = photo[None], np.int32([size])
     pyramid = apply(weights.params, images, sizes)
-    method = functools.partial(VGG16().apply, method="levels", layers=layers)
-    found = jax.jit(method)(weights.params, images, sizes)
+    found = apply(weights.params, images, sizes, method="levels", layers=layers)
     for name, ours in zip(layers.split("/"), (found.pool4, found.pool3), strict=True):
         pooled = getattr(pyramid, f"pool{name[4]}")
         if name.startswith("conv"):
-            assert np.any(np.asarray(ours) < 0)
-            ours = blocks.pool(ours, sizes // 2 ** (int(name[4]) - 1))
-        assert_maps_equal(ours, np.asarray(pooled))
+            assert np.any(ours < 0)
+            ours = pool(ours, sizes // 2 ** (int(name[4]) - 1))
+        assert_maps_equal(ours, pooled)
     assert found.pool3.shape[1] == photo.shape[0] // stride
     assert len(found.scores) == stride.bit_length() - 1
     for score, below in zip(found.scores, pyramid, strict=False):
-        assert_maps_equal(score, np.square(np.asarray(below)).sum(axis=-1))
+        assert_maps_equal(score, np.square(below).sum(axis=-1))
 
 
 def test_the_last_convolution_is_what_pool5_pools(weights, photo):
     size = (57, 71)
-    images, sizes = jnp.asarray(photo[None]), jnp.asarray([size], jnp.int32)
-    last = jax.jit(functools.partial(VGG16().apply, method="conv5"))(weights.params, images, sizes)
+    images, sizes = photo[None], np.int32([size])
+    last = apply(weights.params, images, sizes, method="conv5")
     rows, cols = size[0] // 16, size[1] // 16
     assert not np.any(last[:, rows:]) and not np.any(last[:, :, cols:]) and np.any(last < 0)
     expected = apply(weights.params, images, sizes).pool5
-    assert_maps_equal(blocks.pool(last, sizes // 16), np.asarray(expected))
+    assert_maps_equal(pool(last, sizes // 16), expected)

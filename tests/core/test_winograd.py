@@ -6,14 +6,16 @@ import numpy as np
 import oracles
 import pytest
 import tolerances
+from compiled import compiled
 from jax import lax
 from strategies import rng_of
 
 from jaxsfm.core import winograd
-from jaxsfm.core.winograd import conv3x3
+
+conv3x3 = compiled(winograd.conv3x3, "tiles")
 
 
-def plain(x, kernel):
+def _plain(x, kernel):
     """By XLA."""
     return lax.conv_general_dilated(
         x[None],
@@ -25,6 +27,9 @@ def plain(x, kernel):
     )[0]
 
 
+plain = compiled(_plain)
+
+
 @pytest.mark.parametrize("tiles", [1, 7, 1000])
 @pytest.mark.parametrize(
     "shape", [(1, 1, 3, 2), (2, 2, 1, 1), (1, 9, 4, 3), (8, 1, 2, 5), (7, 10, 4, 4), (13, 5, 5, 6)]
@@ -32,8 +37,8 @@ def plain(x, kernel):
 def test_equals_the_plain_sum_for_all_sizes_and_strips(shape, tiles):
     h, w, c, o = shape
     rng = rng_of(h + w)
-    x = jnp.asarray(rng.normal(size=(h, w, c)), jnp.float32)
-    kernel = jnp.asarray(rng.normal(size=(3, 3, c, o)), jnp.float32)
+    x = np.float32(rng.normal(size=(h, w, c)))
+    kernel = np.float32(rng.normal(size=(3, 3, c, o)))
     ours, expected = conv3x3(x, kernel, tiles=tiles), plain(x, kernel)
     assert ours.shape == expected.shape
     np.testing.assert_allclose(ours, expected, rtol=1e-5, atol=1e-5)
@@ -45,7 +50,7 @@ def rounding(convolve) -> float:
     x = np.maximum(rng.normal(size=(24, 22, 512)), 0).astype(np.float32)
     kernel = (rng.normal(size=(3, 3, 512, 8)) / 68).astype(np.float32)
     exact = oracles.convolution(x, kernel, np.zeros(8))
-    error = np.asarray(convolve(jnp.asarray(x), jnp.asarray(kernel))) - exact
+    error = convolve(x, kernel) - exact
     return np.sqrt(np.mean(error**2) / np.mean(exact**2))
 
 
@@ -57,7 +62,8 @@ def test_other_points_round_more(a, b, least, monkeypatch):
     monkeypatch.setattr(winograd, "PRODUCT", a**2 * b**2)
     monkeypatch.setattr(winograd, "A", a)
     monkeypatch.setattr(winograd, "B", b)
-    assert rounding(conv3x3) > least * ours
+    # A function of its own: that of before is compiled with the points of before.
+    assert rounding(compiled(lambda *given: winograd.conv3x3(*given))) > least * ours
 
 
 def test_rounding_is_a_few_times_that_of_the_plain_sum_on_many_channels():
@@ -67,12 +73,12 @@ def test_rounding_is_a_few_times_that_of_the_plain_sum_on_many_channels():
 
 def test_gradients_are_those_of_the_plain_sum():
     rng = rng_of(1)
-    x = jnp.asarray(rng.normal(size=(6, 7, 3)), jnp.float32)
-    kernel = jnp.asarray(rng.normal(size=(3, 3, 3, 4)), jnp.float32)
-    weight = jnp.asarray(rng.normal(size=(6, 7, 4)), jnp.float32)
+    x, kernel, weight = (
+        np.float32(rng.normal(size=s)) for s in ((6, 7, 3), (3, 3, 3, 4), (6, 7, 4))
+    )
     ours, expected = (
-        jax.grad(lambda x, k, f=f: jnp.sum(weight * f(x, k)), argnums=(0, 1))(x, kernel)
-        for f in (conv3x3, plain)
+        compiled(jax.grad(lambda x, k, f=f: jnp.sum(weight * f(x, k)), argnums=(0, 1)))(x, kernel)
+        for f in (winograd.conv3x3, _plain)
     )
     for a, b in zip(ours, expected, strict=True):
         np.testing.assert_allclose(a, b, **tolerances.FEATURES)

@@ -51,6 +51,22 @@ def test_the_mask_of_a_photo_has_its_name_and_png(tmp_path):
     assert read_image(masked[1], max_size=90).used is None
 
 
+def test_one_file_is_the_mask_of_all_photos_of_its_size(tmp_path):
+    images = [photo(tmp_path / "p", "sub/a.jpg"), photo(tmp_path / "p", "b.jpg", (60, 90))]
+    one = mask(tmp_path / "m.png", left_half())
+    assert mask_path(one, "sub/a.jpg") == one
+    masked, bare = with_masks(images, one)
+    assert bare == ["b.jpg"] and masks_of(masked).keys() == {"sub/a.jpg"}
+    np.testing.assert_array_equal(read_image(masked[0], max_size=90).used, left_half())
+    with pytest.raises(UserError, match="the mask of b.jpg has another size"):
+        with_masks(images[1:], one)
+    with pytest.raises(UserError, match="no such folder or file"):
+        with_masks(images, tmp_path / "nowhere")
+    (tmp_path / "text.png").write_text("no image")
+    with pytest.raises(UserError, match="not a readable mask"):
+        with_masks(images, tmp_path / "text.png")
+
+
 def test_black_is_ignored_and_everything_else_is_used(tmp_path):
     gray = np.asarray([[0, 1], [128, 255]], np.uint8).repeat(30, 0).repeat(45, 1)
     assert cv2.imwrite(str(tmp_path / "m.png"), gray)

@@ -13,9 +13,11 @@ from jaxsfm.config import preset
 from jaxsfm.core.types import Status
 from jaxsfm.io.pairs import PairCounts, component_of, exhaustive_pairs
 from jaxsfm.report.lost_photos import explained as explained_report
+from jaxsfm.report.lost_photos import without_depth
 from jaxsfm.report.pair_outcomes import COLMAP_MIN_INLIERS, photo_groups
+from jaxsfm.report.run_inputs import SamePixels
 from jaxsfm.report.run_report import RunReport
-from jaxsfm.report.run_results import ModelRow, PairRow, PairStatus
+from jaxsfm.report.run_results import Advice, ModelRow, PairRow, PairStatus
 from jaxsfm.report.summary import component_lines, help_lines
 from jaxsfm.sfm.check.model_check import ModelCheck
 from jaxsfm.sfm.limits import TRUST
@@ -511,6 +513,24 @@ def test_photos_from_one_spot_are_told_to_move_and_nothing_else():
         assert options(row) == [None] and "0.4 deg at most" in row["help"][0]["reason"]
     found = explained("ab", {pair: UNVERIFIED[pair]}, {pair: 60}, angles={pair: 5.0})
     assert "deg" not in rows(found)["a"]["help"][0]["reason"]
+
+
+def test_what_gives_no_depth_is_said_once_for_all_photos():
+    pair = ("a", "b")
+    report = explanation("ab", {pair: UNVERIFIED[pair]}, {pair: 60}, angles={pair: 0.4})
+    found = without_depth(report, one_place=True)
+    assert found.no_model is not None and "from one place" in found.no_model
+    assert "move sideways" in found.no_model
+    for photo in found.lost:
+        assert photo.help == [Advice(option=None, reason="move sideways between photos")]
+    assert without_depth(report, one_place=False) == report
+    still = replace(report, same_pixels=SamePixels(share=0.5, photos=9))
+    found = without_depth(still, one_place=False)
+    assert found.no_model is not None and found.no_model.startswith(str(report.no_model))
+    assert "mask what stays" in found.no_model
+    for photo, before in zip(found.lost, report.lost, strict=True):
+        assert photo.detail == before.detail
+        assert photo.help is not None and photo.help[0].option == "--masks"
 
 
 # -- the one reason --------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from verdicts import OTHER, check_of
 
-from jaxsfm.colmap.mapper import Attempt
+from jaxsfm.colmap.mapper import LOW_ANGLE_DEG, Attempt
 from jaxsfm.colmap.other_camera import OtherCamera
 from jaxsfm.io.typed_files import read_figures, write_figures
 from jaxsfm.sfm.check.check_model import Checked
@@ -126,8 +126,28 @@ def test_figures_of_verification_survive_a_file(tmp_path):
     figures = VerificationFigures(
         verified=dict(zip(PAIRS, (30, 15, 99), strict=True)),
         angles=dict(zip(PAIRS, (0.0, 1.25, 44.5), strict=True)),
+        one_place=True,
     )
     assert written_and_read(tmp_path, figures, VerificationFigures) == figures
+
+
+@pytest.mark.parametrize(
+    "angles, one_place, no_depth",
+    [
+        ((0.0, 1.25, 44.5), False, False),
+        ((0.0, 1.25, 44.5), True, True),
+        ((0.0, 1.25, LOW_ANGLE_DEG - 0.1), False, True),
+        ((0.0, 1.25, LOW_ANGLE_DEG), False, False),
+        ((0.0, 0.0, 0.0), False, False),
+        ((), False, False),
+    ],
+)
+def test_nothing_gives_depth_if_no_known_angle_does(angles, one_place, no_depth):
+    """0 says that the angle is not known."""
+    figures = VerificationFigures(
+        verified={}, angles=dict(zip(PAIRS, angles, strict=False)), one_place=one_place
+    )
+    assert figures.no_depth == no_depth
 
 
 def test_a_number_of_numpy_is_written_as_a_number_and_other_things_are_not(tmp_path):
