@@ -19,9 +19,14 @@ class UserError(Exception):
 
 @contextlib.contextmanager
 def writing(what: object) -> Iterator[None]:
-    """Report an OSError of the block as a UserError that `what`, a file or folder, names."""
+    """Report an OSError of the block as a UserError that `what`, a file or folder, names.
+
+    A broken pipe is not reported: it is that of a progress bar, and no file's.
+    """
     try:
         yield
+    except BrokenPipeError:
+        raise
     except OSError as error:
         raise UserError(f"{what}: cannot be written ({error.strerror or error})") from error
 

@@ -1,10 +1,11 @@
-"""Change copies of a finished run."""
+"""Finished runs: what they hold, and changed copies of them."""
 
 import json
 import shutil
 from pathlib import Path
 
 import pycolmap
+from databases import content
 
 from jaxsfm.colmap.model_files import read_model, write_models
 from jaxsfm.colmap.reconstruction import part_of, registered
@@ -59,3 +60,16 @@ def renamed(out: Path, images: Path, to: Path, old: str, new: str) -> tuple[Path
     model.write(run / "sparse" / "0")
     change_report(run, lambda report: report["images"].update(folder=str(photos)))
     return run, photos
+
+
+def results(out: Path) -> dict[str, object]:
+    """What a run leaves that must not depend on how it came there."""
+    files = [*out.glob("matches/*/*"), *out.glob("sparse/*/*")]
+    report = json.loads((out / "report.json").read_text())
+    return {
+        **{str(file.relative_to(out)): file.read_bytes() for file in files},
+        "database": content(out / "database.db"),
+        "report": {
+            name: report[name] for name in ("identity", "pairs", "models", "lost", "refinement")
+        },
+    }

@@ -144,13 +144,19 @@ def _write_model(
     fresh: Path, model: "pycolmap.Reconstruction", to: Literal["ply", "colmap", "colmap-text"]
 ) -> None:
     from jaxsfm.colmap.formats.tables import check_no_blanks
+    from jaxsfm.colmap.model_files import model_bytes, write_model
+    from jaxsfm.io.atomic import check_disk_space
 
+    if to == "colmap":
+        write_model(model, fresh)
+        return
+    if to == "colmap-text":
+        check_no_blanks([image.name for image in model.images.values()], to)
+    # COLMAP cuts files off and says nothing. A float of 8 bytes has at most 24 letters, a blank.
+    check_disk_space(fresh.parent, 25 * model_bytes(model) // 8)
     if to == "ply":
         model.export_PLY(fresh)
-    elif to == "colmap":
-        model.write_binary(fresh)
     elif to == "colmap-text":
-        check_no_blanks([image.name for image in model.images.values()], to)
         model.write_text(fresh)
     else:
         assert_never(to)

@@ -47,6 +47,10 @@ COMMANDS = {
     "data": data,
     "bench": bench,
 }
+UNREAD = 128 + 13
+"""The exit status if nobody reads the output: what a shell says of a program that SIGPIPE ends."""
+NO_MEMORY = ("RESOURCE_EXHAUSTED", "can't start new thread")
+"""What exceptions of other types say if there is not enough memory."""
 for _command in COMMANDS.values():
     unwrapped(_command)
 
@@ -77,11 +81,8 @@ def main(argv: list[str] | None = None) -> int:
     Returns:
       The exit status: 0 for success, 1 for a command that found no solution, 2 for arguments or
       files that cannot be used, 3 for a model that may be wrong (`reconstruct`), 130 after Ctrl-C
-      or SIGTERM.
+      or SIGTERM, 141 if nobody reads what it prints any more (`jaxsfm ... | head`).
     """
-    if (sys.argv[1:] if argv is None else argv) == ["--version"]:
-        print("\n".join(version_lines()))
-        return 0
     _print_any_name()
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("jaxsfm: %(message)s"))
@@ -90,14 +91,22 @@ def main(argv: list[str] | None = None) -> int:
     logger.setLevel(logging.INFO)
     keep_compiled()
     try:
+        return _reported(sys.argv[1:] if argv is None else argv)
+    except BrokenPipeError:
+        # Programs of Unix end without a word then, by the signal SIGPIPE, which Python ignores.
+        # What is still to be written goes nowhere: Python would report an error at its end.
+        with open(os.devnull, "wb") as nowhere:
+            for stream in (sys.stdout, sys.stderr):
+                if stream is not None:
+                    os.dup2(nowhere.fileno(), stream.fileno())
+        return UNREAD
+
+
+def _reported(argv: list[str]) -> int:
+    """Run one command, and report a failure in one sentence."""
+    try:
         with interrupt.noted():
-            return tyro.extras.subcommand_cli_from_dict(
-                COMMANDS,
-                prog="jaxsfm",
-                description=DESCRIPTION,
-                args=with_action(current(sys.argv[1:] if argv is None else argv)),
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
-            )
+            return _run(argv)
     except UserError as error:
         print(f"jaxsfm: {error}", file=sys.stderr)
         return 2
@@ -113,14 +122,16 @@ def main(argv: list[str] | None = None) -> int:
             sys.stdout.flush()
             os._exit(130)
         return 130
+    except BrokenPipeError:
+        raise
     except OSError as error:
         named = f"{error.filename}: " if error.filename else ""
         print(f"jaxsfm: {named}{error.strerror or error}", file=sys.stderr)
         return 2
     except Exception as error:
-        # XLA's allocator raises an exception type of its own. Any other exception is a fault in
-        # jaxsfm, and its traceback is shown.
-        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+        # XLA's allocator raises an exception type of its own, and Python one for the memory of a
+        # thread. Any other exception is a fault in jaxsfm, and its traceback is shown.
+        if not isinstance(error, MemoryError) and not any(each in str(error) for each in NO_MEMORY):
             raise
         print(
             "jaxsfm: out of memory. A smaller --max-size needs less memory; reconstruct also "
@@ -128,6 +139,24 @@ def main(argv: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 1
+
+
+def _run(argv: list[str]) -> int:
+    """Run one command, and write all that it has printed."""
+    if argv == ["--version"]:
+        print("\n".join(version_lines()))
+        status = 0
+    else:
+        status = tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="jaxsfm",
+            description=DESCRIPTION,
+            args=with_action(current(argv)),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
+        )
+    if sys.stdout is not None:  # Python would report a failure at its end, with a traceback
+        sys.stdout.flush()
+    return status
 
 
 if __name__ == "__main__":

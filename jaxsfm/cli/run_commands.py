@@ -259,6 +259,7 @@ def pairs(
 
     from jaxsfm.io.atomic import write_atomic
     from jaxsfm.io.pair_selection import chosen_pairs, parse_pair_selection, selected_pairs
+    from jaxsfm.io.photo_folder import too_few
     from jaxsfm.io.weights import chosen_weights
     from jaxsfm.matching.pipeline import open_images
     from jaxsfm.matching.retrieval import describe_photos, partner_pairs
@@ -267,7 +268,7 @@ def pairs(
     names = [image.name for image in usable]
     selection = parse_pair_selection(chosen_pairs(pairs, len(names)))
     if len(names) < 2:
-        raise UserError(f"{images}: {len(names)} usable images, at least 2 are needed")
+        raise UserError(too_few(images, len(names), skipped))
     found = set(selected_pairs(selection, names, [*names, *skipped]))
     if selection.retrieval:
         weights = chosen_weights(network, backbone)

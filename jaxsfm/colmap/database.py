@@ -4,6 +4,7 @@ Everything is checked before COLMAP sees it, because a match index out of range 
 native code, and some unset options fail silently.
 """
 
+import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult, describe
@@ -131,6 +133,36 @@ def write_keypoint_matches(
     _write(path, images, found.keypoints, rows, cameras)
 
 
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[pycolmap.Database]:
+    """Open a database, which COLMAP makes if it is missing, and writes into even to read it.
+
+    Raises UserError if COLMAP cannot open it.
+    """
+    try:
+        database = pycolmap.Database.open(path)
+    except RuntimeError as error:
+        raise UserError(
+            f"{path}: COLMAP cannot open this database; it needs space on the disk and the "
+            "permission to write, even to read it"
+        ) from error
+    with database:
+        yield database
+
+
+@contextlib.contextmanager
+def changed(path: Path) -> Iterator[pycolmap.Database]:
+    """Open a database for changes, which are made together when the block ends.
+
+    Raises UserError if COLMAP cannot open it, or SQLite's journal, which holds what is changed as
+    it was, does not fit on the disk: then COLMAP would end the process.
+    """
+    size = path.stat().st_size if path.exists() else 0
+    check_disk_space(path.parent, SPARE_BYTES + size)
+    with opened(path) as db, pycolmap.DatabaseTransaction(db):
+        yield db
+
+
 def _write(
     path: Path,
     images: list[ImageFile],
@@ -140,7 +172,7 @@ def _write(
 ) -> None:
     empty = np.zeros((0, 2), np.float32)
     path.unlink(missing_ok=True)
-    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+    with changed(path) as db:
         camera_ids, ids = {}, {}
         for camera, group in cameras.assigned(images):
             camera_ids |= dict.fromkeys((i.name for i in group), db.write_camera(camera))
@@ -172,7 +204,7 @@ def read_matches(
       float64 (n, 2) for each image, in the order of `names`: original pixels, where the centre of
       the top-left one is (0, 0).
     """
-    with pycolmap.Database.open(path) as db:
+    with opened(path) as db:
         ids = image_ids(db)
         a, b = ids[names[0]], ids[names[1]]
         if not verified:
@@ -196,14 +228,14 @@ def colmap_xy(db: pycolmap.Database, image_id: int) -> np.ndarray:
 
 def read_images(path: Path) -> dict[str, tuple[int, pycolmap.Camera]]:
     """Read the id and the camera of every image in a database, by name."""
-    with pycolmap.Database.open(path) as db:
+    with opened(path) as db:
         cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
         return {i.name: (i.image_id, cameras[i.camera_id]) for i in db.read_all_images()}
 
 
 def drop_pairs(path: Path, pairs: Iterable[Pair]) -> None:
     """Delete the verified geometries of pairs from a database. Their matches stay."""
-    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+    with changed(path) as db:
         ids = image_ids(db)
         for a, b in pairs:
             db.delete_two_view_geometry(ids[a], ids[b])

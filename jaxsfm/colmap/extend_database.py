@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET, read_images
+from jaxsfm.colmap.database import PIXEL_OFFSET, changed, opened, read_images
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
@@ -27,7 +27,7 @@ def add_images(
     Returns:
       id and camera of each image, by name.
     """
-    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+    with changed(path) as db:
         known = {camera.camera_id for camera in db.read_all_cameras()}
         for name, (_, camera) in sorted(images.items()):
             camera_id = camera.camera_id
@@ -111,7 +111,7 @@ def add_matches(
             own.setdefault(name, []).append(pair)
     rows: dict[Pair, list[np.ndarray]] = {}
     matches: dict[Pair, np.ndarray] = {}
-    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+    with changed(path) as db:
         for name in sorted(own):  # so the first name of a pair comes first
             parts = [_side(results[pair], pair.index(name)) for pair in own[name]]
             there = db.exists_keypoints(ids[name])
@@ -156,18 +156,14 @@ def _verified(
         return {}
     scratch = path.with_name("new_pairs.db")
     shutil.copyfile(path, scratch)
-    with pycolmap.Database.open(scratch) as db, pycolmap.DatabaseTransaction(db):
+    with changed(scratch) as db:
         db.clear_matches()
         db.clear_two_view_geometries()
         for (a, b), rows in matches.items():
             db.write_matches(ids[a], ids[b], rows)
     verify(scratch, options)
     found = {pair: view.geometry.num_inliers for pair, view in read_two_views(scratch).items()}
-    with (
-        pycolmap.Database.open(scratch) as new,
-        pycolmap.Database.open(path) as db,
-        pycolmap.DatabaseTransaction(db),
-    ):
+    with opened(scratch) as new, changed(path) as db:
         for a, b in matches:
             if new.exists_two_view_geometry(ids[a], ids[b]):
                 geometry = new.read_two_view_geometry(ids[a], ids[b])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.database import changed
 from jaxsfm.io.position_tables import Position
 
 VERTICAL = 2.0
@@ -25,7 +26,7 @@ def write_pose_priors(
       geographic: whether they are longitude and latitude. COLMAP's order is latitude, longitude.
     """
     systems = pycolmap.PosePriorCoordinateSystem
-    with pycolmap.Database.open(database) as db, pycolmap.DatabaseTransaction(db):
+    with changed(database) as db:
         db.clear_pose_priors()
         for image in sorted(db.read_all_images(), key=lambda image: image.name):
             at = positions.get(image.name)

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.database import opened
 from jaxsfm.colmap.formats.tables import (
     camera_fault,
     clash,
@@ -108,7 +109,7 @@ def read_models(folder: Path, database: Path) -> list[pycolmap.Reconstruction]:
     Raises:
       UserError: a model is damaged, or has a camera that the database has not.
     """
-    with pycolmap.Database.open(database) as db:
+    with opened(database) as db:
         known = {c.camera_id: c.has_prior_focal_length for c in db.read_all_cameras()}
     models = []
     while (path := folder / str(len(models))).is_dir():
@@ -127,10 +128,28 @@ def write_models(models: list[pycolmap.Reconstruction], folder: Path) -> None:
     for index, model in enumerate(models):
         target = folder / str(index)
         target.mkdir(parents=True)
-        points2d = sum(image.num_points2D() for image in model.images.values())
-        rows = 24 * points2d + 8 * model.compute_num_observations() + 51 * model.num_points3D()
-        check_disk_space(target, SPARE_BYTES + rows)
-        model.write_binary(target)
+        write_model(model, target)
+
+
+def model_bytes(model: pycolmap.Reconstruction) -> int:
+    """About how many bytes the binary files of a model have, with some to spare."""
+    points2d = sum(image.num_points2D() for image in model.images.values())
+    rows = 24 * points2d + 8 * model.compute_num_observations() + 51 * model.num_points3D()
+    return SPARE_BYTES + rows
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write the binary files of a model into an existing folder.
+
+    COLMAP writes files that are cut off and says nothing if the disk becomes full, so they are
+    looked at again. Raises UserError if they do not fit on the disk.
+    """
+    check_disk_space(folder, model_bytes(model))
+    model.write_binary(folder)
+    try:
+        check_binary(folder)
+    except (DamagedModelError, OSError) as error:
+        raise UserError(f"{folder}: cannot be written (the model was cut off: {error})") from error
 
 
 class _Reader:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pycolmap
 
 from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.database import changed, opened
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.native import native
 from jaxsfm.colmap.two_views import VerificationOptions
@@ -83,7 +84,7 @@ def write_rootsift_database(
             pycolmap.match_image_pairs(path, pairing_options=chosen, **options)
 
     native(work, path, grace_s=1)
-    with pycolmap.Database.open(path) as db:
+    with opened(path) as db:
         there = {image.name for image in db.read_all_images()}
     if lost := sorted({image.name for image in images} - there):
         raise UserError(f"{folder / lost[0]}: COLMAP cannot read this image, which RootSIFT needs")
@@ -92,7 +93,7 @@ def write_rootsift_database(
 def _set_cameras(path: Path, images: list[ImageFile], known: Mapping[str, Intrinsics]) -> None:
     """Replace the guessed cameras of a database by known ones."""
     sizes = {image.name: image.size for image in images}
-    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+    with changed(path) as db:
         for image in db.read_all_images():
             camera = known[image.name].camera(sizes[image.name])
             camera.camera_id = image.camera_id

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET, colmap_xy, image_ids
+from jaxsfm.colmap.database import PIXEL_OFFSET, changed, colmap_xy, image_ids, opened
 from jaxsfm.colmap.native import native
 from jaxsfm.io.pairs import Pair
 
@@ -100,7 +100,7 @@ def read_two_views(path: Path) -> dict[Pair, TwoView]:
 
     Relative poses are known if `verify` was asked for them.
     """
-    with pycolmap.Database.open(path) as db:
+    with opened(path) as db:
         images = {image.image_id: image for image in db.read_all_images()}
         cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
         camera_of = {i: cameras[image.camera_id] for i, image in images.items()}
@@ -158,7 +158,7 @@ class Inliers(NamedTuple):
 
 def read_inliers(path: Path) -> Inliers:
     """Read all keypoints and the two-view inliers of all pairs that have any."""
-    with pycolmap.Database.open(path) as db:
+    with opened(path) as db:
         cameras = {camera.camera_id: camera for camera in db.read_all_cameras()}
         images = {image.image_id: image for image in db.read_all_images()}
         keypoints = {}
@@ -182,7 +182,7 @@ def keep_inliers(path: Path, kept: Mapping[Pair, np.ndarray]) -> None:
     Args:
       kept: for each pair, the rows of `Inliers.matches` to keep. Other pairs are not changed.
     """
-    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+    with changed(path) as db:
         ids = image_ids(db)
         for names, rows in kept.items():
             a, b = (ids[name] for name in names)

@@ -5,10 +5,13 @@ same files, and digests say what is in them.
 """
 
 import contextlib
+import errno
 import hashlib
 import os
 import shutil
 import sqlite3
+import sys
+import tempfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,6 +29,8 @@ Json: TypeAlias = Mapping[str, "Json"] | Sequence["Json"] | str | int | float | 
 """What `json.dumps` writes. What `json.loads` returns is a dict, a list or one of the others."""
 CHECKSUM = "crc32"
 """The name of the array that holds the checksum of the others."""
+_CANNOT_TRY = (errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.ENODEV)
+"""A file system that gives no space in advance. The C library of most systems writes instead."""
 SPARE_BYTES = 4_000_000
 """Disk space that callers of `check_disk_space` add for what they do not count: the indices of
 tables, poses and the report page."""
@@ -105,7 +110,8 @@ def check_disk_space(folder: Path, needed: int) -> None:
     """Raise UserError if less than `needed` bytes are free on the disk of an existing folder.
 
     COLMAP does not survive a full disk: it ends the process when its database cannot grow, and it
-    writes models that are cut off.
+    writes models that are cut off. On Linux, the bytes are given to a file without a name, because
+    a quota or a limit on the size of files may leave less than is free on the disk.
     """
     free = shutil.disk_usage(folder).free
     if free < needed:
@@ -113,6 +119,13 @@ def check_disk_space(folder: Path, needed: int) -> None:
             f"{folder}: cannot be written (about {needed / 1e6:.0f} MB are needed, "
             f"{free / 1e6:.0f} MB are left on the disk)"
         )
+    if sys.platform == "linux":
+        with writing(folder), tempfile.TemporaryFile(dir=folder) as tried:
+            try:
+                os.posix_fallocate(tried.fileno(), 0, needed)
+            except OSError as error:
+                if error.errno not in _CANNOT_TRY:
+                    raise
 
 
 @contextlib.contextmanager

@@ -124,7 +124,8 @@ def decoded(data: bytes, suffix: str, flags: int) -> np.ndarray | None:
     """
     kind = special_format(data, suffix)
     if kind is None:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        with memory_needed():
+            return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     try:
         if kind == "raw":
             with _raw(data) as raw:
@@ -138,6 +139,17 @@ def decoded(data: bytes, suffix: str, flags: int) -> np.ndarray | None:
     except Exception:  # the readers can raise almost anything
         return None
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+
+
+@contextlib.contextmanager
+def memory_needed() -> Iterator[None]:
+    """Report OpenCV's lack of memory as Python's, a MemoryError: it says nothing of a photo."""
+    try:
+        yield
+    except cv2.error as error:
+        if error.code == cv2.Error.STS_NO_MEM:
+            raise MemoryError(error.err) from error
+        raise
 
 
 @contextlib.contextmanager

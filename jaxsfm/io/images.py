@@ -22,6 +22,7 @@ from jaxsfm.config import MIN_SIDE
 from jaxsfm.errors import UserError
 from jaxsfm.io import decoders, orientation
 from jaxsfm.io.exif_camera import taken_with
+from jaxsfm.io.image_names import name_fault
 from jaxsfm.io.masks import MaskFile, read_mask, without_blank_border
 
 logger = logging.getLogger(__name__)
@@ -31,11 +32,7 @@ MAX_DECODED_PIXELS = 250_000_000
 MOST_NAMED = 3
 """The number of photos that a message names of a list."""
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-_REDUCED = {
-    2: cv2.IMREAD_REDUCED_COLOR_2,
-    4: cv2.IMREAD_REDUCED_COLOR_4,
-    8: cv2.IMREAD_REDUCED_COLOR_8,
-}
+_REDUCED = {n: getattr(cv2, f"IMREAD_REDUCED_COLOR_{n}") for n in (2, 4, 8)}
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # damage is reported by jaxsfm
 
 
@@ -127,10 +124,8 @@ def inspect_image(path: Path, *, name: str | None = None) -> ImageFile:
         small for one matching window.
     """
     shown = shown_name(name or str(path))
-    try:
-        (name or path.name).encode("utf-8")
-    except UnicodeEncodeError as error:
-        raise ImageError(f"{shown}: the file name is not UTF-8, which COLMAP needs") from error
+    if (fault := name_fault(name or path.name)) is not None:
+        raise ImageError(f"{shown}: {fault}")
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -232,8 +227,6 @@ def _decode(image: ImageFile) -> np.ndarray:
         bgr = decoders.decoded(image_bytes(image), image.path.suffix, flags)
     except decoders.MissingReader as error:
         raise ImageError(f"{shown}: {error}") from error
-    except MemoryError as error:
-        raise ImageError(f"{shown}: there is not enough memory to decode it") from error
     except cv2.error as error:
         raise DamagedImage(f"{shown}: cannot be decoded") from error
     if bgr is None:
@@ -273,6 +266,15 @@ def read_image(
     Images in grey, with alpha, with 16 bits or in CMYK are converted to RGB with 8 bits. Raises
     ImageError if the file cannot be decoded, or a side would be shorter than `MIN_SIDE`.
     """
+    try:
+        with decoders.memory_needed():
+            return _read(image, max_size=max_size, enlarge=enlarge, upright=upright)
+    except MemoryError as error:
+        shown = shown_name(image.name)
+        raise ImageError(f"{shown}: there is not enough memory to decode it") from error
+
+
+def _read(image: ImageFile, *, max_size: int, enlarge: float, upright: bool) -> WorkingImage:
     rgb, size = _decode(image), image.size
     used = _mask_of(image)
     if upright:

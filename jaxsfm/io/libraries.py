@@ -98,20 +98,42 @@ def keep_compiled() -> None:
     """
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = platformdirs.user_cache_path("jaxsfm") / "compiled"
+        if not _can_write(folder):  # JAX would warn of each program, in several lines
+            _refused[:] = [folder]
+            return
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(LEAST_SECONDS)
         with contextlib.suppress(OSError):  # the folder is missing or not ours; JAX handles both
             drop_cut_short(folder)
 
 
+_refused: list[Path] = []
+"""The folder for compiled programs, if it cannot be written and this has not been said yet."""
+
+
+def _can_write(folder: Path) -> bool:
+    """Whether a folder can be written or made, as far as permissions tell. Nothing is made."""
+    try:
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+    except OSError:
+        return False
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+
+
 def announce_compilation() -> None:
-    """Say that a first run takes longer, if no compiled program is kept yet."""
+    """Say that a first run takes longer, if no compiled program is kept yet, or that each does."""
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
     if folder and not any(Path(folder).glob(_ENTRIES)):
         logger.info(
             "the first run compiles its programs, which takes about half a minute; "
             "they are kept in %s",
             folder,
+        )
+    while _refused:
+        logger.warning(
+            "each run compiles its programs, which takes about half a minute: they cannot be kept "
+            "in %s; JAX_COMPILATION_CACHE_DIR names another folder",
+            _refused.pop(),
         )
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from jaxsfm.errors import UserError
@@ -64,6 +64,16 @@ def _without_doubles(names: list[str]) -> list[str]:
     if doubles:
         logger.info("left out, as the same photo is there in another format: %s", named(doubles))
     return sorted({*names} - {*doubles})
+
+
+def too_few(folder: Path, usable: int, skipped: Mapping[str, str]) -> str:
+    """What to tell the user if a folder has fewer than two usable images.
+
+    Args:
+      skipped: why others cannot be used, by name.
+    """
+    why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
+    return f"{folder}: {usable} usable images, at least 2 are needed{why}"
 
 
 def masks_of(images: Iterable[ImageFile]) -> dict[str, str]:

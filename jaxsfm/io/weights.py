@@ -141,7 +141,8 @@ def read_arrays(data: bytes, *, path: str) -> dict[str, dict[str, dict[str, np.n
     try:
         return _ArrayUnpickler(io.BytesIO(data)).load()
     except Exception as error:  # a damaged pickle can raise almost anything
-        raise UserError(f"{path}: not a readable weights file ({error})") from error
+        why = "it needs more memory than there is" if isinstance(error, MemoryError) else error
+        raise UserError(f"{path}: not a readable weights file ({why})") from error
 
 
 def default_path(backbone: BackboneName = "vgg16") -> Path:

@@ -88,7 +88,7 @@ class WorkFolder(Store):
                 _make_own(database)
             logger.info("%s: as before, nothing it depends on has changed", name)
             return folder
-        with atomic_folder(folder) as fresh:
+        with writing(f"--out {self.path}"), atomic_folder(folder) as fresh:
             compute(fresh)
             (fresh / _KEY).write_text(f"{key} {_content(fresh)}", encoding="ascii")
         return folder
@@ -117,20 +117,21 @@ class WorkFolder(Store):
         If the process is killed while it moves them, the next run moves the rest first. Results
         without a model do not replace results with one: they are put into the folder `failed`.
         """
-        fresh = entry(self.path, FRESH)
-        remove(fresh)
-        fresh.mkdir()
-        yield fresh
-        failed = (self.path / "sparse").exists() and not (fresh / "sparse").exists()
-        if failed:
-            logger.warning(
-                "this run made no model, so the earlier model stays; its report is in %s",
-                self.path / FAILED,
-            )
-        moves = {"failed": failed, "names": [n for n in RESULTS if (fresh / n).exists()]}
-        write_atomic(fresh / _MOVES, json.dumps(moves).encode())
-        fresh.rename(entry(self.path, PUBLISHING))  # from here on they are the results
-        self.finish_publishing()
+        with writing(f"--out {self.path}"):
+            fresh = entry(self.path, FRESH)
+            remove(fresh)
+            fresh.mkdir()
+            yield fresh
+            failed = (self.path / "sparse").exists() and not (fresh / "sparse").exists()
+            if failed:
+                logger.warning(
+                    "this run made no model, so the earlier model stays; its report is in %s",
+                    self.path / FAILED,
+                )
+            moves = {"failed": failed, "names": [n for n in RESULTS if (fresh / n).exists()]}
+            write_atomic(fresh / _MOVES, json.dumps(moves).encode())
+            fresh.rename(entry(self.path, PUBLISHING))  # from here on they are the results
+            self.finish_publishing()
 
     def finish_publishing(self) -> None:
         """Move those of the complete results that have not been moved yet."""

@@ -21,7 +21,7 @@ from jaxsfm.io.entries import FAILED, FRAMES, STILL, entry
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
-from jaxsfm.io.photo_folder import masks_of, with_masks
+from jaxsfm.io.photo_folder import masks_of, too_few, with_masks
 from jaxsfm.io.still_pattern import find_still_pattern
 from jaxsfm.io.video import open_video
 from jaxsfm.io.weights import chosen_weights
@@ -229,8 +229,7 @@ def _same_pixels(images: Sequence[ImageFile], out: Path) -> SamePixels | None:
 
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:
     if len(images) < 2:
-        why = f"; skipped: {next(iter(skipped.values()))}" if skipped else ""
-        raise UserError(f"{folder}: {len(images)} usable images, at least 2 are needed{why}")
+        raise UserError(too_few(folder, len(images), skipped))
 
 
 def _lacks_detail(made: Reconstructed, images: Sequence[ImageFile]) -> bool:

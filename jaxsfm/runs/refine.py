@@ -14,9 +14,10 @@ from jaxsfm.colmap.given_model import (
     read_given_model,
     shares_cameras,
 )
+from jaxsfm.colmap.model_files import write_model
 from jaxsfm.config import Config, Refinement
 from jaxsfm.errors import UserError, writing
-from jaxsfm.io.atomic import SPARE_BYTES, atomic_folder, check_disk_space
+from jaxsfm.io.atomic import atomic_folder
 from jaxsfm.io.entries import named_place
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.libraries import versions
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 REPORT = "refine.json"
-OBSERVATION_BYTES = 60
-"""A model file takes at most so many bytes for each observation: 24 for its keypoint, 8 in its
-track, and half of a point's 51."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -158,8 +156,7 @@ def write_new_folder(
     Raises UserError if the folder cannot be written, or the disk is too small.
     """
     with writing(f"--out {out}"), atomic_folder(named_place(out)) as fresh:
-        check_disk_space(fresh, SPARE_BYTES + OBSERVATION_BYTES * model.compute_num_observations())
-        model.write_binary(fresh)
+        write_model(model, fresh)
         (fresh / name).write_text(json.dumps(report, indent=1), encoding="utf-8")
 
 

@@ -5,9 +5,9 @@ Each stage reads the files of the one before. So a stage whose files exist from 
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
@@ -24,10 +24,14 @@ from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import digest
 from jaxsfm.io.typed_files import read_figures, write_figures
 from jaxsfm.io.work_folder import WorkFolder
-from jaxsfm.sfm.check.check_model import CHECKED_BY, Checked
+from jaxsfm.sfm.check.check_model import CHECKED_BY, MIN_CHECKED_POINTS, Checked
+from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck
 from jaxsfm.sfm.checker import VerifiedPairs
 from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
 from jaxsfm.sfm.one_place import from_one_place
+
+if TYPE_CHECKING:
+    import pycolmap
 
 DATABASE, SPARSE, ALTERNATIVE = "database.db", "sparse", "alternative"
 FIGURES = "figures.msgpack"
@@ -186,11 +190,22 @@ def map_trusted(
 
     key = digest(verified.key, *mapping_settings(given), _plain(trust))
     folder = kept.folder.stage(name, key, compute)
-    return MappedModels(
-        trust=trust,
-        database=folder / DATABASE,
-        models=read_models(folder / SPARSE, folder / DATABASE),
-        checks=read_figures(folder / FIGURES, list[Checked | None]),
+    models = read_models(folder / SPARSE, folder / DATABASE)
+    checks = read_figures(folder / FIGURES, list[Checked | None])
+    if given.config.checked and unchecked(models, checks):
+        kept.folder.forget_stage(name)  # a photo could not be read; perhaps it can next time
+    return MappedModels(trust=trust, database=folder / DATABASE, models=models, checks=checks)
+
+
+def unchecked(
+    models: "Sequence[pycolmap.Reconstruction]", checks: Sequence[Checked | ModelCheck | None]
+) -> bool:
+    """Whether a model is without a check that has photos and points enough for one."""
+    return any(
+        check is None
+        and model.num_reg_images() >= MIN_VIEWS
+        and model.num_points3D() >= MIN_CHECKED_POINTS
+        for model, check in zip(models, checks, strict=True)
     )
 
 

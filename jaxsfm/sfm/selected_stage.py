@@ -33,6 +33,7 @@ from jaxsfm.sfm.mapped_stage import (
     VerifiedStage,
     mapper_of,
     mapping_settings,
+    unchecked,
 )
 from jaxsfm.sfm.mapping import MappedModels, Mapper, MappingFigures
 
@@ -95,6 +96,8 @@ def select_models(
         best, other = second, first
     attempts = [attempt_of(each.models, given.options.mapper) for each in made if each is not None]
 
+    unread: list[bool] = []
+
     def compute(folder: Path) -> None:
         shutil.copyfile(best.database, folder / DATABASE)
         found = _selected(given, mapper, best, other, without)
@@ -104,6 +107,7 @@ def select_models(
             checks=found.checks,
             basis=best.trust.basis,
         )
+        unread.append(given.config.checked and unchecked(found.models, found.checks))
         write_models(found.models, folder / SPARSE)
         write_models(found.alternative, folder / ALTERNATIVE)
         write_figures(folder / FIGURES, figures)
@@ -111,6 +115,8 @@ def select_models(
     models = [fingerprint(model) for each in made if each is not None for model in each.models]
     key = digest(verified.key, *mapping_settings(given), models, sorted(without))
     folder = kept.folder.stage("selected", key, compute)
+    if any(unread):
+        kept.folder.forget_stage("selected")  # a photo could not be read; perhaps it can next time
     return SelectedModels(read_figures(folder / FIGURES, MappingFigures), folder, key)
 
 

@@ -520,9 +520,18 @@ def test_a_photo_that_does_not_fit_into_memory_is_named(scene, tmp_path, monkeyp
     assert "view0.png" in error and "--max-size" in error and "Traceback" not in error
 
 
-def test_running_out_of_memory_is_one_sentence(scene, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("RESOURCE_EXHAUSTED: out of memory allocating 1 TB"),
+        RuntimeError("can't start new thread"),
+        MemoryError(),
+    ],
+    ids=["XLA", "thread", "Python"],
+)
+def test_running_out_of_memory_is_one_sentence(scene, tmp_path, monkeypatch, capsys, error):
     def exhausted(*args, **kwargs):
-        raise RuntimeError("RESOURCE_EXHAUSTED: out of memory allocating 1 TB")
+        raise error
 
     monkeypatch.setattr("jaxsfm.matching.engines.LocalEngine.match_pairs", exhausted)
     args = ["reconstruct", str(scene / "images"), "--out", str(tmp_path / "out")]

@@ -21,7 +21,7 @@ from jaxsfm.colmap.bundle_adjustment import bundle_adjust
 from jaxsfm.colmap.cameras import Cameras
 from jaxsfm.colmap.database import write_database
 from jaxsfm.colmap.map_options import MapOptions
-from jaxsfm.colmap.model_files import read_model, read_models, write_models
+from jaxsfm.colmap.model_files import read_model, read_models, write_model, write_models
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.colmap.reconstruction import colour_points
 from jaxsfm.errors import UserError
@@ -268,3 +268,23 @@ def test_models_with_a_camera_that_their_database_has_not_are_refused(tmp_path, 
     write_database(tmp_path / "d.db", [], {}, Cameras())
     with pytest.raises(UserError, match=r"0: its camera \d is not in d\.db"):
         read_models(tmp_path / "sparse", tmp_path / "d.db")
+
+
+def test_a_model_that_colmap_has_cut_off_is_not_taken_for_written(tmp_path):
+    """On a full disk COLMAP writes what fits, and says nothing."""
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_frames_per_rig=3))
+
+    class Cut:
+        """The model, on a disk that is full after half of a file."""
+
+        def __getattr__(self, name):
+            return getattr(model, name)
+
+        def write_binary(self, folder):
+            model.write_binary(folder)
+            points = folder / "points3D.bin"
+            points.write_bytes(points.read_bytes()[: points.stat().st_size // 2])
+
+    write_model(model, tmp_path)
+    with pytest.raises(UserError, match="cannot be written .the model was cut off: points3D.bin"):
+        write_model(Cut(), tmp_path)

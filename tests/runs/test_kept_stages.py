@@ -135,3 +135,29 @@ def test_a_photo_that_was_away_for_a_moment_is_back_in_the_next_run(scene, tmp_p
     assert main(command) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["images"]["usable"] == 3 and report["images"]["skipped"] == {}
+
+
+@pytest.mark.slow
+def test_a_check_that_a_lost_photo_prevented_is_made_in_the_next_run(scene, tmp_path, monkeypatch):
+    """Otherwise the model would stay without a verdict for good."""
+    from jaxsfm.io.images import ImageError
+    from jaxsfm.sfm import checker
+
+    command = ["reconstruct", str(scene / "images"), "--refine", "0", "--threads", "1"]
+    command += ["--intrinsics", str(scene / "K.txt"), "--out", str(tmp_path / "out")]
+
+    def gone(*_, **__):
+        raise ImageError("gone")
+
+    def checks() -> list:
+        return json.loads((tmp_path / "out" / "report.json").read_text())["checks"]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checker, "check_model", gone)
+        assert main(command) == 0
+    assert checks() == [None]
+    assert main(command) == 0
+    assert checks() != [None]
+    made, original = [], checker.check_model
+    monkeypatch.setattr(checker, "check_model", lambda *a: made.append(1) or original(*a))
+    assert main(command) == 0 and made == []

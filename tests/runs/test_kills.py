@@ -1,18 +1,13 @@
 """Killed at any moment, a run goes on to the very database and model that it would have made."""
 
-import contextlib
 import json
-import os
-import select
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from databases import content
+from kept_runs import results
+from nursery import Nursery
 
 from jaxsfm.bench.synthetic import write_scene
 from jaxsfm.io.atomic import load_arrays
@@ -27,50 +22,12 @@ MOMENTS = 5
 OPTIONS = ("--preset", "paper", "--refine", "1", "--threads", "1", "--pairs", "exhaustive")
 
 
-class Nursery:
-    """See `nursery.py`."""
-
-    def __init__(self, folder: Path) -> None:
-        command = [sys.executable, str(Path(__file__).parents[1] / "nursery.py"), str(folder)]
-        self._process = subprocess.Popen(command, stdin=-1, stdout=-1, text=True, bufsize=1)
-        self.log = folder / "log"
-
-    def run(self, argv: list[str], kill_after: float | None = None) -> tuple[int, float]:
-        """Exit status (minus the signal) and seconds of a command."""
-        assert self._process.stdin and self._process.stdout
-        start = time.monotonic()
-        self._process.stdin.write(json.dumps(argv) + "\n")
-        child = int(self._process.stdout.readline())
-        if kill_after is not None:
-            ended, _, _ = select.select([self._process.stdout], [], [], kill_after)
-            if not ended:
-                with contextlib.suppress(ProcessLookupError):  # at this very moment
-                    os.kill(child, signal.SIGKILL)
-        return int(self._process.stdout.readline()), time.monotonic() - start
-
-    def end(self) -> None:
-        self._process.communicate(timeout=60)
-
-
 @pytest.fixture
 def nursery(tmp_path):
     (tmp_path / "compiled").mkdir()
     made = Nursery(tmp_path / "compiled")
     yield made
     made.end()
-
-
-def results(out: Path) -> dict[str, object]:
-    """What a run leaves that must not depend on how it came there."""
-    files = [*out.glob("matches/*/*"), *out.glob("sparse/*/*")]
-    report = json.loads((out / "report.json").read_text())
-    return {
-        **{str(file.relative_to(out)): file.read_bytes() for file in files},
-        "database": content(out / "database.db"),
-        "report": {
-            name: report[name] for name in ("identity", "pairs", "models", "lost", "refinement")
-        },
-    }
 
 
 def assert_whole(out: Path) -> None:
