@@ -6,6 +6,7 @@ The summary on the screen and the page say the same sentences.
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from jaxsfm.io.entries import STILL
 from jaxsfm.io.images import named, shown_name
 from jaxsfm.sfm.check.model_check import (
     Alternative,
@@ -31,6 +32,10 @@ FOLLOWS: dict[Basis, str] = {
 _UNCONFIRMED = (
     "too few of its points were found in the photos that should show them, so the model is as the "
     "mapper made it"
+)
+_STILL = (
+    "more than half of what holds this model shows at the same pixels in all photos, which nothing "
+    "does that a moving camera passes"
 )
 _OVERLAP = (
     "so that neighbours overlap by more than half and something that occurs only once is in view"
@@ -95,6 +100,8 @@ def model_verdict(check: ModelCheck, model: str = "") -> ModelVerdict:
     headline = in_words(colour)
     if colour == "amber" and check.unconfirmed:
         headline = f"{colour}: the photos do not show most points of the model"
+    elif colour == "amber" and check.same_pixels:
+        headline = f"{colour}: most of the model stays at the same pixels in all photos"
     elif colour == "amber" and check.scale_drift:
         headline = f"{colour}: the scale of a part of the model may have drifted"
     elif colour == "amber" and places:
@@ -118,6 +125,7 @@ def _reasons(check: ModelCheck, places: Sequence[PoseAmbiguity]) -> list[Reason]
         Reason("neighbours", [_apart(pair) for pair in check.apart]),
         Reason("split", [_split_groups(check.split_groups)] if check.split_groups else []),
         Reason("scale", [_scale_drift(check.scale_drift)] if check.scale_drift else []),
+        Reason("same pixels", [Finding(_STILL)] if check.same_pixels else []),
         Reason("not refined", [Finding(_UNCONFIRMED)] if check.unconfirmed else []),
     ]
     return [reason for reason in reasons if reason.findings]
@@ -215,6 +223,8 @@ def _advice(check: ModelCheck, places: Sequence[PoseAmbiguity]) -> str:
             "do not use this model before you have looked at it; add photos that overlap more, and "
             f"--intrinsics if the camera is known, {_AGAIN}"
         )
+    if check.same_pixels:
+        return f"mask what stays: look at {STILL}, add --masks with this file, {_AGAIN}"
     if check.scale_drift:
         return (
             "do not trust distances in this model; look where these photos and the others meet, "

@@ -22,7 +22,7 @@ from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.photo_folder import masks_of, too_few, with_masks
-from jaxsfm.io.still_pattern import find_still_pattern
+from jaxsfm.io.still_pattern import StillPattern, find_still_pattern
 from jaxsfm.io.video import open_video
 from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import lock_folder, open_folder
@@ -42,6 +42,7 @@ from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
 from jaxsfm.runs.run_stages import RunStages
 from jaxsfm.runs.video.frames import frames_folder
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
+from jaxsfm.sfm.check.still_model import with_still_models
 from jaxsfm.sfm.refined_stage import Reconstructed
 
 logger = logging.getLogger("jaxsfm")
@@ -119,7 +120,7 @@ def reconstruct_folder(
             seed=options.seed,
             progress=options.progress,
         )
-        same_pixels = None if options.masks else _same_pixels(usable, out)
+        still = None if options.masks else _still_pattern(usable, out)
         skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
         if selection.retrieval:
             with timed(seconds, "retrieval"):
@@ -159,7 +160,7 @@ def reconstruct_folder(
                 low_resolution = dataclasses.replace(low_resolution, whole=True)
                 matched = photos.match_at_full_size(matched.counts, seconds)
                 models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
-            made = models.made
+            made = models.made if still is None else with_still_models(models.made, still.still)
             moved = stages.write(made, target)
             report = run_report(
                 StageResults(
@@ -174,7 +175,7 @@ def reconstruct_folder(
                     georeference=moved,
                     weights=msgspec.convert(weights.described(config), UsedWeights),
                     low_resolution=low_resolution,
-                    same_pixels=same_pixels,
+                    same_pixels=still and _in_report(still),
                     seconds=seconds,
                 ),
                 config=config,
@@ -213,18 +214,20 @@ def reconstruct_video(video: Path, out: Path, *, config: Config, options: RunOpt
     return reconstruct_folder(out / FRAMES, out, config=config, options=options)
 
 
-def _same_pixels(images: Sequence[ImageFile], out: Path) -> SamePixels | None:
+def _still_pattern(images: Sequence[ImageFile], out: Path) -> StillPattern | None:
     """What shows at the same pixels in all photos; its mask is written into the work folder.
 
     It is only told: whoever sees the mask knows whether it is part of the scene.
     """
     found = remark("what stays at the same pixels", lambda: find_still_pattern(images))
-    if found is None:
-        return None
-    write_atomic(entry(out, STILL), found.mask())
-    same = SamePixels(share=found.share, photos=found.photos)
-    logger.warning("%s (%s)", same.in_words(), out / STILL)
-    return same
+    if found is not None:
+        write_atomic(entry(out, STILL), found.mask())
+        logger.warning("%s (%s)", _in_report(found).in_words(), out / STILL)
+    return found
+
+
+def _in_report(found: StillPattern) -> SamePixels:
+    return SamePixels(share=found.share, photos=found.photos)
 
 
 def _check_enough(folder: Path, images: list[ImageFile], skipped: dict[str, str]) -> None:

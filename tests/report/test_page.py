@@ -295,7 +295,11 @@ def test_the_page_names_the_camera_that_the_photos_speak_for(plain):
 
 @pytest.mark.parametrize(
     ("doubt", "label"),
-    [({"unconfirmed": True}, "Not refined"), ({"scale_drift": NAMES[:2]}, "Scale")],
+    [
+        ({"unconfirmed": True}, "Not refined"),
+        ({"scale_drift": NAMES[:2]}, "Scale"),
+        ({"same_pixels": True}, "Same pixels"),
+    ],
 )
 def test_the_page_says_what_speaks_against_a_model_as_a_whole(plain, doubt, label):
     run = read_run(plain[0])

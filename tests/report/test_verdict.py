@@ -144,6 +144,16 @@ def test_a_model_of_which_the_photos_show_few_points_is_amber():
     assert "do not use this model before you have looked at it" in advice
 
 
+def test_a_model_of_still_pixels_is_amber_and_its_mask_is_named():
+    verdict = model_verdict(dataclasses.replace(check_of("green"), same_pixels=True))
+    head, said, advice = verdict_lines([verdict])
+    assert head == (
+        "verdict          amber: most of the model stays at the same pixels in all photos"
+    )
+    assert said.startswith("same pixels      more than half of what holds this model")
+    assert "--masks" in advice and "still.png" in advice
+
+
 def test_the_model_that_was_split_off_is_shown_as_one_way_to_join_the_groups():
     whole = Alternative(basis="order", images=8, elsewhere=NAMES[3:], contradicted=9, whole=True)
     groups = [NAMES[:3], NAMES[3:5]]

@@ -3,8 +3,9 @@
 import dataclasses
 
 import numpy as np
+import pycolmap
 import pytest
-from room_scene import Room, exact_model, exact_tracks, images_of
+from room_scene import SIZE, Room, exact_model, exact_tracks, images_of
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.config import Refinement
@@ -68,6 +69,23 @@ def test_rays_meet_where_the_points_are(rendered):
     np.testing.assert_allclose(found.points, rendered.points, atol=1e-6)
     alone = model.select(model.tracks.view == 0)
     assert np.isnan(triangulated(alone).tracks.points).all()
+
+
+def test_a_camera_whose_distortion_cannot_be_undone_gives_no_rays(rendered):
+    """A mapper that follows false matches may end with such a camera."""
+    model = exact_model(rendered)
+    (width, height), focal = SIZE, model.views[0].camera.mean_focal_length()
+    params = [focal, width / 2, height / 2, -5.0]
+    bent = pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+    views = [dataclasses.replace(model.views[0], camera=bent), *model.views[1:]]
+    tracks = model.tracks
+    own = tracks.view == 0
+    lost = ~np.isfinite(views[0].rays(tracks.xy[own])).all(1)
+    assert lost.any()
+    found = triangulated(Model(views, tracks)).tracks.points
+    others = np.bincount(tracks.point[~own], minlength=len(found))
+    seen_well = np.setdiff1d(np.flatnonzero(others > 1), tracks.point[own][~lost])
+    np.testing.assert_allclose(found[seen_well], rendered.points[seen_well], atol=1e-6)
 
 
 def test_what_has_a_point_gets_no_other_and_the_rest_is_found_where_it_is(rendered):

@@ -112,13 +112,16 @@ class ModelCheck:
     unconfirmed: bool = False
     """Whether the model was not refined, because too few of its points were found in the photos
     that should show them."""
+    same_pixels: bool = False
+    """Whether most of what the photos show of the model stays at the same pixels in all of them
+    (`jaxsfm.sfm.check.still_model`)."""
 
     @property
     def verdict(self) -> VerdictColour:
         """Whether the model may be wrong."""
         if self.contradictions:
             return "red"
-        speaks_against = self.apart or self.unconfirmed or self.doubted()
+        speaks_against = self.apart or self.unconfirmed or self.same_pixels or self.doubted()
         return "amber" if speaks_against else "green"
 
     def doubted(self) -> bool:

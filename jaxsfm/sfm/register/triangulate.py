@@ -83,18 +83,21 @@ def matched_tracks(
 def triangulated(model: Model) -> Model:
     """The model with every point at the least squares of distances to its observations' rays.
 
-    The point is NaN where the rays are parallel or there are fewer than two.
+    The point is NaN where the rays are parallel or there are fewer than two. Where a camera's
+    distortion cannot be undone, an observation has no ray, and does not count.
     """
     tracks = model.tracks
     normal = np.zeros((len(tracks.points), 3, 3))
     right = np.zeros((len(tracks.points), 3))
     for k, view in enumerate(model.views):
         own = tracks.view == k
-        ray = view.rays(tracks.xy[own])
+        ray, point = view.rays(tracks.xy[own]), tracks.point[own]
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        there = np.isfinite(ray).all(1)
+        ray, point = ray[there], point[there]
         across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-        np.add.at(normal, tracks.point[own], across)
-        np.add.at(right, tracks.point[own], across @ view.centre)
+        np.add.at(normal, point, across)
+        np.add.at(right, point, across @ view.centre)
     # Parallel rays leave the depth unknown: the least eigenvalue is the squared sine between them.
     solvable = np.linalg.eigvalsh(normal)[:, 0] > 1e-6
     points = np.full(tracks.points.shape, np.nan)
