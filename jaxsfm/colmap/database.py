@@ -133,16 +133,20 @@ def write_keypoint_matches(
     _write(path, images, found.keypoints, rows, cameras)
 
 
+class CannotOpen(UserError):
+    """COLMAP cannot open a database."""
+
+
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[pycolmap.Database]:
     """Open a database, which COLMAP makes if it is missing, and writes into even to read it.
 
-    Raises UserError if COLMAP cannot open it.
+    Raises CannotOpen.
     """
     try:
         database = pycolmap.Database.open(path)
     except RuntimeError as error:
-        raise UserError(
+        raise CannotOpen(
             f"{path}: COLMAP cannot open this database; it needs space on the disk and the "
             "permission to write, even to read it"
         ) from error
@@ -154,7 +158,7 @@ def opened(path: Path) -> Iterator[pycolmap.Database]:
 def changed(path: Path) -> Iterator[pycolmap.Database]:
     """Open a database for changes, which are made together when the block ends.
 
-    Raises UserError if COLMAP cannot open it, or SQLite's journal, which holds what is changed as
+    Raises CannotOpen, or UserError if SQLite's journal, which holds what is changed as
     it was, does not fit on the disk: then COLMAP would end the process.
     """
     size = path.stat().st_size if path.exists() else 0

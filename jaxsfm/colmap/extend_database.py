@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.database import PIXEL_OFFSET, changed, opened, read_images
+from jaxsfm.colmap.database import PIXEL_OFFSET, CannotOpen, changed, opened, read_images
 from jaxsfm.colmap.two_views import VerificationOptions, read_two_views, verify
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
@@ -45,6 +45,9 @@ def used_by_colmap(path: Path) -> Iterator[None]:
         yield
     except RuntimeError as error:  # of SQLite in COLMAP, such as a constraint that failed
         raise UserError(f"{path}: COLMAP cannot use this database ({error})") from error
+    except CannotOpen as error:  # of a copy, which the user does not know
+        why = "it is damaged, or the disk has no space for a copy"
+        raise UserError(f"{path}: COLMAP cannot open this database; {why}") from error
 
 
 def copy_database(source: Path, target: Path, matches: int) -> None:
