@@ -21,7 +21,6 @@ from jaxsfm.core import (
     align,
     blocks,
     bundle,
-    bundle_normal,
     bundle_problem,
     cameras,
     consensus,
@@ -217,7 +216,7 @@ def _eliminated(scene, problem) -> tuple:
     """The quadratic model and its factor, with any numbers."""
 
     def made(scene, problem):
-        model = bundle_normal.normal(scene, problem, "huber", exact=False)
+        model = bundle_problem.normal(scene, problem, "huber", exact=False)
         return model, schur.factor(model, problem.layout, damping=0.1, tolerance=0.1)
 
     model, factor = jax.tree.map(
@@ -404,15 +403,15 @@ def calls() -> dict[str, Call]:
         "bundle.triangulated": Call(
             bundle.triangulated, (scene.poses, scene.params, seen, layout), (0,)
         ),
-        "bundle_normal.cost": Call(_bind(bundle_normal.cost, loss="cauchy"), (scene, problem)),
-        "bundle_normal.normal": Call(
-            _bind(bundle_normal.normal, loss="cauchy", exact=False), (scene, problem)
+        "bundle_problem.cost": Call(_bind(bundle_problem.cost, loss="cauchy"), (scene, problem)),
+        "bundle_problem.normal": Call(
+            _bind(bundle_problem.normal, loss="cauchy", exact=False), (scene, problem)
         ),
-        "bundle_normal.normal[exact]": Call(
-            _bind(bundle_normal.normal, loss="huber", exact=True), (scene, problem), slow=True
+        "bundle_problem.normal[exact]": Call(
+            _bind(bundle_problem.normal, loss="huber", exact=True), (scene, problem), slow=True
         ),
-        "bundle_normal.slope_of": Call(
-            _bind(bundle_normal.slope_of, loss="cauchy"), (scene, problem)
+        "bundle_problem.slope_of": Call(
+            _bind(bundle_problem.slope_of, loss="cauchy"), (scene, problem)
         ),
         "bundle_problem.robust": Call(
             _bind(bundle_problem.robust, loss="huber"), (np.abs(_floats(3, 9)), one)
@@ -424,7 +423,7 @@ def calls() -> dict[str, Call]:
         "cameras.spread": Call(_bind(cameras.spread, dtype=np.float32), (n([0, 5]),)),
         "cameras.numbers_of": Call(cameras.numbers_of, (scene.params, layout.model), (0,)),
         "cameras.projected": Call(cameras.projected, (numbers, fisheye, ray), (0,)),
-        "cameras.slopes": Call(cameras.slopes, (numbers, fisheye, ray)),
+        "cameras.slopes": Call(cameras.slopes, (numbers, fisheye, ray, _floats(5, 2, 10, 9))),
         "cameras.directions": Call(cameras.directions, (numbers, fisheye, ray[:2]), (0,)),
         "coarse_to_fine.window_cells": Call(
             c2f.window_cells, (cells[:, 0], f0.coarse_grid, f0.fine_grid)

@@ -17,8 +17,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsfm.core.bundle_normal import cost, normal, slope_of
-from jaxsfm.core.bundle_problem import Layout, Loss, Observations, Poses, Problem, Scene, moved
+from jaxsfm.core.bundle_problem import (
+    Layout,
+    Loss,
+    Observations,
+    Poses,
+    Problem,
+    Scene,
+    cost,
+    moved,
+    normal,
+    slope_of,
+)
 from jaxsfm.core.cameras import directions, numbers_of
 from jaxsfm.core.levenberg_marquardt import minimise
 from jaxsfm.core.numerics import HIGHEST, inverse_norm, unit
@@ -118,7 +128,7 @@ def adjust(
     slope = slope_of(scene, problem, loss)
     step = solve(made, slope)
     squared = sum(jnp.sum(x * g) for x, g in zip(step, slope, strict=True))
-    converged = made.solved & (squared < jnp.sum(fixed.weight) * CONVERGED_PX**2)
+    converged = made.solved & (jnp.abs(squared) < jnp.sum(fixed.weight) * CONVERGED_PX**2)
     scene = moved(scene, layout, *(jnp.where(converged, -x, 0.0) for x in step))
     least = lax.stop_gradient(cost(scene, fixed, loss))
     seen = (jnp.trace(model.points, axis1=1, axis2=2) > 0) | ~layout.free.points

@@ -7,7 +7,6 @@ of several models, and there is one program for all.
 Source: COLMAP's sensor/models.h. Its undistorted pinhole and OpenCV's models are special cases.
 """
 
-import functools
 from collections.abc import Sequence
 
 import jax
@@ -78,8 +77,8 @@ def numbers_of(
 
 
 def projected(
-    numbers: Float[Array, "10 *n"], fisheye: Float[Array, " *n"], rays: Float[Array, "3 *n"]
-) -> Float[Array, "2 *n"]:
+    numbers: Float[Array, "10 ..."], fisheye: Float[Array, "..."], rays: Float[Array, "3 ..."]
+) -> Float[Array, "2 ..."]:
     """Places on the photo, pixels. Coordinates are the first axis, so that their arrays are long.
 
     A fisheye sees rays at any angle from its axis. Other cameras project what lies behind them
@@ -112,33 +111,20 @@ def _scale(fisheye: Array, square: Array, z: Array) -> Array:
 
 
 def slopes(
-    numbers: Float[Array, "10 n"], fisheye: Float[Array, " n"], rays: Float[Array, "3 n"]
-) -> tuple[Float[Array, "10 2 n"], Float[Array, "3 2 n"]]:
-    """The derivatives of `projected` in the ten numbers and in the ray."""
-    fx, fy, _, _, k1, k2, k3, k4, p1, p2 = numbers
-    x, y, z = rays
-    given, zero, one = (x * x + y * y, z), jnp.zeros_like(z), jnp.ones_like(z)
-    by = functools.partial(jax.jvp, functools.partial(_scale, fisheye), given)
-    (scale, by_square), (_, by_z) = by((one, zero)), by((zero, one))
-    u, v = x * scale, y * scale
-    s = u * u + v * v
-    radial = 1 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
-    twice = 2 * (k1 + s * (2 * k2 + s * (3 * k3 + s * 4 * k4)))
-    mixed = u * v * twice + 2 * (p1 * u + p2 * v)
-    bent = (
-        (fx * (radial + u * u * twice + 2 * p1 * v + 6 * p2 * u), fx * mixed),
-        (fy * mixed, fy * (radial + v * v * twice + 2 * p2 * u + 6 * p1 * v)),
-    )
-    steps = 2 * by_square * jnp.stack([x * x, x * y, y * y])
-    ways = (scale + steps[0], steps[1]), (steps[1], scale + steps[2]), (x * by_z, y * by_z)
-    by_ray = [[du * one_u + dv * one_v for one_u, one_v in bent] for du, dv in ways]
-    powers = [[fx * u * s**n, fy * v * s**n] for n in (1, 2, 3, 4)]
-    bends = [fx * 2 * u * v, fy * (s + 2 * v * v)], [fx * (s + 2 * u * u), fy * 2 * u * v]
-    out = u * radial + 2 * p1 * u * v + p2 * (s + 2 * u * u)
-    down = v * radial + 2 * p2 * u * v + p1 * (s + 2 * v * v)
-    lengths = [out, zero], [zero, down], [one, zero], [zero, one]
-    by_number = jnp.stack([jnp.stack(pair) for pair in (*lengths, *powers, *bends)])
-    return by_number, jnp.stack([jnp.stack(pair) for pair in by_ray])
+    numbers: Float[Array, "10 n"],
+    fisheye: Float[Array, " n"],
+    rays: Float[Array, "3 n"],
+    ways: Float[Array, "m 10 n"],
+) -> Float[Array, "_ 2 n"]:
+    """The derivatives of `projected` along m ways of the ten numbers, and then in the ray."""
+    still, axes = jnp.zeros_like(rays), jnp.eye(3, dtype=rays.dtype)[..., None]
+    by = [(way, still) for way in ways]
+    by += [(jnp.zeros_like(numbers), still + axis) for axis in axes]
+
+    def project(n, r):
+        return projected(n, fisheye, r)
+
+    return jnp.stack([jax.jvp(project, (numbers, rays), one)[1] for one in by])
 
 
 def directions(
@@ -152,7 +138,7 @@ def directions(
 
     def nearer(_, uv):
         rays = jnp.stack([*uv, jnp.ones_like(uv[0])])
-        (a, c), (b, d), _ = slopes(numbers, fisheye, rays)[1]
+        (a, c), (b, d), _ = slopes(numbers, fisheye, rays, jnp.zeros_like(numbers[None])[:0])
         left, up = xy - projected(numbers, fisheye, rays)
         determinant = a * d - b * c
         return uv + jnp.stack([d * left - b * up, a * up - c * left]) / determinant

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsfm.core.bundle_normal import Normal, cost, normal
-from jaxsfm.core.bundle_problem import Loss, Problem, Scene, moved
+from jaxsfm.core.bundle_problem import Loss, Normal, Problem, Scene, cost, moved, normal
 from jaxsfm.core.schur import factor, solve
 
 DAMPING = 1e-4

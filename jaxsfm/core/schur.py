@@ -16,8 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsfm.core.bundle_normal import Normal
-from jaxsfm.core.bundle_problem import Layout, gathered, places
+from jaxsfm.core.bundle_problem import Layout, Normal, gathered, places
 from jaxsfm.core.numerics import HIGHEST
 
 triangular_solve = functools.partial(lax.linalg.triangular_solve, left_side=True, lower=True)
@@ -27,24 +26,15 @@ class Factor(NamedTuple):
     """What solves H + damping diag(H) for any right side."""
 
     layout: Layout
-    inverse: Float[Array, "p 3 3"]
-    """Of the lower factors of the points' blocks; 0 where rows do not determine a point."""
-    mixed: Float[Array, "s b 3 d"]
-    """The rows' mixed blocks, times `inverse`."""
-    photos: Float[Array, "c d d"]
-    """The photos' blocks before points are eliminated."""
-    blocks: Float[Array, "c d d"]
-    """And after."""
-    added: Float[Array, " z"]
-    """What damping adds to the diagonal, and 1 for numbers that are held."""
-    lower: Float[Array, "z z"] | None
-    """The factor of the reduced system, where it is a matrix."""
-    determined: Bool[Array, " p"]
-    """Which points the rows determine. Others stay, and do not count."""
-    solved: Bool[Array, ""]
-    """Whether the rows determine poses and cameras. Without a matrix it is not known, and true."""
-    tolerance: Float[Array, ""]
-    """Of conjugate gradients, as a share of the right side."""
+    inverse: Float[Array, "p 3 3"]  # of the points' lower factors; 0 where not determined
+    mixed: Float[Array, "s b 3 d"]  # the rows' mixed blocks, times `inverse`
+    photos: Float[Array, "c d d"]  # the photos' blocks before points are eliminated
+    blocks: Float[Array, "c d d"]  # and after
+    added: Float[Array, " z"]  # to the diagonal: damping, and 1 for numbers that are held
+    lower: Float[Array, "z z"] | None  # the factor of the reduced system, if it is a matrix
+    determined: Bool[Array, " p"]  # which points the rows determine; others do not count
+    solved: Bool[Array, ""]  # whether they determine the rest; without a matrix, true
+    tolerance: Float[Array, ""]  # of conjugate gradients, as a share of the right side
 
 
 def factor(
@@ -119,25 +109,15 @@ def _reduced(made: Factor) -> Float[Array, "z z"]:
 
 def _to_points(made: Factor, x: Float[Array, " z"]) -> Float[Array, "p 3"]:
     """The mixed blocks times the numbers of the photos."""
-    by = x[places(made.layout)]
-
-    def one(sums, rows):
-        photo, point, mixed = rows
-        return sums.at[point].add((mixed * by[photo][:, None]).sum(-1)), None
-
-    rows = made.layout.photo, made.layout.point, made.mixed
-    return lax.scan(one, jnp.zeros(made.inverse.shape[:2], x.dtype), rows)[0]
+    by = x[places(made.layout)][made.layout.photo]
+    rows = (made.mixed * by[..., None, :]).sum(-1)
+    return jnp.zeros(made.inverse.shape[:2], x.dtype).at[made.layout.point].add(rows)
 
 
 def _to_photos(made: Factor, own: Float[Array, "p 3"]) -> Float[Array, " z"]:
     """The mixed blocks, transposed, times the numbers of the points."""
-
-    def one(sums, rows):
-        photo, point, mixed = rows
-        return sums.at[photo].add((mixed * own[point][..., None]).sum(1)), None
-
-    rows = made.layout.photo, made.layout.point, made.mixed
-    sums = lax.scan(one, jnp.zeros(made.blocks.shape[:2], own.dtype), rows)[0]
+    rows = (made.mixed * own[made.layout.point][..., None]).sum(-2)
+    sums = jnp.zeros(made.blocks.shape[:2], own.dtype).at[made.layout.photo].add(rows)
     return gathered(sums, made.layout)
 
 

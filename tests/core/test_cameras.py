@@ -1,6 +1,7 @@
 """Laws of camera models."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pycolmap
 import pytest
@@ -32,7 +33,8 @@ def _all(params, model, rays):
     derivative = jax.jacfwd(lambda *x: projected(x[0], fisheye, x[1]), (0, 1))
     xy = projected(*wide, rays)
     forward = jax.vmap(derivative, (None, 1))(numbers, rays)
-    return xy, slopes(*wide, rays), forward, directions(*wide, xy)
+    ways = jnp.eye(10)[..., None] + 0 * wide[0]
+    return xy, slopes(*wide, rays, ways), forward, directions(*wide, xy)
 
 
 def projections(model: str, rays: np.ndarray):
@@ -60,8 +62,8 @@ def test_a_projection_is_that_of_colmap(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_slopes_are_those_of_forward_mode(model):
-    _, (by_number, by_ray), forward, _ = projections(model, rays_of(model))
-    for ours, theirs in zip((by_number, by_ray), forward, strict=True):
+    _, found, forward, _ = projections(model, rays_of(model))
+    for ours, theirs in zip((found[:10], found[10:]), forward, strict=True):
         np.testing.assert_allclose(ours.T, theirs, rtol=1e-9, atol=1e-9)
 
 

@@ -66,7 +66,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/alexnet": (BACKBONES,),
     "core/align": ALIGN,
     "core/blocks": ("tests/core/test_blocks.py", "tests/core/test_vgg.py"),
-    "core/bundle_normal": ("tests/core/test_bundle.py",),
     "core/bundle_problem": ("tests/core/test_bundle.py",),
     "core/cameras": ("tests/core/test_cameras.py",),
     "core/features": ("tests/core/test_features.py", BACKBONES),
