@@ -53,7 +53,8 @@ class Adjustment(NamedTuple):
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
     """False if the observations do not determine what is free, or if there were too few steps. Then
-    the scene is the last one found, and its gradient is zero."""
+    the scene is the last one found, and its gradient is zero. Photos of one place are noticed in
+    float64 only, and nothing undetermined is without a matrix of the photos."""
 
 
 def problem_of(
@@ -128,11 +129,13 @@ def adjust(
     slope = slope_of(scene, problem, loss)
     step = solve(made, slope)
     squared = sum(jnp.sum(x * g) for x, g in zip(step, slope, strict=True))
-    converged = made.solved & (jnp.abs(squared) < jnp.sum(fixed.weight) * CONVERGED_PX**2)
+    moving = jnp.trace(model.points, axis1=1, axis2=2) > 0
+    unknown = jnp.sum(made.added == 0) + 3 * jnp.sum(moving)  # held numbers have 1 there
+    converged = made.solved & (2 * jnp.sum(fixed.weight > 0) >= unknown)
+    converged &= jnp.abs(squared) < jnp.sum(fixed.weight) * CONVERGED_PX**2
     scene = moved(scene, layout, *(jnp.where(converged, -x, 0.0) for x in step))
     least = lax.stop_gradient(cost(scene, fixed, loss))
-    seen = (jnp.trace(model.points, axis1=1, axis2=2) > 0) | ~layout.free.points
-    determined = converged & made.determined & seen
+    determined = converged & made.determined & (moving | ~layout.free.points)
     return Adjustment(_scaled(scene, size), least, determined, found.steps, converged)
 
 

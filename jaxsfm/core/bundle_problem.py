@@ -120,11 +120,11 @@ def layout_of(
     photo, point, camera, model = (np.asarray(x, np.int32) for x in (photo, point, camera, model))
     chunk = max(min(CHUNK, len(photo)), 1)
     end = -(-len(photo) // chunk) * chunk
-    rows = (np.pad(x, (0, end - len(x))).reshape(-1, chunk) for x in (photo, point))
+    one, other = (np.pad(x, (0, end - len(x))).reshape(-1, chunk) for x in (photo, point))
     columns = np.flatnonzero(np.asarray(free.params).any(0)).astype(np.int32)
     dense = photos <= MOST_PHOTOS if dense is None else dense
     pairs = _pairs(photo, point, photos, nothing=end) if dense else None
-    return Layout(*rows, camera, model, free, columns, pairs)
+    return Layout(one, other, camera, model, free, columns, pairs)
 
 
 def _pairs(photo: np.ndarray, point: np.ndarray, photos: int, *, nothing: int) -> tuple:

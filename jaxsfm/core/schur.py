@@ -144,7 +144,7 @@ def _iterated(made: Factor, right: Float[Array, " z"]) -> Float[Array, " z"]:
     found, _ = jax.scipy.sparse.linalg.cg(
         lambda x: unit * _multiplied(made, unit * x),
         unit * right,
-        tol=made.tolerance,
+        tol=made.tolerance,  # pyright: ignore[reportArgumentType]  # it may be traced
         maxiter=10 * len(right),
         M=preconditioned,
     )

@@ -108,6 +108,8 @@ def scene(
     places = np.arange(photos)[:, None] * [1.0, 0.2, 0.1] + 0.1 * rng.normal(size=(photos, 3))
     poses = poses_of(turns(rng, photos, 0.1), places)
     points = np.column_stack([rng.uniform([-2, -2, 4], [4, 2, 9], (count, 3)), np.ones(count)])
+    if photos > 10:  # the box is long
+        points[:, :3] += np.linspace(0, photos, count)[:, None] * [1.0, 0.2, 0.1]
     models = [model, "PINHOLE" if known else "OPENCV"]
     camera = np.minimum(np.arange(photos), 1) * (np.arange(photos) < 2)
     exact = photographed(poses, points, [models[k] for k in camera])
@@ -137,8 +139,9 @@ def single(tree):
     return jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == np.float64 else x, tree)
 
 
-def check_gradient(made: Made, *, scale: float, loss="cauchy"):
-    """The gradient along a random way of each part, beside central differences."""
+def check_gradient(made: Made, *, scale: float, loss="cauchy", shrink=1.0):
+    """The gradient along a random way of each part, beside central differences. `shrink` makes
+    their steps smaller."""
     start, seen, layout = made.given
     rng, free = rng_of(3), layout.free
     still = ~free.poses.any(1)
@@ -160,7 +163,7 @@ def check_gradient(made: Made, *, scale: float, loss="cauchy"):
     (_, found), slopes = solved(start, seen, layout, scale=scale, loss=loss)
     assert found.converged and found.cost > 10
     for part, (k, way, step) in ways.items():
-        values = {}
+        step, values = shrink * step, {}
         for by in (-2, -1, 1, 2):
             data = [start, seen, np.float64(scale)]
             data[k] = jax.tree.map(lambda x, d, by=by * step: x + by * d, data[k], way)
@@ -183,7 +186,8 @@ def test_the_gradient_is_that_of_central_differences(model):
 
 @pytest.mark.slow
 def test_the_gradient_of_hubers_loss_is_that_of_central_differences():
-    check_gradient(scene(2, model="RADIAL"), scale=1.0, loss="huber")
+    """Its second derivative jumps, so no residual may pass the scale within a step."""
+    check_gradient(scene(2, model="RADIAL"), scale=1.0, loss="huber", shrink=0.01)
 
 
 def test_the_gradient_of_ten_photos_without_a_matrix_is_that_of_central_differences(monkeypatch):
@@ -196,14 +200,16 @@ def test_the_gradient_of_ten_photos_without_a_matrix_is_that_of_central_differen
 
 @pytest.mark.slow
 def test_two_hundred_photos_have_the_same_minimum_and_gradient_with_and_without_a_matrix():
-    """A point is seen by eight photos beside each other."""
-    results = []
+    """A point is seen by nine photos beside each other."""
+    results, made = [], scene(4, photos=200, count=400, known=True, dense=False)
+    photo, point = (x.ravel() for x in np.mgrid[:200, :400])
+    near = np.abs(photo - point / 2) < 5
+    _, (xy, _), layout = made.given
+    start = Scene(made.poses, made.points, made.params)
     for dense in (True, False):
-        made = scene(4, photos=200, count=400, dense=dense)
-        photo, point = np.mgrid[:200, :400]
-        near = np.abs(photo - point / 2) <= 4
-        made.weight[~near] = 0
-        results.append(solved(*made.given, scale=5.0))
+        how = {"camera": layout.camera, "model": layout.model, "dense": dense}
+        own = layout_of(photo[near], point[near], layout.free, **how)
+        results.append(solved(start, Observations(xy[near], np.ones(near.sum())), own, scale=5.0))
     (_, one), slopes = results[0]
     (_, other), others = results[1]
     assert one.converged and other.converged
@@ -252,9 +258,9 @@ def test_in_float32_poses_are_right_to_the_rounding_of_keypoints():
     assert found.converged and found.scene.points.dtype == np.float32
     reference = jax.tree.map(jnp.asarray, single(made.poses))
     assert np.sqrt(pose_loss(jax.tree.map(jnp.asarray, found.scene.poses), reference)) < 1e-5
-    for kind in DEGENERATE:
+    for kind in ("four points", "no weights", "a blind photo"):
         (_, found), slopes = solved(*single(degenerate(kind).given), scale=5.0)
-        assert not found.converged
+        assert not found.converged, kind
         assert not any(np.any(x) for x in jax.tree.leaves(slopes[1]))
 
 
@@ -413,7 +419,7 @@ def test_scenes_of_a_batch_are_adjusted_as_they_are_alone():
 def test_memory_grows_with_the_rows_and_not_with_photos_times_points():
     sizes = []
     for photos, count in ((40, 1000), (40, 2000), (80, 2000)):
-        made = scene(18, photos=photos, count=count, known=True)
+        made = scene(18, photos=photos, count=count, known=True, dense=False)
         photo, point = (np.repeat(np.arange(n), m) for n, m in ((photos, 1), (count, 4)))
         photo = (point + np.tile(np.arange(4), count)) % photos
         layout = layout_of(
