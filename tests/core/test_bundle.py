@@ -198,26 +198,6 @@ def test_the_gradient_of_ten_photos_without_a_matrix_is_that_of_central_differen
     check_gradient(made, scale=4.0)
 
 
-@pytest.mark.slow
-def test_two_hundred_photos_have_the_same_minimum_and_gradient_with_and_without_a_matrix():
-    """A point is seen by nine photos beside each other."""
-    results, made = [], scene(4, photos=200, count=400, known=True, dense=False)
-    photo, point = (x.ravel() for x in np.mgrid[:200, :400])
-    near = np.abs(photo - point / 2) < 5
-    _, (xy, _), layout = made.given
-    start = Scene(made.poses, made.points, made.params)
-    for dense in (True, False):
-        how = {"camera": layout.camera, "model": layout.model, "dense": dense}
-        own = layout_of(photo[near], point[near], layout.free, **how)
-        results.append(solved(start, Observations(xy[near], np.ones(near.sum())), own, scale=5.0))
-    (_, one), slopes = results[0]
-    (_, other), others = results[1]
-    assert one.converged and other.converged
-    np.testing.assert_allclose(other.cost, one.cost, rtol=1e-9)
-    scale = np.abs(slopes[1].xy).max()
-    np.testing.assert_allclose(others[1].xy / scale, slopes[1].xy / scale, atol=1e-6)
-
-
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_optimum_is_that_of_scipy(seed):
     made = scene(seed, known=True)
