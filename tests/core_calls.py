@@ -22,11 +22,13 @@ from jaxsfm.core import (
     align,
     blocks,
     bundle,
-    bundle_steps,
+    bundle_problem,
+    cameras,
     consensus,
     grid,
     interpolate,
     lanes,
+    levenberg_marquardt,
     losses,
     matching,
     naive,
@@ -38,6 +40,7 @@ from jaxsfm.core import (
     ransac,
     relocalize,
     retrieval,
+    schur,
     scores,
     sharded,
     soft_matching,
@@ -77,6 +80,8 @@ class Call(NamedTuple):
 
 
 WITHOUT_ARRAYS = {
+    "bundle_problem.layout_of",
+    "cameras.intrinsics_of",
     "consensus.weights",
     "octaves.octave_capacity",
     "scores.heads_of",
@@ -187,20 +192,39 @@ def _cameras() -> tuple[np.ndarray, ...]:
     return k, k, rotation, _floats(6, 3)
 
 
-def _scene() -> tuple[bundle_steps.Scene, bundle_steps.Measured]:
-    """Three cameras beside each other, and twelve points before them."""
+def _adjusted() -> tuple:
+    """Three photos of a camera beside each other, and twelve points before them; one pose and some
+    of the intrinsics are held."""
     points = _floats(5, 12, 4, scale=0.3) + np.float32([0, 0, 3, 0.6])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    scene = bundle_steps.Scene(
-        np.stack([np.eye(3, dtype=np.float32)] * 3),
-        np.float32([[0, 0, 0], [-1, 0, 0], [-2, 0.5, 0]]),
-        points,
+    turns = np.stack([np.eye(3, dtype=np.float32)] * 3)
+    poses = bundle_problem.Poses(turns, np.float32([[0, 0, 0], [-1, 0, 0], [-2, 0.5, 0]]))
+    params, model = cameras.intrinsics_of(["RADIAL"], [[900.0, 400.0, 300.0, 0.01, 0.001]])
+    scene = bundle_problem.Scene(poses, points, params.astype(np.float32))
+    free = bundle_problem.Free(
+        np.arange(18).reshape(3, 6) > 5, np.arange(12) > 1, np.arange(8)[None] % 3 == 0
     )
-    k = np.stack([_cameras()[0]] * 3)
-    seen = (points[:, :3] + scene.translations[:, None] * points[:, 3:]) @ k[0].T
-    xy = seen[..., :2] / seen[..., 2:] + _floats(6, 3, 12, 2)
-    weight = np.abs(_floats(7, 3, 12)) + np.float32(0.1)
-    return scene, bundle_steps.Measured(k, xy, weight, np.float32(0.01))
+    photo, point = np.mgrid[:3, :12].reshape(2, -1)
+    layout = bundle_problem.layout_of(photo, point, free, camera=np.zeros(3, int), model=model)
+    seen = (points[:, :3] + poses.translations[:, None] * points[:, 3:]) @ _cameras()[0].T
+    xy = (seen[..., :2] / seen[..., 2:] + _floats(6, 3, 12, 2)).reshape(-1, 2)
+    weight = np.abs(_floats(7, 36)) + np.float32(0.1)
+    problem = bundle_problem.Problem(layout, xy[None], weight[None], np.float32(0.01))
+    return scene, bundle_problem.Observations(xy, weight), problem
+
+
+def _eliminated(scene, problem) -> tuple:
+    """The quadratic model and its factor, with any numbers."""
+
+    def made(scene, problem):
+        model = bundle_problem.normal(scene, problem, "huber", exact=False)
+        return model, schur.factor(model, problem.layout, damping=0.1, tolerance=0.1)
+
+    model, factor = jax.tree.map(
+        lambda x: np.ones(x.shape, x.dtype) if x.dtype == bool else _floats(8, *x.shape),
+        jax.eval_shape(made, scene, problem),
+    )
+    return model, factor._replace(layout=problem.layout)
 
 
 def _pair_shape(preset: str):
@@ -341,10 +365,10 @@ def calls() -> dict[str, Call]:
     one = np.float32(1)
     soft = {"temperature": 0.7}
     rgb, rgb_size = _photo(64, 64), np.asarray([60, 50], np.int32)
-    posed, measured = _scene()
-    around = bundle.Cameras(*posed[:2], measured.intrinsics)
-    slopes = _floats(8, 3, 12, 2, 9)
-    normal = np.einsum("cpki,cpkj->cpij", slopes, slopes)
+    scene, seen, problem = _adjusted()
+    numbers, fisheye, ray = _floats(3, 10, 9), np.float32(np.arange(9) % 2), _floats(4, 3, 9) + 3
+    layout, steps = problem.layout, (_floats(8, 21, scale=0.1), _floats(9, 12, 3, scale=0.1))
+    quadratic, made = _eliminated(scene, problem)
     table = {
         "align.square_patch": Call(lambda: align.square_patch(2), (), (0,)),
         "interpolate.sample": Call(interpolate.sample, (image, image_size, at)),
@@ -369,28 +393,39 @@ def calls() -> dict[str, Call]:
             _bind(blocks.scores_and_pool, large=True), (x, size, layers)
         ),
         "bundle.adjust": Call(
-            bundle.adjust, (around, bundle.Observations(*measured[1:3])), (0, 1, 2, 3)
+            _bind(bundle.adjust, scale=5.0, steps=5), (scene, seen, layout), (0, 1, 2), traced=True
         ),
-        "bundle.relative_to_first": Call(bundle.relative_to_first, (around,), (0, 1)),
+        "bundle.problem_of": Call(_bind(bundle.problem_of, scale=5.0), (seen, layout), (10,)),
+        "bundle.frame_held": Call(bundle.frame_held, (scene.poses,)),
+        "bundle.relative_to_first": Call(bundle.relative_to_first, (scene.poses,), (0, 1)),
         "bundle.pose_loss": Call(
-            bundle.pose_loss, (around, around._replace(translations=_floats(9, 3, 3)))
+            bundle.pose_loss, (scene.poses, scene.poses._replace(translations=_floats(9, 3, 3)))
         ),
-        "bundle_steps.residuals": Call(bundle_steps.residuals, (posed, measured), (0,)),
-        "bundle_steps.derivatives": Call(
-            _bind(bundle_steps.derivatives, exact=False), (posed, measured)
+        "bundle.triangulated": Call(
+            bundle.triangulated, (scene.poses, scene.params, seen, layout), (0,)
         ),
-        "bundle_steps.derivatives[exact]": Call(
-            _bind(bundle_steps.derivatives, exact=True), (posed, measured)
+        "bundle_problem.cost": Call(_bind(bundle_problem.cost, loss="cauchy"), (scene, problem)),
+        "bundle_problem.normal": Call(
+            _bind(bundle_problem.normal, loss="cauchy", exact=False), (scene, problem)
         ),
-        "bundle_steps.solve": Call(bundle_steps.solve, (slopes[:, :, 0], normal)),
-        "bundle_steps.moved": Call(
-            bundle_steps.moved,
-            (posed, _floats(8, 3, 6, scale=0.1), _floats(9, 12, 3, scale=0.1)),
-            (0, 1, 2),
+        "bundle_problem.normal[exact]": Call(
+            _bind(bundle_problem.normal, loss="huber", exact=True), (scene, problem), slow=True
         ),
-        "bundle_steps.levenberg_marquardt": Call(
-            _bind(bundle_steps.levenberg_marquardt, steps=5), (posed, measured), (0, 1, 2)
+        "bundle_problem.slope_of": Call(
+            _bind(bundle_problem.slope_of, loss="cauchy"), (scene, problem)
         ),
+        "bundle_problem.robust": Call(
+            _bind(bundle_problem.robust, loss="huber"), (np.abs(_floats(3, 9)), one)
+        ),
+        "bundle_problem.places": Call(bundle_problem.places, (layout,)),
+        "bundle_problem.gathered": Call(bundle_problem.gathered, (_floats(3, 3, 9), layout)),
+        "bundle_problem.turned": Call(bundle_problem.turned, (_floats(3, 5, 3), _floats(4, 5, 3))),
+        "bundle_problem.moved": Call(bundle_problem.moved, (scene, layout, *steps), (0, 1, 2, 3)),
+        "cameras.spread": Call(_bind(cameras.spread, dtype=np.float32), (n([0, 5]),)),
+        "cameras.numbers_of": Call(cameras.numbers_of, (scene.params, layout.model), (0,)),
+        "cameras.projected": Call(cameras.projected, (numbers, fisheye, ray), (0,)),
+        "cameras.slopes": Call(cameras.slopes, (numbers, fisheye, ray, _floats(5, 2, 10, 9))),
+        "cameras.directions": Call(cameras.directions, (numbers, fisheye, ray[:2]), (0,)),
         "coarse_to_fine.window_cells": Call(
             c2f.window_cells, (cells[:, 0], f0.coarse_grid, f0.fine_grid)
         ),
@@ -650,6 +685,13 @@ def calls() -> dict[str, Call]:
             (vgg16, learned, [photo[:32, :32] / 255] * 2, [n([32, 32])] * 2, f),
             traced=True,
         ),
+        "levenberg_marquardt.minimise": Call(
+            _bind(levenberg_marquardt.minimise, loss="cauchy", steps=5, tolerance=1e-3),
+            (scene, problem),
+            (0, 1, 2, 3),
+        ),
+        "schur.factor": Call(_bind(schur.factor, damping=0.1, tolerance=0.1), (quadratic, layout)),
+        "schur.solve": Call(schur.solve, (made, quadratic.slope)),
         "vgg.preprocess": Call(
             lambda rgb: vgg.preprocess(rgb, _settings(1, "vgg16").preprocessing), (rgb,)
         ),

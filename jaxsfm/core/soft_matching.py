@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsfm.core.bundle import Observations
+from jaxsfm.core.bundle_problem import Observations
 from jaxsfm.core.grid import cell_rows_cols
 from jaxsfm.core.losses import sampson_distances
 from jaxsfm.core.numerics import HIGHEST, argmax_first, unit
@@ -132,7 +132,8 @@ def observed(
     keypoints: Sequence[Float[Array, "_ 2"]], matches: Sequence[Float[Array, "n _"]]
 ) -> Observations:
     """Observations for `jaxsfm.core.bundle.adjust`: every cell of the first image is a point, which
-    each other image sees at the cell with the largest weight.
+    each other image sees at the cell with the largest weight. The rows are those of the first
+    image, then those of the second, and so on; within an image, they are in the order of points.
 
     Gradients reach the keypoints, and through the weights the descriptors; which cell has the
     largest weight is a decision without a gradient.
@@ -147,7 +148,8 @@ def observed(
         xy.append(places[partner])
         weight.append(best)
     # The first image sees a point as surely as the image that sees it best.
-    return Observations(jnp.stack(xy), jnp.stack([jnp.max(jnp.stack(weight), axis=0), *weight]))
+    sure = jnp.max(jnp.stack(weight), axis=0)
+    return Observations(jnp.concatenate(xy), jnp.concatenate([sure, *weight]))
 
 
 def pair_loss(

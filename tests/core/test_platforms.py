@@ -20,6 +20,7 @@ from strategies import rng_of
 
 from jaxsfm.config import PRESETS, PairShape
 from jaxsfm.core import align, bundle, features, pair, ransac, relocalize, sharded, soft_matching
+from jaxsfm.core.bundle_problem import Free, Observations, Poses, Scene, layout_of
 from jaxsfm.core.features import BACKBONES
 from jaxsfm.core.octaves import join_octaves
 from jaxsfm.core.pair_shape import Products
@@ -112,12 +113,18 @@ def soft_pair():
 
 
 def adjustment():
-    def loss(start, seen, reference):
-        return bundle.pose_loss(bundle.adjust(start, seen, scale=3.0).cameras, reference)
+    photo, point = np.mgrid[:3, :40].reshape(2, -1)
+    free = Free(np.arange(18).reshape(3, 6) > 6, np.ones(40, bool), np.zeros((1, 8), bool))
+    layout = layout_of(photo, point, free, camera=np.zeros(3, int), model=np.ones(1, int))
 
-    cameras = bundle.Cameras(shaped(3, 3, 3), shaped(3, 3), shaped(3, 3, 3))
-    seen = bundle.Observations(shaped(3, 40, 2), shaped(3, 40))
-    return jax.value_and_grad(loss, argnums=(0, 1)), (cameras, seen, cameras)
+    def loss(start, seen, reference):
+        return bundle.pose_loss(
+            bundle.adjust(start, seen, layout, scale=3.0).scene.poses, reference
+        )
+
+    scene = Scene(Poses(shaped(3, 3, 3), shaped(3, 3)), shaped(40, 4), shaped(1, 8))
+    seen = Observations(shaped(120, 2), shaped(120))
+    return jax.value_and_grad(loss, argnums=(0, 1)), (scene, seen, scene.poses)
 
 
 def walks(variant):
