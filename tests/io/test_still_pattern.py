@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from textures import texture
 
 from jaxsfm.io import still_pattern
 from jaxsfm.io.images import ImageFile, WorkingImage, inspect_image, read_image
@@ -27,13 +28,8 @@ PATTERN = (slice(380, 460), slice(60, 340))
 
 @functools.cache
 def scene(seed: int = 0) -> np.ndarray:
-    """A texture with the same contrast at all scales, as photos have it: uint8 (1200, 1600)."""
-    random = np.random.default_rng(seed)
-    whole = np.zeros((1200, 1600))
-    for octave in range(8):
-        noise = random.normal(size=(1200 >> octave, 1600 >> octave))
-        whole += cv2.resize(noise, (1600, 1200), interpolation=cv2.INTER_CUBIC)
-    return np.clip(128 + 60 * whole / whole.std(), 0, 255).astype(np.uint8)
+    """uint8 (1200, 1600)."""
+    return np.clip(128 + 60 * texture(seed, (1600, 1200)), 0, 255).astype(np.uint8)
 
 
 def view(k: int, step: int = 37, seed: int = 0) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from textures import texture
 
 from jaxsfm.colmap.two_views import ImageKeypoints, Inliers
 from jaxsfm.io.images import ImageError
@@ -32,13 +33,8 @@ NORMAL = np.asarray([0.0, 0.0, 1.0])
 
 @functools.cache
 def wall(seed: int = 0) -> np.ndarray:
-    """What a camera of twice the focal length sees: float32 (960, 1280), textured at all scales."""
-    random = np.random.default_rng(seed)
-    whole = np.zeros((960, 1280))
-    for octave in range(8):
-        noise = random.normal(size=(960 >> octave, 1280 >> octave))
-        whole += cv2.resize(noise, (1280, 960), interpolation=cv2.INTER_CUBIC)
-    return (128 + 50 * whole / whole.std()).astype(np.float32)
+    """What a camera of twice the focal length sees: float32 (960, 1280)."""
+    return (128 + 50 * texture(seed, (1280, 960))).astype(np.float32)
 
 
 WIDE = np.asarray([[2 * FOCAL, 0, 639.5], [0, 2 * FOCAL, 479.5], [0, 0, 1]])
