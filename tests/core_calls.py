@@ -365,10 +365,10 @@ def calls() -> dict[str, Call]:
     one = np.float32(1)
     soft = {"temperature": 0.7}
     rgb, rgb_size = _photo(64, 64), np.asarray([60, 50], np.int32)
-    scene, seen, problem = _adjusted()
+    scene, seen, adjusted = _adjusted()
     numbers, fisheye, ray = _floats(3, 10, 9), np.float32(np.arange(9) % 2), _floats(4, 3, 9) + 3
-    layout, steps = problem.layout, (_floats(8, 21, scale=0.1), _floats(9, 12, 3, scale=0.1))
-    quadratic, made = _eliminated(scene, problem)
+    layout, steps = adjusted.layout, (_floats(8, 21, scale=0.1), _floats(9, 12, 3, scale=0.1))
+    quadratic, made = _eliminated(scene, adjusted)
     table = {
         "align.square_patch": Call(lambda: align.square_patch(2), (), (0,)),
         "interpolate.sample": Call(interpolate.sample, (image, image_size, at)),
@@ -404,15 +404,15 @@ def calls() -> dict[str, Call]:
         "bundle.triangulated": Call(
             bundle.triangulated, (scene.poses, scene.params, seen, layout), (0,)
         ),
-        "bundle_problem.cost": Call(_bind(bundle_problem.cost, loss="cauchy"), (scene, problem)),
+        "bundle_problem.cost": Call(_bind(bundle_problem.cost, loss="cauchy"), (scene, adjusted)),
         "bundle_problem.normal": Call(
-            _bind(bundle_problem.normal, loss="cauchy", exact=False), (scene, problem)
+            _bind(bundle_problem.normal, loss="cauchy", exact=False), (scene, adjusted)
         ),
         "bundle_problem.normal[exact]": Call(
-            _bind(bundle_problem.normal, loss="huber", exact=True), (scene, problem), slow=True
+            _bind(bundle_problem.normal, loss="huber", exact=True), (scene, adjusted), slow=True
         ),
         "bundle_problem.slope_of": Call(
-            _bind(bundle_problem.slope_of, loss="cauchy"), (scene, problem)
+            _bind(bundle_problem.slope_of, loss="cauchy"), (scene, adjusted)
         ),
         "bundle_problem.robust": Call(
             _bind(bundle_problem.robust, loss="huber"), (np.abs(_floats(3, 9)), one)
@@ -687,7 +687,7 @@ def calls() -> dict[str, Call]:
         ),
         "levenberg_marquardt.minimise": Call(
             _bind(levenberg_marquardt.minimise, loss="cauchy", steps=5, tolerance=1e-3),
-            (scene, problem),
+            (scene, adjusted),
             (0, 1, 2, 3),
         ),
         "schur.factor": Call(_bind(schur.factor, damping=0.1, tolerance=0.1), (quadratic, layout)),

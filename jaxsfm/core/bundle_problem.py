@@ -8,7 +8,7 @@ move. A point has three: directions at right angles to its homogeneous vector. A
 cameras together have z numbers.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -124,9 +124,8 @@ def layout_of(
     columns = np.flatnonzero(np.asarray(free.params).any(0)).astype(np.int32)
     dense = photos <= MOST_PHOTOS if dense is None else dense
     pairs = _pairs(photo, point, photos, nothing=end) if dense else None
-    rows = jnp.asarray(one), jnp.asarray(other)
-    held = jnp.asarray(camera), jnp.asarray(model), free, jnp.asarray(columns)
-    return Layout(*rows, *held, pairs)
+    arrays: tuple[Any, ...] = one, other, camera, model, free, columns, pairs  # of numpy still
+    return Layout(*arrays)
 
 
 def _pairs(photo: np.ndarray, point: np.ndarray, photos: int, *, nothing: int) -> tuple:

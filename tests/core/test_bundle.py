@@ -15,7 +15,7 @@ import pytest
 import tolerances
 from scipy.spatial.transform import Rotation
 from strategies import rng_of
-from test_cameras import params_of
+from test_projections import params_of
 
 from jaxsfm.core import bundle_problem
 from jaxsfm.core.bundle import (

@@ -67,7 +67,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/align": ALIGN,
     "core/blocks": ("tests/core/test_blocks.py", "tests/core/test_vgg.py"),
     "core/bundle_problem": ("tests/core/test_bundle.py",),
-    "core/cameras": ("tests/core/test_cameras.py",),
+    "core/cameras": ("tests/core/test_projections.py",),
     "core/features": ("tests/core/test_features.py", BACKBONES),
     "core/grid": (NUMERICS,),
     "core/interpolate": ALIGN,
