@@ -18,7 +18,7 @@ demo: $(VENV)/.demo ## render a small scene, reconstruct it, compare it with the
 	rm -rf demo
 	$(BIN)/jaxsfm demo --out demo
 
-test: $(VENV)/.dev ## run the quick tests: about 17 minutes on two cores
+test: $(VENV)/.dev ## run the quick tests: about 10 minutes on two cores
 	$(PYTEST) -m "not slow"
 	JAXSFM_TESTS_OPTIMIZED=1 $(PYTEST) -m "optimized and not slow"
 
