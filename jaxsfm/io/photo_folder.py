@@ -1,6 +1,7 @@
 """The image files in a folder, and their masks in another one."""
 
 import dataclasses
+import functools
 import logging
 import os
 from collections.abc import Iterable, Mapping
@@ -97,23 +98,29 @@ def with_masks(images: Iterable[ImageFile], masks: Path) -> tuple[list[ImageFile
     if not masks.exists():
         raise UserError(f"--masks {masks}: no such folder or file")
     images = list(images)
-    found = {image.name: mask_of(image, masks) for image in images}
+    one = mask_size(masks) if masks.is_file() else None
+    found = {image.name: mask_of(image, masks, one) for image in images}
     bare = [name for name, path in found.items() if path is None]
     if len(bare) == len(images):
         its = f"would be {mask_path(Path(), bare[0])}" if masks.is_dir() else "has another size"
         raise UserError(f"--masks {masks}: no mask of any photo (the mask of {bare[0]} {its})")
-    return [with_mask(image, found[image.name]) for image in images], bare
+    opened = functools.cache(open_mask)  # one file for all images is decoded once
+    masked = (
+        (image, None if (path := found[image.name]) is None else opened(path, image.size))
+        for image in images
+    )
+    return [dataclasses.replace(image, mask=mask) for image, mask in masked], bare
 
 
-def mask_of(image: ImageFile, masks: Path) -> Path | None:
+def mask_of(image: ImageFile, masks: Path, one: tuple[int, int] | None) -> Path | None:
     """Where the mask of an image lies; None if it has none.
 
     Args:
       masks: as `with_masks` takes it.
+      one: (width, height) of the one mask for all images; None: they are in a folder.
     """
     path = mask_path(masks, image.name)
-    fits = masks.is_dir() or mask_size(masks) in (None, image.size)
-    return path if fits and path.is_file() else None
+    return path if one in (None, image.size) and path.is_file() else None
 
 
 def with_mask(image: ImageFile, path: Path | None) -> ImageFile:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from jaxsfm.io.images import ImageError, ImageFile, read_image
+from jaxsfm.io.photos import intensities
 
 LEAST_PHOTOS = 8
 """Fewer photos say little: neighbouring frames of a video show nearly the same. Of runs of 5 to 10
@@ -98,8 +99,6 @@ def find_still_pattern(images: Sequence[ImageFile]) -> StillPattern | None:
 def _grey(image: ImageFile) -> np.ndarray | None:
     """Grey values float32 (h, w) of a photo, NaN where it is not used; None: it cannot be read."""
     try:
-        rgb, _, used = read_image(image, max_size=SIDE)
+        return intensities(read_image(image, max_size=SIDE))
     except ImageError:
         return None  # the description says so
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return grey if used is None else np.where(used, grey, np.float32(np.nan))

@@ -25,7 +25,7 @@ from jaxsfm.io.images import (
     read_image,
     size_and_scale,
 )
-from jaxsfm.io.masks import MaskFile, mask_path
+from jaxsfm.io.masks import MaskFile, mask_path, mask_size
 from jaxsfm.io.photo_folder import mask_of, with_mask
 from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RecordedConfig, RunIdentity
@@ -93,7 +93,11 @@ class RecordedPhotos:
 
         Raises UserError if the mask cannot be used.
         """
-        return with_mask(image, self._masks and mask_of(image, self._masks))
+        masks = self._masks
+        if masks is None:
+            return with_mask(image, None)
+        one = mask_size(masks) if masks.is_file() else None
+        return with_mask(image, mask_of(image, masks, one))
 
     def _mask(self, name: str) -> MaskFile | None:
         sha256 = self._identity.masks.get(name)
