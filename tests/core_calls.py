@@ -20,9 +20,13 @@ from jaxsfm.config import PRESETS
 from jaxsfm.core import (
     alexnet,
     align,
+    band,
     blocks,
+    border,
     bundle,
+    bundle_layout,
     bundle_problem,
+    bundle_step,
     cameras,
     consensus,
     grid,
@@ -80,10 +84,15 @@ class Call(NamedTuple):
 
 
 WITHOUT_ARRAYS = {
-    "bundle_problem.layout_of",
+    "bundle_layout.is_formed",
+    "bundle_layout.layout_of",
+    "bundle_layout.room_for",
     "cameras.intrinsics_of",
     "consensus.weights",
     "octaves.octave_capacity",
+    "panorama.panorama_directions",
+    "panorama.panorama_pixels",
+    "panorama.rows_per_pixel",
     "scores.heads_of",
     "sharded.device_mesh",
     "sharded.pick",
@@ -201,11 +210,11 @@ def _adjusted() -> tuple:
     poses = bundle_problem.Poses(turns, np.float32([[0, 0, 0], [-1, 0, 0], [-2, 0.5, 0]]))
     params, model = cameras.intrinsics_of(["RADIAL"], [[900.0, 400.0, 300.0, 0.01, 0.001]])
     scene = bundle_problem.Scene(poses, points, params.astype(np.float32))
-    free = bundle_problem.Free(
+    free = bundle_layout.Free(
         np.arange(18).reshape(3, 6) > 5, np.arange(12) > 1, np.arange(8)[None] % 3 == 0
     )
     photo, point = np.mgrid[:3, :12].reshape(2, -1)
-    layout = bundle_problem.layout_of(photo, point, free, camera=np.zeros(3, int), model=model)
+    layout = bundle_layout.layout_of(photo, point, free, camera=np.zeros(3, int), model=model)
     seen = (points[:, :3] + poses.translations[:, None] * points[:, 3:]) @ _cameras()[0].T
     xy = (seen[..., :2] / seen[..., 2:] + _floats(6, 3, 12, 2)).reshape(-1, 2)
     weight = np.abs(_floats(7, 36)) + np.float32(0.1)
@@ -355,7 +364,6 @@ def calls() -> dict[str, Call]:
     cells = rng_of(1).integers(0, 40, (60, 2)).astype(np.int32)
     fine_cells = rng_of(3).integers(0, 2 * ROWS, (60, 4)).astype(np.int32)
     squared = _floats(2, 5, 16, 16) ** 2
-    problem = ransac._Problem(few.xy0 / 100, few.xy1 / 100, n(100), reach, reach)
     image, image_size, at, patch = _aligned(0)
     affine = np.eye(2, dtype=np.float32) + _floats(4, 6, 2, 2, scale=0.1)
     f = _floats(8, 3, 3)
@@ -369,6 +377,7 @@ def calls() -> dict[str, Call]:
     numbers, fisheye, ray = _floats(3, 10, 9), np.float32(np.arange(9) % 2), _floats(4, 3, 9) + 3
     layout, steps = adjusted.layout, (_floats(8, 21, scale=0.1), _floats(9, 12, 3, scale=0.1))
     quadratic, made = _eliminated(scene, adjusted)
+    tiles = np.float32(9) * np.eye(4, dtype=np.float32)[None].repeat(3, 0), _floats(4, 3, 4, 4)
     table = {
         "align.square_patch": Call(lambda: align.square_patch(2), (), (0,)),
         "interpolate.sample": Call(interpolate.sample, (image, image_size, at)),
@@ -395,7 +404,29 @@ def calls() -> dict[str, Call]:
         "bundle.adjust": Call(
             _bind(bundle.adjust, scale=5.0, steps=5), (scene, seen, layout), (0, 1, 2), traced=True
         ),
-        "bundle.problem_of": Call(_bind(bundle.problem_of, scale=5.0), (seen, layout), (10,)),
+        "bundle.minimised": Call(
+            bundle.minimised,
+            (scene, seen, layout, np.float32(5), n(5), np.float32(1e-3), None),
+            (0, 1, 2),
+            traced=True,
+        ),
+        "band.band_factor": Call(band.band_factor, tiles),
+        "band.band_solve": Call(band.band_solve, (band.BandFactor(*tiles), _floats(5, 3, 4))),
+        "border.beside_of": Call(border.beside_of, (quadratic, layout)),
+        "border.corner_of": Call(border.corner_of, (quadratic, layout)),
+        "border.eliminated": Call(
+            lambda e: border.eliminated(e, lambda x: 2 * x), (_floats(6, 5, 3),)
+        ),
+        "border.without_inner": Call(
+            border.without_inner, (_floats(6, 5, 3), _floats(7, 5, 3), _floats(8, 3, 3))
+        ),
+        "border.with_border": Call(
+            lambda *x: border.with_border(
+                border.Border(*x[:3]), lambda y: 2 * y, lambda y: 3 * y, x[3]
+            ),
+            (_floats(6, 5, 3), _floats(7, 5, 3), _floats(8, 4, 3, 3), _floats(9, 8)),
+        ),
+        "bundle.problem_of": Call(_bind(bundle.problem_of, scale=5.0), (seen, layout), (15,)),
         "bundle.frame_held": Call(bundle.frame_held, (scene.poses,)),
         "bundle.relative_to_first": Call(bundle.relative_to_first, (scene.poses,), (0, 1)),
         "bundle.pose_loss": Call(
@@ -417,10 +448,10 @@ def calls() -> dict[str, Call]:
         "bundle_problem.robust": Call(
             _bind(bundle_problem.robust, loss="huber"), (np.abs(_floats(3, 9)), one)
         ),
-        "bundle_problem.places": Call(bundle_problem.places, (layout,)),
-        "bundle_problem.gathered": Call(bundle_problem.gathered, (_floats(3, 3, 9), layout)),
+        "bundle_layout.places": Call(bundle_layout.places, (layout,)),
+        "bundle_layout.gathered": Call(bundle_layout.gathered, (_floats(3, 3, 9), layout)),
         "bundle_problem.turned": Call(bundle_problem.turned, (_floats(3, 5, 3), _floats(4, 5, 3))),
-        "bundle_problem.moved": Call(bundle_problem.moved, (scene, layout, *steps), (0, 1, 2, 3)),
+        "bundle_step.moved": Call(bundle_step.moved, (scene, layout, *steps), (0, 1, 2, 3)),
         "cameras.spread": Call(_bind(cameras.spread, dtype=np.float32), (n([0, 5]),)),
         "cameras.numbers_of": Call(cameras.numbers_of, (scene.params, layout.model), (0,)),
         "cameras.projected": Call(cameras.projected, (numbers, fisheye, ray), (0,)),
@@ -497,7 +528,6 @@ def calls() -> dict[str, Call]:
         "interpolate.cubic": Call(interpolate.cubic, (reach,)),
         "interpolate.noise_kept": Call(interpolate.noise_kept, (xy0, np.abs(xy0[:, 0]))),
         "interpolate.noise_summed": Call(interpolate.noise_summed, (reach, one)),
-        "lanes.anywhere": Call(jax.vmap(lanes.anywhere), (few.valid,)),
         "lanes.in_turn_on_cpus": Call(
             lambda x: jax.vmap(lanes.in_turn_on_cpus(numerics.unit))(x), (x,)
         ),
@@ -616,9 +646,6 @@ def calls() -> dict[str, Call]:
         ),
         "ransac.hypotheses_needed": Call(
             ransac.hypotheses_needed, (n(30), n(80), np.float32(0.999))
-        ),
-        "ransac.count_inliers": Call(
-            _bind(ransac.count_inliers, shape=_pair_shape("default")), (hs, problem)
         ),
         "ransac.peel_planes": Call(
             _bind(ransac.peel_planes, shape=_pair_shape("default")),

@@ -17,8 +17,6 @@ from jaxsfm.bench.synthetic import arc, render, room
 from jaxsfm.config import Config
 from jaxsfm.core.coarse_to_fine import SIDE
 from jaxsfm.core.octaves import octave_capacity
-from jaxsfm.core.pair import pair_key
-from jaxsfm.core.ransac import peel_planes
 from jaxsfm.core.sharded import extract_batch, join_everywhere, match_batch
 from jaxsfm.core.types import PairMatches
 from jaxsfm.io.features import feature_capacity, padded_size
@@ -67,8 +65,6 @@ class Found(NamedTuple):
     """Mutual coarse matches."""
     tentative: int
     """Fine correspondences."""
-    hypotheses: int
-    """Hypotheses scored, over all planes."""
 
 
 class Programs(NamedTuple):
@@ -98,7 +94,7 @@ def compiled_programs(
     weights: Weights, config: Config, photos: PaddedPhotos, mesh: Mesh
 ) -> Programs:
     """Compile the programs of a preset for the first device of a mesh, and run each once."""
-    execution, device = Execution(), mesh.devices.flat[0]
+    execution = Execution()
     pixels = photos.images.shape[1] * photos.images.shape[2]
     images = images_at_once(execution, mesh, pixels, ENOUGH)
     pairs = pairs_at_once(execution, mesh, photos.num_coarse, ENOUGH, config=config)
@@ -122,8 +118,6 @@ def compiled_programs(
     matching = match_batch.lower(*arguments, mesh=mesh, shape=config.pair).compile()
     once = jax.tree.map(lambda x: np.asarray(x[0, 0]), matching(*arguments))
     keypoints = np.stack([np.asarray(dense.keypoints[0]) for dense in both])
-    with jax.default_device(device):
-        found = _found(once, keypoints, config)
     return Programs(
         lambda: extraction(*put),
         lambda: matching(*arguments),
@@ -133,22 +127,8 @@ def compiled_programs(
         _program_bytes(matching) / pairs,
         keypoints,
         once,
-        found,
+        Found(int(once.num_coarse), int(once.num_tentative)),
     )
-
-
-def _found(matches: PairMatches, keypoints: np.ndarray, config: Config) -> Found:
-    tentative = int(matches.num_tentative)
-    xy0, xy1 = (keypoints[side][matches.cells[:, side]] for side in (0, 1))
-    planes = jax.jit(peel_planes, static_argnames="shape")(
-        pair_key(jax.random.key(0), 0, 1),
-        xy0,
-        xy1,
-        np.arange(len(xy0)) < tentative,
-        thresholds(config),
-        shape=config.pair,
-    )
-    return Found(int(matches.num_coarse), tentative, int(np.sum(planes.num_hypotheses)))
 
 
 def agreement(ours: Programs, cpu: Programs) -> tuple[float, float]:
@@ -219,10 +199,8 @@ def pair_work(width: int, height: int, config: Config, found: Found) -> list[Sta
     stages.append(Stage("correspondences", 0, 9 * 4.0 * 4 * n * 12))
     if shape.one_to_one == "similarity":
         stages.append(Stage("similarities", 0, 3 * 2 * channels * size * found.tentative))
-    # Every hypothesis is scored on all correspondences: later planes have fewer.
-    batches = found.hypotheses / shape.hypotheses_per_step / shape.steps_at_once
-    stages.append(Stage("hypotheses", 0, 16.0 * found.tentative * batches))
-    # A plane has about three new best hypotheses, and each is refitted until nothing is gained.
+    # Hypotheses are compared on few correspondences, which stay in the cache. A plane has about
+    # three new best ones, and each is refitted until nothing is gained.
     fits = shape.max_planes * (3 * min(shape.local_refits, 2) + shape.plane_rounds)
     stages.append(Stage("refits", 0, 40.0 * found.tentative * fits))
     return stages

@@ -48,7 +48,7 @@ def _picture(photos: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
     return np.clip(part * rng.uniform(0.6, 1.2, 3), 0, 255).astype(np.uint8)
 
 
-def _wall(
+def wall_of_pictures(
     photos: list[np.ndarray], rng: np.random.Generator, rows: int, columns: int
 ) -> np.ndarray:
     """A texture of rows x columns pictures, uint8 RGB."""
@@ -69,19 +69,19 @@ def houses(metres: float, *, seed: int = 0) -> list[TexturedPlane]:
                 corner=v(x, -3, back),
                 right=v(HOUSE, 0, 0),
                 down=v(0, 4.5, 0),
-                texture=_wall(photos, rng, 3, 3),
+                texture=wall_of_pictures(photos, rng, 3, 3),
             ),
             TexturedPlane(
                 corner=v(x, 1.5, back),
                 right=v(HOUSE, 0, 0),
                 down=v(0, 0, -4),
-                texture=_wall(photos, rng, 2, 3),
+                texture=wall_of_pictures(photos, rng, 2, 3),
             ),
             TexturedPlane(
                 corner=v(x + rng.uniform(0.5, 3.5), rng.uniform(-0.6, 0.2), DEPTH - 1),
                 right=v(0.9, 0, rng.uniform(-0.3, 0.3)),
                 down=v(0, 1.2, 0),
-                texture=_wall(photos, rng, 1, 1),
+                texture=wall_of_pictures(photos, rng, 1, 1),
             ),
         ]
     return planes

@@ -1,25 +1,23 @@
-"""COLMAP's bundle adjustment of a whole model.
+"""The bundle adjustment of a whole model: what moves, and what no camera may become."""
 
-COLMAP can share a camera only among photos that were turned alike: the principal point of a turned
-photo lies elsewhere, and its two focal lengths change places. For the last adjustment, all photos
-of such a model are turned upright, where they do share it, and are turned back afterwards.
-"""
-
-import dataclasses
-import math
+import copy
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from collections.abc import Collection
 
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.intrinsics import Intrinsics
+from jaxsfm.colmap.adjustment import TOLERANCE, adjustable, cameras_of, minimum, with_cameras
+from jaxsfm.colmap.database import camera_sensor
+from jaxsfm.colmap.given_model import has_rigs
 from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.colmap.native import native
-from jaxsfm.colmap.reconstruction import move_model
+from jaxsfm.colmap.poses import CameraPose
+from jaxsfm.colmap.reconstruction import forget_behind, move_model
+from jaxsfm.colmap.rigs import gives_scale
 from jaxsfm.colmap.view import View
-from jaxsfm.io.orientation import QUARTERS, UPRIGHT, stored_axes, upright_size
+from jaxsfm.core.bundle_problem import Positions
+from jaxsfm.core.cameras import MODELS
 
 VIEWS_FOR_CENTRE = 3
 """The principal point of a camera is adjusted if so many views of the model share it. In a single
@@ -27,14 +25,14 @@ view it cannot be told from a small rotation. Of all three neighbours of Herz-Je
 fountain-P11, the median rotation is off by 0.16 and 0.27 deg instead of 0.47 and 0.60, and the
 worst by 0.33 and 0.89 deg instead of 1.14 and 1.29. All eight views of Herz-Jesus-P8 find the point
 to 0.4 px, which was 8 px from the centre of the photos."""
-TRUST_RADIUS = 1e8
-"""The radius of the first step of the solver; that of Ceres is 1e4. It holds long rows of photos
-back: bending them changes the errors little. With 1e10, a row of 300 photos that was joined from
-five parts takes 2.5 s; with 1e4 it takes 15 s to get as far. 1e8 was not measured on it. A step
-that is too long is taken back."""
 FARTHEST_CENTRE = 0.1
 """A principal point that moves farther than this from the centre of the photo, in units of the
 longer side, is not believed."""
+CENTRE = frozenset({"cx", "cy"})
+POSSIBLE = (0.1, 10.0, 1.0)
+"""What COLMAP's mapper takes for a lens: the least and the largest focal length, in units of the
+longer side, and the largest distortion. One photo of *statue* with a camera of its own ended with a
+focal length of -756 pixels."""
 
 
 def bundle_adjust(
@@ -43,175 +41,217 @@ def bundle_adjust(
     loss_px: float,
     refine_intrinsics: bool,
     threads: int,
-    steps: int = 50,
+    steps: int = 300,
+    held: Collection[int] = (),
 ) -> None:
-    """Adjust all poses and points of a model, in place.
+    """Adjust all poses and points of a model, in place (`adjusted`).
 
-    Observations of points that end behind a camera are taken out. The model keeps its size and its
-    place: the solver holds two cameras, and in a video they may be a millimetre apart. All 500
-    frames of *kitchen* were a hundred thousand units wide after three passes.
+    The core's program knows neither rigs of several cameras nor some of COLMAP's camera models, and
+    is slow for very many photos (`adjustable`). Such models are adjusted by COLMAP.
+    """
+    how = {"loss_px": loss_px, "refine_intrinsics": refine_intrinsics}
+    model = Model.from_colmap(reconstruction, stored_sizes(reconstruction))
+    if has_rigs(reconstruction) or not adjustable(model, refine_intrinsics=refine_intrinsics):
+        _by_colmap(reconstruction, threads=threads, steps=steps, held=held, **how)
+        views = Model.from_colmap(reconstruction, model.sizes).views
+        metric = gives_scale(reconstruction, held)
+        move_model(reconstruction, *_back(views, model.views, metric=metric))
+    else:
+        write_into(adjusted_onto(model, None, steps=steps, **how), reconstruction)
+        return
+    forget_behind(reconstruction)
+
+
+def adjusted(
+    model: Model,
+    *,
+    loss_px: float,
+    refine_intrinsics: bool,
+    threads: int,
+    steps: int = 300,
+    held: Collection[int] = (),
+) -> Model:
+    """A model with the poses, points and cameras that its observations speak for.
+
+    Observations of points that end behind a camera are taken out, and so are points with fewer than
+    two. The model keeps its size, place and direction as a whole. A camera that ends as no lens can
+    be is held, while the rest is adjusted again.
 
     Args:
       loss_px: scale of the Cauchy loss, original pixels. If it is well above the noise (0.1 px
         after refinement), sound observations count as in least squares, and others count little.
       refine_intrinsics: also adjust focal lengths and distortion, and the principal points of
         cameras that `VIEWS_FOR_CENTRE` views share.
-      threads: of the solver; -1 takes all cores.
-      steps: the solver ends after so many, if it has not ended before.
+      threads: of COLMAP, if it adjusts the model (`bundle_adjust`); -1 takes all cores.
+      steps: the iteration ends after so many, if it has not ended before.
+      held: ids of cameras that stay where they are on their rig. Where one of them stands away from
+        the centre of its rig, the size of the model follows from the photos.
     """
-    images = (reconstruction.image(i) for i in reconstruction.reg_image_ids())
-    views = Counter(image.camera_id for image in images)
-    shared = {camera for camera, count in views.items() if count >= VIEWS_FOR_CENTRE}
+    how = {"loss_px": loss_px, "refine_intrinsics": refine_intrinsics, "steps": steps}
+    if model.rigs or not adjustable(model, refine_intrinsics=refine_intrinsics):
+        made = model.to_colmap()
+        bundle_adjust(made, threads=threads, held=held, **how)
+        return Model.from_colmap(made, model.sizes)
+    found = adjusted_onto(model, None, **how)
+    tracks = found.tracks.select(np.isfinite(found.errors_px()))
+    return found.with_tracks(tracks.select_points(np.flatnonzero(tracks.num_observations() > 1)))
+
+
+def adjusted_onto(
+    model: Model,
+    positions: Positions | None,
+    *,
+    loss_px: float,
+    refine_intrinsics: bool,
+    steps: int = 300,
+) -> Model:
+    """The model after one minimisation, or two if it has lost a camera; all observations stay.
+
+    Args:
+      model: `adjustable`. With positions it is near them, and the result is in their frame.
+      positions: measured ones of its views.
+      loss_px, refine_intrinsics, steps: as in `adjusted`.
+    """
+    before = cameras_of(model)
+    views = Counter(view.camera.camera_id for view in model.views)
+    moving: dict[int, frozenset[str]] = {}
+    for number, camera in before.items():
+        names = frozenset(MODELS[camera.model_name].split()) if refine_intrinsics else frozenset()
+        moving[number] = names if views[number] >= VIEWS_FOR_CENTRE else names - CENTRE
+    found = minimum(model, moving, positions, loss_px=loss_px, steps=steps)
+    after, held = cameras_of(found), dict(moving)
+    for number, camera in before.items():
+        if _impossible(after[number], camera):
+            after[number], held[number] = camera, frozenset()
+        elif moving[number] > CENTRE and _ran_away(after[number], camera):
+            after[number] = _with_centre_of(after[number], camera)
+            held[number] = moving[number] - CENTRE
+    if held != moving:
+        # An impossible camera has drawn its photos with it, so they start again.
+        again = {n for n in before if after[n] is before[n]}
+        own = zip(found.views, model.views, strict=True)
+        views = [old if old.camera.camera_id in again else new for new, old in own]
+        start = with_cameras(found.with_views(views), after)
+        found = minimum(start, held, positions, loss_px=loss_px, steps=steps)
+    return _in_place_of(found, model) if positions is None else found
+
+
+def write_into(model: Model, reconstruction: pycolmap.Reconstruction) -> None:
+    """Give a reconstruction the poses, cameras and points of the model that was read from it. It
+    loses the observations of points behind cameras."""
+    for view in model.views:
+        image = reconstruction.image(view.image_id)
+        frame = reconstruction.frame(image.frame_id)
+        frame.set_cam_from_world(image.camera_id, view.cam_from_world())
+    for number, camera in cameras_of(model).items():
+        reconstruction.camera(number).params = camera.params.tolist()
+    for number, xyz in zip(sorted(reconstruction.point3D_ids()), model.tracks.points, strict=True):
+        reconstruction.point3D(number).xyz = xyz
+    forget_behind(reconstruction)
+
+
+def _back(
+    views: list[View], before: list[View], *, metric: bool = False
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """The scale, the rotation and the translation that give views the size, the place and the
+    direction as a whole that they had (`metric`: the scale is 1). The rotation is the one nearest
+    to the sum of those of the cameras."""
+    both = zip(views, before, strict=True)
+    u, _, vt = np.linalg.svd(sum(old.rotation.T @ new.rotation for new, old in both))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    middle, size = _place(np.stack([view.centre for view in views]) @ turn.T)
+    old_middle, old_size = _place(np.stack([view.centre for view in before]))
+    scale = old_size / size if size > 0 and old_size > 0 and not metric else 1.0
+    return scale, turn, old_middle - scale * middle
+
+
+def _place(centres: np.ndarray) -> tuple[np.ndarray, float]:
+    """The median of each coordinate, and the median distance from there. A camera that runs away
+    does not change them."""
+    middle = np.median(centres, axis=0)
+    return middle, float(np.median(np.linalg.norm(centres - middle, axis=1)))
+
+
+def _in_place_of(model: Model, before: Model) -> Model:
+    """The model where another one of the same views was (`_back`)."""
+    scale, turn, shift = _back(model.views, before.views)
+    views = [
+        v.at(CameraPose(v.rotation @ turn.T, scale * turn @ v.centre + shift)) for v in model.views
+    ]
+    points = scale * model.tracks.points @ turn.T + shift
+    return model.with_views(views).with_tracks(model.tracks._replace(points=points))
+
+
+def _impossible(camera: pycolmap.Camera, before: pycolmap.Camera) -> bool:
+    """Whether a camera is none that a lens can be, while it was one before."""
+    params = np.asarray(camera.params)
+    wrong = not np.isfinite(params).all() or camera.has_bogus_params(*POSSIBLE)
+    return bool(wrong and not before.has_bogus_params(*POSSIBLE))
+
+
+def _ran_away(camera: pycolmap.Camera, before: pycolmap.Camera) -> bool:
+    """Whether a principal point is too far out, and farther than it was."""
+    middle = np.asarray([camera.width, camera.height]) / 2
+    now, then = (float(np.linalg.norm(_centre(each) - middle)) for each in (camera, before))
+    return now > max(then, FARTHEST_CENTRE * max(camera.width, camera.height))
+
+
+def _centre(camera: pycolmap.Camera) -> np.ndarray:
+    return np.asarray([camera.principal_point_x, camera.principal_point_y])
+
+
+def _with_centre_of(camera: pycolmap.Camera, other: pycolmap.Camera) -> pycolmap.Camera:
+    changed = copy.deepcopy(camera)
+    changed.principal_point_x, changed.principal_point_y = _centre(other)
+    return changed
+
+
+def _by_colmap(
+    reconstruction: pycolmap.Reconstruction,
+    *,
+    loss_px: float,
+    refine_intrinsics: bool,
+    threads: int,
+    steps: int,
+    held: Collection[int] = (),
+) -> None:
+    """Adjust a model by COLMAP, in place. Principal points move if all cameras have enough views.
+    Cameras that end as no lens can be are held, and the rest is adjusted again."""
+    images = [reconstruction.image(i) for i in sorted(reconstruction.reg_image_ids())]
+    views, fixed = Counter(image.camera_id for image in images), set[int]()
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = refine_intrinsics
+    options.refine_principal_point = refine_intrinsics and min(views.values()) >= VIEWS_FOR_CENTRE
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = loss_px
     options.ceres.solver_options.num_threads = threads
     options.ceres.solver_options.max_num_iterations = steps
-    options.ceres.solver_options.function_tolerance = 1e-7
-    options.ceres.solver_options.initial_trust_region_radius = TRUST_RADIUS
-    before = {number: _centre(reconstruction.camera(number)) for number in sorted(shared)}
-    place = _place(reconstruction)
-    options.refine_principal_point = refine_intrinsics and shared == views.keys()
-    _solve(reconstruction, options, fixed=())
-    if refine_intrinsics and shared and not options.refine_principal_point:
-        options.refine_principal_point = True  # COLMAP has one switch for all cameras
-        _solve(reconstruction, options, fixed=sorted(views.keys() - shared))
-    lost = [n for n in before if _ran_away(reconstruction.camera(n), before[n])]
-    for number in lost:
-        camera = reconstruction.camera(number)
-        camera.principal_point_x, camera.principal_point_y = before[number]
-    if lost:
-        options.refine_principal_point = False
-        _solve(reconstruction, options, fixed=())
-    # The solver moves points behind cameras. COLMAP gives them an error of 1e154.
-    pycolmap.ObservationManager(reconstruction).filter_observations_with_negative_depth()
-    _move_to(reconstruction, place)
-    reconstruction.update_point_3d_errors()  # the solver does not update them
-
-
-class _Place(NamedTuple):
-    """Where most cameras of a model are. A camera that runs away does not change it."""
-
-    middle: np.ndarray
-    """The median of each coordinate, float64 (3,)."""
-    size: float
-    """The median distance from the middle."""
-
-
-def _place(reconstruction: pycolmap.Reconstruction) -> _Place:
-    numbers = sorted(reconstruction.reg_image_ids())
-    centres = np.stack([reconstruction.image(n).projection_center() for n in numbers])
-    middle = np.median(centres, axis=0)
-    return _Place(middle, float(np.median(np.linalg.norm(centres - middle, axis=1))))
-
-
-def _move_to(reconstruction: pycolmap.Reconstruction, place: _Place) -> None:
-    """Give a model the size and the place that it had; it is not turned."""
-    now = _place(reconstruction)
-    if not (now.size > 0 and place.size > 0):
-        return
-    scale = place.size / now.size
-    shift = place.middle - scale * now.middle
-    move_model(reconstruction, scale, np.eye(3), shift)
-
-
-def _centre(camera: pycolmap.Camera) -> tuple[float, float]:
-    return camera.principal_point_x, camera.principal_point_y
-
-
-def _ran_away(camera: pycolmap.Camera, before: tuple[float, float]) -> bool:
-    """Whether a principal point is too far out, and farther than it was."""
-    middle = camera.width / 2, camera.height / 2
-    now, then = math.dist(_centre(camera), middle), math.dist(before, middle)
-    return now > max(then, FARTHEST_CENTRE * max(camera.width, camera.height))
-
-
-def _solve(
-    reconstruction: pycolmap.Reconstruction,
-    options: pycolmap.BundleAdjustmentOptions,
-    *,
-    fixed: Iterable[int],
-) -> None:
-    """Adjust a model; the intrinsics of `fixed` cameras stay."""
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in sorted(reconstruction.reg_image_ids()):
-        config.add_image(image_id)
-    for camera_id in fixed:
-        config.set_constant_cam_intrinsics(camera_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    # Not pycolmap.bundle_adjustment: it switches COLMAP's log messages on for the whole process.
-    adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
-    native(lambda _: adjuster.solve(), "bundle adjustment", grace_s=1)
-
-
-def shares_one_camera(model: pycolmap.Reconstruction, codes: Mapping[str, int]) -> bool:
-    """Whether the photos of a model have one camera, but for turns.
-
-    Args:
-      codes: how the pixels of each photo were turned (`jaxsfm.io.orientation`).
-    """
-    images = [model.image(i) for i in model.reg_image_ids()]
-    used = {(codes[image.name], image.camera_id) for image in images}
-    turns = {code for code, _ in used}
-    return len(used) == len(turns) < len(images) and turns <= set(QUARTERS) and turns != {UPRIGHT}
-
-
-def adjust_as_one(
-    model: pycolmap.Reconstruction, codes: Mapping[str, int], *, threads: int
-) -> pycolmap.Reconstruction:
-    """Adjust a model whose photos share one camera but for turns (`shares_one_camera`).
-
-    Raises UserError if the camera's model is one that cannot be turned.
-    """
-    stored = Model.from_colmap(model, stored_sizes(model))
-    start = max(stored.views, key=lambda view: (codes[view.name] == UPRIGHT, -view.image_id))
-    shared = _turned(start.camera, _inverse(codes[start.name]))
-    views = [_in_frame(v, shared, _inverse(codes[v.name])) for v in stored.views]
-    upright = _moved(stored, views).to_colmap()
-    bundle_adjust(upright, loss_px=1.0, refine_intrinsics=True, threads=threads)
-    adjusted = Model.from_colmap(upright, {view.name: (view.size, (1.0, 1.0)) for view in views})
-    shared = adjusted.views[0].camera
-    numbers = {view.name: view.camera.camera_id for view in stored.views}
-    back = []
-    for view in adjusted.views:
-        camera = _turned(shared, codes[view.name])
-        camera.camera_id = numbers[view.name]
-        back.append(_in_frame(view, camera, codes[view.name]))
-    result = _moved(dataclasses.replace(adjusted, cameras=stored.cameras), back).to_colmap()
-    result.update_point_3d_errors()
-    return result
-
-
-def _inverse(code: int) -> int:
-    """The turn that undoes another one."""
-    return QUARTERS[-QUARTERS.index(code) % 4]
-
-
-def _turned(camera: pycolmap.Camera, code: int) -> pycolmap.Camera:
-    """The camera of pixels that become those of another camera when they are turned by a code."""
-    size = upright_size((camera.width, camera.height), code)
-    known = Intrinsics(model=camera.model_name, params=tuple(camera.params)).turned(size, code)
-    turned = known.camera(size)
-    turned.camera_id = camera.camera_id
-    turned.has_prior_focal_length = camera.has_prior_focal_length
-    return turned
-
-
-def _in_frame(view: View, camera: pycolmap.Camera, code: int) -> View:
-    """A view whose pixels are those of a camera that `code` turns to the view's own."""
-    size = camera.width, camera.height
-    rotation = stored_axes(code) @ view.rotation
-    return dataclasses.replace(view, rotation=rotation, camera=camera, size=size)
-
-
-def _moved(model: Model, views: list[View]) -> Model:
-    """The model with other frames of the pixels: observations move as their points' projections."""
-    xy = model.tracks.xy.copy()
-    for k, (old, new) in enumerate(zip(model.views, views, strict=True)):
-        rows = model.tracks.view == k
-        turn = new.rotation @ old.rotation.T  # of the axes: it says how the pixels turn
-        centre_old, centre_new = (np.asarray(view.size) / 2 - 0.5 for view in (old, new))
-        xy[rows] = (xy[rows] - centre_old) @ turn[:2, :2].T + centre_new
-    return dataclasses.replace(model.with_views(views), tracks=model.tracks._replace(xy=xy))
+    options.ceres.solver_options.function_tolerance = TOLERANCE
+    before = {number: copy.deepcopy(reconstruction.camera(number)) for number in views}
+    while True:
+        config = pycolmap.BundleAdjustmentConfig()
+        for image in images:
+            config.add_image(image.image_id)
+        for number in sorted(fixed):
+            config.set_constant_cam_intrinsics(number)
+        for number in sorted(held):
+            config.set_constant_sensor_from_rig_pose(camera_sensor(number))
+        if gives_scale(reconstruction, held):  # two cameras would hold the size, too
+            config.set_constant_rig_from_world_pose(images[0].frame_id)
+        else:
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        # Not pycolmap.bundle_adjustment: it switches COLMAP's messages on for the whole process.
+        adjuster = pycolmap.create_default_bundle_adjuster(options, config, reconstruction)
+        native(lambda _, solver=adjuster: solver.solve(), "bundle adjustment", grace_s=1)
+        after = {number: reconstruction.camera(number) for number in views}
+        lost = {
+            n
+            for n in before.keys() - fixed
+            if _impossible(after[n], before[n]) or _ran_away(after[n], before[n])
+        }
+        if not lost:
+            return
+        for number in lost:
+            after[number].params = before[number].params.tolist()
+        fixed |= lost

@@ -36,6 +36,7 @@ from jaxsfm.io.decoders import BRANDS_END, special_format
 from jaxsfm.io.exif_camera import ExifCamera, exif_camera, is_of_a_lens
 from jaxsfm.io.images import ImageFile, exif_data, named, shown_name
 from jaxsfm.io.orientation import QUARTERS
+from jaxsfm.io.rig_config import Rig, check_rigs, rig_photos
 from jaxsfm.options import CameraSharing
 
 logger = logging.getLogger("jaxsfm")
@@ -53,13 +54,18 @@ class Cameras:
     sharing: CameraSharing = "auto"
     model: str = "SIMPLE_RADIAL"
     """COLMAP's model of a camera that is not known."""
+    rigs: tuple[Rig, ...] = ()
+    """What cameras are mounted together. Each camera of a rig is one of its own, and may say its
+    intrinsics."""
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise ValueError(f"model must be one of {sorted(MODELS)}; got {self.model!r}")
 
     def check_fits(self, images: Iterable[ImageFile]) -> None:
-        """Raise UserError if the known cameras or the sharing do not fit the photos."""
+        """Raise UserError if the known cameras, the sharing or the rigs do not fit the photos."""
+        images = list(images)
+        check_rigs(self.rigs, {image.name: image.size for image in images})
         if self.known is not None:
             check_fits(self.known, sizes_of(self.known, images))
         elif self.sharing == "single":
@@ -70,8 +76,10 @@ class Cameras:
         """The same as JSON, which tells different cameras apart."""
         known = self.known
         if isinstance(known, Mapping):
-            return {name: dataclasses.asdict(each) for name, each in known.items()}
-        return dataclasses.asdict(known) if known else [self.sharing, self.model]
+            found: Json = {name: dataclasses.asdict(each) for name, each in known.items()}
+        else:
+            found = dataclasses.asdict(known) if known else [self.sharing, self.model]
+        return [found, [rig.plain() for rig in self.rigs]] if self.rigs else found
 
     def assigned(
         self, images: Sequence[ImageFile]
@@ -83,7 +91,7 @@ class Cameras:
         """
         groups = self.groups(images)
         if self.known is None:  # from EXIF if one of the photos has a focal length
-            told = [told_camera(group, self.model) for group in groups]
+            told = [self._told(group) for group in groups]
             report_doubts(doubts for _, doubts in told)
             return [(camera, group) for (camera, _), group in zip(told, groups, strict=True)]
         upright, given = pixels_were_turned(images), []
@@ -92,13 +100,36 @@ class Cameras:
             given.append((accepted(known.camera(group[0].size), group[0]), group))
         return given
 
+    def _told(self, group: Sequence[ImageFile]) -> tuple[pycolmap.Camera, dict[str, list[str]]]:
+        """The camera of photos as their rig says, or as `told_camera` does."""
+        known = rig_intrinsics(self.rigs, group[:1])
+        if not known:
+            return told_camera(group, self.model)
+        return accepted(known[group[0].name].camera(group[0].size), group[0]), {}
+
+    def held(self, images: Sequence[ImageFile]) -> tuple[int, ...]:
+        """The ids, in a new database, of the cameras whose place on their rig is known."""
+        mounted = rig_photos(self.rigs, (image.name for image in images))
+        places = [mounted.get(group[0].name) for group in self.groups(images)] if mounted else []
+        return tuple(
+            number
+            for number, place in enumerate(places, 1)
+            if place is not None
+            and place.camera != self.rigs[place.rig].reference
+            and self.rigs[place.rig].cameras[place.camera].known
+        )
+
     def groups(self, images: Sequence[ImageFile]) -> list[list[ImageFile]]:
         """The photos that share a camera: groups and photos in the order of the photos' names."""
         ordered = sorted(images, key=lambda image: image.name)
         one_source, upright = _from_one_source(ordered), pixels_were_turned(ordered)
+        mounted = rig_photos(self.rigs, (image.name for image in ordered))
         together: dict[object, list[ImageFile]] = {}
         for image in ordered:
-            key = self._key(image, one_source), image.orientation if upright else None
+            if image.name in mounted:
+                key = mounted[image.name][:2]
+            else:
+                key = self._key(image, one_source), image.orientation if upright else None
             together.setdefault(key, []).append(image)
         return list(together.values())
 
@@ -118,6 +149,37 @@ class Cameras:
             case "auto":
                 told = image.taken_with or one_source
                 return (image.taken_with, image.size) if told else image.name
+
+
+def rig_intrinsics(rigs: Sequence[Rig], images: Sequence[ImageFile]) -> dict[str, Intrinsics]:
+    """The intrinsics of photos whose rig says those of its camera, by name.
+
+    Raises:
+      UserError: the camera is none of COLMAP's, or not one of such photos.
+    """
+    sizes, found = {image.name: image.size for image in images}, dict[str, Intrinsics]()
+    for name, photo in rig_photos(rigs, sizes).items():
+        camera = rigs[photo.rig].cameras[photo.camera]
+        if camera.model is None:
+            continue
+        where = f"--rig: the camera {shown_name(camera.prefix)}"
+        if camera.model not in MODELS:
+            raise UserError(f"{where}: camera_model_name must be one of {', '.join(MODELS)}")
+        width, height = sizes[name]
+        usual = pycolmap.Camera.create_from_model_name(0, camera.model, 1.0, width, height)
+        if len(camera.params) != len(usual.params):
+            raise UserError(
+                f"{where}: camera_params must be {len(usual.params)} numbers "
+                f"({usual.params_info}); got {len(camera.params)}"
+            )
+        found[name] = Intrinsics(model=camera.model, params=camera.params)
+        given = found[name].camera((width, height))
+        cx, cy = given.principal_point_x, given.principal_point_y
+        if not (0 < cx < width and 0 < cy < height) or given.mean_focal_length() <= 0:
+            raise UserError(
+                f"{where}: camera_params are not those of photos of {width} x {height} pixels"
+            )
+    return found
 
 
 def pixels_were_turned(images: Sequence[ImageFile]) -> bool:

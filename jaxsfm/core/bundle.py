@@ -9,6 +9,7 @@ keypoints do not agree exactly.
 Source: Triggs et al. 2000, "Bundle adjustment: a modern synthesis".
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -17,18 +18,19 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsfm.core.bundle_layout import Layout
 from jaxsfm.core.bundle_problem import (
-    Layout,
     Loss,
     Observations,
     Poses,
+    Positions,
     Problem,
     Scene,
     cost,
-    moved,
     normal,
     slope_of,
 )
+from jaxsfm.core.bundle_step import moved
 from jaxsfm.core.cameras import directions, numbers_of
 from jaxsfm.core.levenberg_marquardt import minimise
 from jaxsfm.core.numerics import HIGHEST, inverse_norm, unit
@@ -81,6 +83,7 @@ def adjust(
     observations: Observations,
     layout: Layout,
     *,
+    positions: Positions | None = None,
     loss: Loss = "cauchy",
     scale: Float[Array, ""] | float = math.inf,
     steps: Int[Array, ""] | int = 100,
@@ -101,6 +104,8 @@ def adjust(
     are rounded to 1e-4 pixels, so poses of well-known scenes are right to about 1e-5.
 
     Args:
+      positions: where cameras were measured. The robust loss of the distances to them is added,
+        and they say where the scene as a whole lies. They have derivatives too.
       loss: Cauchy's, or Huber's.
       scale: the distance, pixels, beyond which a keypoint loses influence; above 0. By default it
         is infinite, which gives least squares. Far from the minimum, begin with that.
@@ -108,12 +113,15 @@ def adjust(
       tolerance: the iteration ends where a step promises to lower the cost by less than this share.
         Then the last step is left out, and the result has no gradient.
     """
-    given = jax.tree.map(jnp.asarray, (start, observations))
+    given = jax.tree.map(jnp.asarray, (start, observations, positions))
     wide = any(x.dtype == jnp.float64 for x in jax.tree.leaves(given))
     dtype = jnp.float64 if wide else jnp.float32
-    start, observations = jax.tree.map(lambda x: x.astype(dtype), given)
+    start, observations, positions = jax.tree.map(lambda x: x.astype(dtype), given)
     layout = jax.tree.map(jnp.asarray, layout)
     problem, size = problem_of(observations, layout, scale=scale), _size(start.points)
+    if positions is not None:
+        xyz, weight = positions.xyz / size, positions.weight * size**2
+        problem = problem._replace(positions=positions._replace(xyz=xyz, weight=weight))
     start, fixed = _scaled(start, 1 / size), lax.stop_gradient(problem)
     least_gain = 0.0 if tolerance is None else tolerance
     found = minimise(lax.stop_gradient(start), fixed, loss, steps=steps, tolerance=least_gain)
@@ -121,7 +129,7 @@ def adjust(
     scene, poses = found.scene, layout.free.poses
     if tolerance is not None:
         every = jnp.ones(len(scene.points), bool)
-        return Adjustment(_scaled(scene, size), found.cost, every, found.steps, found.done)
+        return Adjustment(_scaled(scene, size), found.model.cost, every, found.steps, found.done)
     moves = Poses(poses[:, :3].any(1)[:, None, None], poses[:, 3:])
     moves = Scene(moves, layout.free.points[:, None], layout.free.params)
     scene = jax.tree.map(jnp.where, moves, scene, start)
@@ -135,12 +143,32 @@ def adjust(
     squared = sum(jnp.sum(x * g) for x, g in zip(step, slope, strict=True))
     moving = jnp.trace(model.points, axis1=1, axis2=2) > 0
     unknown = jnp.sum(made.added == 0) + 3 * jnp.sum(moving)  # held numbers have 1 there
-    converged = made.solved & (2 * jnp.sum(fixed.weight > 0) >= unknown)
+    known = 2 * jnp.sum(fixed.weight > 0)
+    if fixed.positions is not None:
+        known += 3 * jnp.sum(fixed.positions.weight > 0)
+    converged = made.solved & (known >= unknown)
     converged &= jnp.abs(squared) < jnp.sum(fixed.weight) * CONVERGED_PX**2
     scene = moved(scene, layout, *(jnp.where(converged, -x, 0.0) for x in step))
     least = lax.stop_gradient(cost(scene, fixed, loss))
     determined = converged & made.determined & (moving | ~layout.free.points)
     return Adjustment(_scaled(scene, size), least, determined, found.steps, converged)
+
+
+@functools.partial(jax.jit, static_argnames="loss")
+def minimised(
+    start: Scene,
+    observations: Observations,
+    layout: Layout,
+    scale: Float[Array, ""],
+    steps: Int[Array, ""],
+    tolerance: Float[Array, ""],
+    positions: Positions | None,
+    *,
+    loss: Loss = "cauchy",
+) -> Adjustment:
+    """`adjust` without gradients, as one program; its arguments are those of `adjust`."""
+    how = {"scale": scale, "steps": steps, "tolerance": tolerance}
+    return adjust(start, observations, layout, positions=positions, loss=loss, **how)
 
 
 def _size(points: Float[Array, "p 4"]) -> Float[Array, ""]:

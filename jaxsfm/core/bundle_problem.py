@@ -1,32 +1,27 @@
 """What a bundle adjustment works on, its cost, and the quadratic model of the cost.
 
-A row is one keypoint of one photo and one point. Which rows belong together is known before any
-program runs, so lists of them are made once, with numpy.
-
-A photo has d numbers: a rotation vector, a translation, and those parameters of its camera that
-move. A point has three: directions at right angles to its homogeneous vector. All photos and
-cameras together have z numbers.
+Rows, and the numbers of a photo, are those of a layout (`jaxsfm.core.bundle_layout`). A point has
+three numbers: directions at right angles to its homogeneous vector.
 """
 
-from typing import Any, Literal, NamedTuple
+import functools
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from jaxsfm.core.cameras import numbers_of, projected, slopes, spread
-from jaxsfm.core.numerics import HIGHEST, across, squared_norm, unit
+from jaxsfm.core.bundle_layout import Layout, gathered
+from jaxsfm.core.cameras import numbers_of, projected, spread
+from jaxsfm.core.cameras import slopes as slopes_of_rays
+from jaxsfm.core.numerics import HIGHEST, across, squared_norm
 
-CHUNK = 2048
-"""Rows that are linearised at once. A chunk's arrays stay in the cache: 31,843 rows take 33 ms, and
-70 ms all at once."""
-TOGETHER, STEP = 8, 128
-"""Pairs of rows that one product sums, and products at once. 120,000 pairs take 17 ms so, and 60 ms
-without steps."""
-MOST_PHOTOS = 300
-"""So many photos or fewer have a dense reduced system."""
+FLATTEST = 2 / 3
+"""The second derivative of a robust loss along a residual counts at least so much of its influence.
+By one step, a single residual then becomes at most half as large, on the other side of zero. With
+1/2 it would become as large as it was, and adjustments of real models do not converge
+(docs/decisions/relocalization.md)."""
 Loss = Literal["cauchy", "huber"]
 
 
@@ -56,30 +51,16 @@ class Observations(NamedTuple):
     """At least 0. Rows of weight 0 are padding."""
 
 
-class Free(NamedTuple):
-    """What may move; everything else is held."""
+class Positions(NamedTuple):
+    """Measured positions of cameras, in the order of the photos."""
 
-    poses: Bool[Array, "c 6"]
-    """Three numbers of the rotation, which move together, and three of the translation."""
-    points: Bool[Array, " p"]
-    params: Bool[Array, "k 8"]
-
-
-class Layout(NamedTuple):
-    """Which rows belong together (`layout_of`). Rows are in steps of one length. Those that fill
-    the last step belong to the first photo and the first point, and weigh nothing."""
-
-    photo: Int[Array, "s b"]
-    point: Int[Array, "s b"]
-    camera: Int[Array, " c"]
-    """The camera of each photo: a row of `Scene.params`."""
-    model: Int[Array, " k"]
-    free: Free
-    columns: Int[Array, " m"]
-    """The columns of `Scene.params` that move for any camera."""
-    pairs: tuple[Int[Array, "t u 2 8"], Int[Array, "t u"]] | None
-    """Pairs of rows of one point, eight for each product, and the block of the matrix of all photos
-    that the product belongs to. None if the reduced system is not formed."""
+    xyz: Float[Array, "c 3"]
+    """In the world; finite also where the weight is 0."""
+    weight: Float[Array, " c"]
+    """At least 0, pixels^2 for each squared unit of length: a position that is off by its own
+    deviation counts as much as a keypoint that is off by its own. 0 where none was measured."""
+    scale: Float[Array, ""]
+    """Of their robust loss, pixels, as that of keypoints."""
 
 
 class Problem(NamedTuple):
@@ -90,64 +71,7 @@ class Problem(NamedTuple):
     weight: Float[Array, "s b"]
     sharpness: Float[Array, ""]
     """1 / scale^2 of the robust loss; 0 for least squares."""
-
-
-def layout_of(
-    photo: Int[np.ndarray, " n"],
-    point: Int[np.ndarray, " n"],
-    free: Free,
-    *,
-    camera: Int[np.ndarray, " c"],
-    model: Int[np.ndarray, " k"],
-    dense: bool | None = None,
-) -> Layout:
-    """The layout of rows, made on the host (numpy). The sizes of the scene are those of `free`.
-
-    Args:
-      photo, point: of each row.
-      camera: of each photo.
-      model: of each camera (`jaxsfm.core.cameras.intrinsics_of`).
-      dense: whether the reduced system is a matrix; by default up to `MOST_PHOTOS` photos.
-
-    Raises:
-      ValueError: an index is out of range.
-    """
-    photos, points, cameras = (len(x) for x in free)
-    given = {"photo": (photo, photos), "point": (point, points), "camera": (camera, cameras)}
-    for name, (index, end) in given.items():
-        if len(index) and not (0 <= np.min(index) and np.max(index) < end):
-            raise ValueError(f"{name} must be in 0 to {end - 1}, but has {np.max(index)}")
-    photo, point, camera, model = (np.asarray(x, np.int32) for x in (photo, point, camera, model))
-    chunk = max(min(CHUNK, len(photo)), 1)
-    end = -(-len(photo) // chunk) * chunk
-    one, other = (np.pad(x, (0, end - len(x))).reshape(-1, chunk) for x in (photo, point))
-    columns = np.flatnonzero(np.asarray(free.params).any(0)).astype(np.int32)
-    dense = photos <= MOST_PHOTOS if dense is None else dense
-    pairs = _pairs(photo, point, photos, nothing=end) if dense else None
-    arrays: tuple[Any, ...] = one, other, camera, model, free, columns, pairs  # of numpy still
-    return Layout(*arrays)
-
-
-def _pairs(photo: np.ndarray, point: np.ndarray, photos: int, *, nothing: int) -> tuple:
-    """Every pair of rows of one point once, by the block of their photos; `nothing` is padding."""
-    order = np.argsort(point, kind="stable")
-    _, first, count = np.unique(point[order], return_index=True, return_counts=True)
-    after = np.repeat(first + count, count) - np.arange(len(order)) - 1
-    one = np.repeat(np.arange(len(order)), after)
-    other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(after) - after, after)
-    both = order[np.stack([one, other], axis=1)]
-    block = photo[both] @ [photos, 1]
-    by_block = np.argsort(block, kind="stable")
-    block, first, count = np.unique(block[by_block], return_index=True, return_counts=True)
-    products = -(-count // TOGETHER)
-    within = np.arange(len(both)) - np.repeat(first, count)
-    at = np.repeat(np.cumsum(products) - products, count) + within // TOGETHER
-    step = max(min(STEP, products.sum()), 1)
-    end = max(-(-products.sum() // step), 1) * step
-    rows, blocks = np.full((end, 2, TOGETHER), nothing, np.int32), np.zeros(end, np.int32)
-    rows[at, :, within % TOGETHER] = both[by_block]
-    blocks[: products.sum()] = np.repeat(block, products)
-    return rows.reshape(-1, step, 2, TOGETHER), blocks.reshape(-1, step)
+    positions: Positions | None = None
 
 
 def robust(squared: Array, sharpness: Array, loss: Loss) -> Array:
@@ -159,55 +83,14 @@ def robust(squared: Array, sharpness: Array, loss: Loss) -> Array:
     return jnp.where(x > 1, (2 * jnp.sqrt(jnp.maximum(x, 1.0)) - 1) / by, squared)
 
 
-def places(layout: Layout) -> Int[Array, "c d"]:
-    """Where the d numbers of each photo are among all z: six of its pose, and those of its camera,
-    which come after all poses."""
-    photos, columns = len(layout.camera), len(layout.columns)
-    pose = jnp.arange(6 * photos, dtype=jnp.int32).reshape(photos, 6)
-    own = layout.camera[:, None] * columns + jnp.arange(columns, dtype=jnp.int32)
-    return jnp.concatenate([pose, 6 * photos + own], axis=1)
-
-
-def gathered(x: Float[Array, "c d"], layout: Layout) -> Float[Array, " z"]:
-    """All numbers from those of each photo: sums over the photos of each camera."""
-    size = 6 * len(layout.camera) + len(layout.model) * len(layout.columns)
-    return jnp.zeros(size, x.dtype).at[places(layout)].add(x)
-
-
-def turned(by: Float[Array, "*n 3"], x: Float[Array, "*m 3"]) -> Float[Array, "*m 3"]:
-    """x after a rotation that is, to first order, that of the rotation vector `by` (Cayley's)."""
-    half = by / 2
-    once = jnp.cross(half, x)
-    return x + 2 / (1 + squared_norm(half)[..., None]) * (once + jnp.cross(half, once))
-
-
-def moved(
-    scene: Scene, layout: Layout, cameras: Float[Array, " z"], points: Float[Array, "p 3"]
-) -> Scene:
-    """The scene after a step; what is held stays as it is."""
-    (rotations, translations), homogeneous, params = scene
-    end, free = translations.size * 2, layout.free
-    by = jnp.where(free.poses, cameras[:end].reshape(-1, 6), 0.0)
-    rotations = turned(by[:, None, :3], rotations.mT).mT
-    # Products of many rotations drift away from rotations; this brings them back.
-    square = (rotations[:, :, None] * rotations[:, None]).sum(-1)
-    rotations = 1.5 * rotations - 0.5 * (square[..., None] * rotations[:, None]).sum(2)
-    shift = cameras[end:].reshape(len(params), -1)
-    shift = jnp.where(free.params[:, layout.columns], shift, 0.0)
-    by_points = jnp.where(free.points[:, None], points, 0.0)[:, None]
-    to = unit(
-        homogeneous
-        + (jnp.vectorize(across, signature="(n)->(n,m)")(homogeneous) * by_points).sum(-1)
-    )
-    params = params.at[:, layout.columns].add(shift)
-    return Scene(Poses(rotations, translations + by[:, 3:]), to, params)
-
-
 class Normal(NamedTuple):
-    """The quadratic model of the cost at a scene."""
+    """The cost at a scene, and its quadratic model."""
 
-    photos: Float[Array, "c d d"]
+    cost: Float[Array, ""]
+    photos: Float[Array, "c f f"]
     mixed: Float[Array, "s b 3 d"]
+    border: Float[Array, "p 3 b"] | None
+    """The mixed blocks of points and cameras if these are a border."""
     points: Float[Array, "p 3 3"]
     slope: tuple[Float[Array, " z"], Float[Array, "p 3"]]  # of poses and cameras, and of points
 
@@ -229,13 +112,18 @@ def _rows(
 
 
 def cost(scene: Scene, problem: Problem, loss: Loss) -> Float[Array, ""]:
-    """Half the sum of weight times robust loss, pixels^2, as Ceres counts."""
+    """Half the sum of weight times robust loss, pixels^2, as Ceres counts. Positions count too."""
     photo, point, xy, weight = _flat(problem)
     r, t, x, numbers, fisheye, *_ = (
         jnp.moveaxis(x, 0, -1) for x in _rows(scene, problem, photo, point, weight)
     )
     left = projected(numbers, fisheye, (r * x[:3]).sum(1) + t * x[3]) - xy.T
-    return jnp.sum(weight * robust(jnp.sum(left**2, axis=0), problem.sharpness, loss)) / 2
+    found = jnp.sum(weight * robust(jnp.sum(left**2, axis=0), problem.sharpness, loss)) / 2
+    if problem.positions is None:
+        return found
+    origin = jnp.zeros(6, found.dtype)
+    of = jax.vmap(functools.partial(_position_cost, origin, loss=loss))
+    return found + jnp.sum(of(*_position_rows(scene, problem)))
 
 
 def _flat(problem: Problem) -> list[Array]:
@@ -244,14 +132,16 @@ def _flat(problem: Problem) -> list[Array]:
     return [x.reshape(-1, *x.shape[2:]) for x in steps]
 
 
-def _jacobian(rows: tuple, xy: Array, weight: Array, sharpness: Array, loss: Loss) -> Array:
-    """Derivatives (2, d + 3) of each row and its residual, weighted for least squares. The chain
-    rule is closed; forward mode through all of it takes five times as long."""
+def _jacobian(
+    rows: tuple, xy: Array, weight: Array, sharpness: Array, loss: Loss
+) -> tuple[Array, Array]:
+    """The cost of each row, and derivatives (2, d + 3) and its residual, weighted for least
+    squares."""
     # With rows as the last axis, processors work on many at once.
     r, t, x, numbers, fisheye, ways, pose_free, point_free = (jnp.moveaxis(x, 0, -1) for x in rows)
     seen = (r * x[:3]).sum(1)
     ray = seen + t * x[3]
-    slope = slopes(numbers, fisheye, ray, ways.swapaxes(0, 1))
+    slope = slopes_of_rays(numbers, fisheye, ray, ways.swapaxes(0, 1))
     own, by = slope[:-3], slope[-3:]
     turn = jnp.cross(seen[:, None], by, axis=0)
     pose = jnp.concatenate([turn, x[3] * by]) * pose_free[:, None]
@@ -259,10 +149,51 @@ def _jacobian(rows: tuple, xy: Array, weight: Array, sharpness: Array, loss: Los
     v = x.at[3].add(jnp.where(x[3] >= 0, 1.0, -1.0).astype(x.dtype))  # the reflection of `across`
     place = place - 2 / (v * v).sum(0) * (place * v[:, None]).sum(0) * v[:, None]
     left = projected(numbers, fisheye, ray) - xy.T
+    found = _reweighting(left, sharpness, loss)
+    columns = jnp.concatenate([pose, own, place[:3] * point_free])
+    return _reweighted(columns, left, weight, found)
+
+
+def _reweighting(left: Array, sharpness: Array, loss: Loss) -> tuple[Array, ...]:
+    """Of residuals (m, n): their losses, their influence, the root of the share of it that the
+    second derivative has along each residual, and the residuals' directions."""
     squared = jnp.sum(left**2, axis=0)
-    influence = jax.grad(lambda s: robust(s, sharpness, loss).sum())(squared)
-    columns = jnp.concatenate([pose, own, place[:3] * point_free, left[None]])
-    return (columns * jnp.sqrt(weight * influence)).T
+    costs, influence, bend = _influence(squared, sharpness, loss)
+    # Along its residual, the loss of a row is flatter than across: its second derivative there is
+    # a share of the influence (Triggs' correction, appendix 3).
+    along = jnp.sqrt(jnp.maximum(1 + 2 * squared * bend / influence, FLATTEST))
+    by = left / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+    return costs, influence, along, by
+
+
+def _reweighted(
+    columns: Array, left: Array, weight: Array, found: tuple[Array, ...]
+) -> tuple[Array, Array]:
+    """The costs of residuals (m, n), and their derivatives (k, m, n) with the residuals after them,
+    weighted for least squares (n, m, k + 1)."""
+    costs, influence, along, by = found
+    columns = columns + (along - 1) * (columns * by).sum(1, keepdims=True) * by
+    columns = jnp.concatenate([columns, left[None] / along])
+    return weight * costs / 2, (columns * jnp.sqrt(weight * influence)).T
+
+
+def _influence(squared: Array, sharpness: Array, loss: Loss) -> tuple[Array, Array, Array]:
+    """The loss of squared distances, and its first and second derivatives in them."""
+    x = squared * sharpness
+    if loss == "cauchy":
+        influence = 1 / (1 + x)
+        bend = -sharpness * influence**2
+    else:
+        root = lax.rsqrt(jnp.maximum(x, 1.0))
+        influence, bend = root, jnp.where(x > 1, -sharpness * root**3 / 2, 0.0)
+    return robust(squared, sharpness, loss), influence, bend
+
+
+def turned(by: Float[Array, "*n 3"], x: Float[Array, "*m 3"]) -> Float[Array, "*m 3"]:
+    """x after a rotation that is, to first order, that of the rotation vector `by` (Cayley's)."""
+    half = by / 2
+    once = jnp.cross(half, x)
+    return x + 2 / (1 + squared_norm(half)[..., None]) * (once + jnp.cross(half, once))
 
 
 def _row_cost(step: Array, rows: tuple, xy: Array, weight: Array, sharpness: Array, loss: Loss):
@@ -275,37 +206,95 @@ def _row_cost(step: Array, rows: tuple, xy: Array, weight: Array, sharpness: Arr
     return weight * robust(jnp.sum(left**2), sharpness, loss) / 2
 
 
-def normal(scene: Scene, problem: Problem, loss: Loss, *, exact: bool) -> Normal:
-    """The quadratic model. Its second derivatives are those of Gauss and Newton, with the weights
-    of the robust loss, if it is not `exact`. Slopes are exact."""
-    layout, d = problem.layout, 6 + len(problem.layout.columns)
+def _position_rows(scene: Scene, problem: Problem) -> tuple[Array, ...]:
+    """What the residuals of positions depend on; photos are the first axis. A residual is where
+    the photo has the position in its own coordinates: as far from 0 as the camera is from it."""
+    assert problem.positions is not None
+    (rotations, translations), (xyz, weight, scale) = scene.poses, problem.positions
+    seen = (rotations * xyz[:, None]).sum(-1)
+    sharpness = jnp.broadcast_to(scale**-2, weight.shape)
+    free = problem.layout.free.poses.astype(weight.dtype)
+    return seen, translations, free, weight, sharpness
 
-    def one(sums, given):
-        photo, point, xy, weight = given
+
+def _position_cost(step: Array, seen, translation, free, weight, sharpness, *, loss: Loss) -> Array:
+    """The cost of one position after a step of its photo."""
+    pose = step * free
+    left = turned(pose[:3], seen) + translation + pose[3:]
+    return robust(weight * squared_norm(left), sharpness, loss) / 2
+
+
+def _with_positions(
+    sums: list[Array], costs: Array, scene: Scene, problem: Problem, loss: Loss, exact: bool
+) -> tuple[list[Array], Array]:
+    """The sums of `normal` over rows, with what positions add: they touch photos only."""
+    rows = _position_rows(scene, problem)
+    seen, translations, free, weight, sharpness = rows
+    if exact:
+        origin = jnp.zeros(6, weight.dtype)
+        of = functools.partial(_position_cost, loss=loss)
+        own = [
+            jax.vmap(lambda *row, f=f: f(of)(origin, *row))(*rows)
+            for f in (lambda f: f, jax.grad, jax.hessian)
+        ]
+        cost_of, slope, hessian = own
+    else:
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=weight.dtype)[..., None], (3, 3, len(weight)))
+        turn = jnp.cross(eye, seen.T[None], axis=1)  # each row is a number of the step
+        columns = jnp.concatenate([turn, eye]) * free.T[:, None] * jnp.sqrt(weight)
+        left = (seen + translations).T * jnp.sqrt(weight)
+        found = _reweighting(left, sharpness, loss)
+        cost_of, wide = _reweighted(columns, left, jnp.ones_like(weight), found)
+        square = jnp.einsum("nki,nkj->nij", wide, wide, precision=HIGHEST)
+        hessian, slope = square[:, :-1, :-1], square[:, :-1, -1]
+    photos, points, slopes_of, rest = sums
+    sums = [photos.at[:, :6, :6].add(hessian), points, slopes_of.at[:, :6].add(slope), rest]
+    return sums, costs + jnp.sum(cost_of)
+
+
+def normal(scene: Scene, problem: Problem, loss: Loss, *, exact: bool) -> Normal:
+    """The cost and its quadratic model. If it is not `exact`, its second derivatives are those of
+    Gauss and Newton, with those of the robust loss down to `FLATTEST`. Slopes are exact."""
+    layout, f = problem.layout, 6 + len(problem.layout.columns)
+    d, dtype = 6 + len(layout.own), problem.xy.dtype
+
+    def one(k, state):
+        sums, border, costs, kept = state
+        photo, point, xy, weight = (x[k] for x in given)
         rows = _rows(scene, problem, photo, point, weight)
         if exact:
-            origin = jnp.zeros(d + 3, xy.dtype)
-            hessian, slope = (
-                jax.vmap(lambda *row, f=f: f(origin, *row, problem.sharpness, loss))(
-                    rows, xy, weight
-                )
-                for f in (jax.hessian(_row_cost), jax.grad(_row_cost))
-            )
+            origin = jnp.zeros(f + 3, dtype)
+
+            def each(f):
+                return jax.vmap(lambda *row: f(origin, *row, problem.sharpness, loss))
+
+            hessian = each(jax.hessian(_row_cost))(rows, xy, weight)
+            costs_of, slope = each(jax.value_and_grad(_row_cost))(rows, xy, weight)
         else:
-            rows = _jacobian(rows, xy, weight, problem.sharpness, loss)
+            costs_of, rows = _jacobian(rows, xy, weight, problem.sharpness, loss)
             rows = lax.optimization_barrier(rows)  # or they are computed anew for each product
             square = jnp.einsum("bki,bkj->bij", rows, rows, precision=HIGHEST)
             hessian, slope = square[:, :-1, :-1], square[:, :-1, -1]
-        parts = hessian[:, :d, :d], hessian[:, d:, d:], slope[:, :d], slope[:, d:]
+        parts = hessian[:, :f, :f], hessian[:, f:, f:], slope[:, :f], slope[:, f:]
         to = photo, point, photo, point
         sums = [x.at[k].add(part) for x, k, part in zip(sums, to, parts, strict=True)]
-        return sums, hessian[:, d:, :d]
+        if border is not None:
+            border = border.at[point, :, layout.camera[photo]].add(hessian[:, f:, d:f])
+        return sums, border, costs + jnp.sum(costs_of), kept.at[k].set(hessian[:, f:, :d])
 
-    c, p = len(layout.camera), len(scene.points)
-    zeros = [jnp.zeros(shape, problem.xy.dtype) for shape in ((c, d, d), (p, 3, 3), (c, d), (p, 3))]
+    c, p, cameras = len(layout.camera), len(scene.points), len(layout.model)
+    shapes = (c, f, f), (p, 3, 3), (c, f), (p, 3)
+    zeros = [jnp.zeros(shape, dtype) for shape in shapes]
+    border = jnp.zeros((p, 3, cameras, f - d), dtype) if d < f else None
     given = layout.photo, layout.point, problem.xy, problem.weight
-    (photos, points, *slope), mixed = lax.scan(one, zeros, given)
-    return Normal(photos, mixed, points, (gathered(slope[0], layout), slope[1]))
+    nothing = jnp.zeros((), dtype), jnp.zeros((*layout.photo.shape, 3, d), dtype)
+    sums, border, costs, mixed = lax.fori_loop(0, layout.used[0], one, (zeros, border, *nothing))
+    if problem.positions is not None:
+        sums, costs = _with_positions(sums, costs, scene, problem, loss, exact)
+    photos, points, *slope = sums
+    border = None if border is None else border.reshape(p, 3, -1)
+    slopes = gathered(slope[0], layout), slope[1]
+    return Normal(costs, photos, mixed, border, points, slopes)
 
 
 def slope_of(scene: Scene, problem: Problem, loss: Loss) -> tuple[Array, Array]:
@@ -316,4 +305,9 @@ def slope_of(scene: Scene, problem: Problem, loss: Loss) -> tuple[Array, Array]:
     origin = jnp.zeros(9 + len(layout.columns), scene.points.dtype)
     by = jax.vmap(lambda *row: jax.grad(_row_cost)(origin, *row, sharpness, loss))(*rows)
     photos = jax.ops.segment_sum(by[:, :-3], photo, len(layout.camera))
+    if problem.positions is not None:
+        still = jnp.zeros(6, scene.points.dtype)
+        of = jax.grad(functools.partial(_position_cost, loss=loss))
+        own = jax.vmap(lambda *row: of(still, *row))
+        photos = photos.at[:, :6].add(own(*_position_rows(scene, problem)))
     return gathered(photos, layout), jax.ops.segment_sum(by[:, -3:], point, len(scene.points))

@@ -1,10 +1,5 @@
 """Batches by `vmap`, so that they cost what their items cost one by one.
 
-JAX turns a condition on a vmapped value into a selection: both of its branches are computed, for
-every lane and in every turn of the loop around it. A condition on `anywhere` keeps its meaning,
-because all lanes share its value: what no lane asks for is not computed. Its branches must then
-leave the other lanes as they are.
-
 A vmapped loop runs every lane as long as the slowest one needs. An accelerator, which one lane does
 not fill, gains more from the batch than it loses by that. A CPU is filled by one lane, so it
 computes the lanes in turn (`in_turn_on_cpus`).
@@ -15,25 +10,9 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import jax
-import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool
 
 T = TypeVar("T")
-
-
-@jax.custom_batching.custom_vmap
-def anywhere(wanted: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether `wanted` holds in any lane; without `vmap` it is `wanted` itself."""
-    return wanted
-
-
-@anywhere.def_vmap
-def _any_lane(lanes: object, batched: list[bool], wanted: Array) -> tuple[Array, bool]:
-    # In an exported program the number of lanes may be a symbol. Without a batched argument this
-    # rule is not used.
-    del lanes, batched
-    return anywhere(jnp.any(wanted, axis=0)), False
 
 
 def in_turn_on_cpus(function: Callable[..., T]) -> Callable[..., T]:

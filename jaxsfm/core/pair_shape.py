@@ -9,14 +9,14 @@ from typing import Literal
 OneToOne = Literal["first", "similarity"]
 Products = Literal["float32", "bfloat16", "float16"]
 """Types of the descriptors that are multiplied. Their products are summed in float32."""
-ACCELERATOR_FACTORS = {"steps_at_once": 8, "score_chunk": 8, "fine_chunk": 8}
+ACCELERATOR_FACTORS = {"steps_at_once": 79, "fine_chunk": 8}
 """How many times as much an accelerator computes at once. The sizes in `PairShape` are those of a
-CPU, whose caches they fill. An accelerator has thousands of lanes to fill, and every turn of a loop
-costs it the start of several kernels. The factors follow from that and from the memory that a pair
-may take (`jaxsfm.matching.execution`). Of 400 x 300 pairs, an H200 matches 18 % fewer a second with
-two steps at once than with eight, and 3 % fewer with 32. The others have not been measured. None of
-them changes a result. The tile of coarse products stays as it is: a larger one has a smaller share
-of margins, but leaves room for fewer pairs side by side (docs/decisions/accelerators.md)."""
+CPU. An accelerator has thousands of lanes to fill, and every turn of a loop costs it the start of
+several kernels. So all 10 000 samples of a plane are one turn. The factor of the windows follows
+from the memory that a pair may take (`jaxsfm.matching.execution`). Neither has been measured on an
+accelerator, and neither changes a result. The tile of coarse products stays as it is: a larger one
+has a smaller share of margins, but leaves room for fewer pairs side by side
+(docs/decisions/accelerators.md)."""
 Layers = Literal["pool4/pool3", "conv4_3/conv3_3", "pool5/conv5_3"]
 """The coarse and the fine layer."""
 PAPER_LAYERS: Layers = "pool4/pool3"
@@ -37,7 +37,7 @@ class PairShape:
     """Largest number of minimal samples for a plane."""
     hypotheses_per_step: int = 64
     """Number of samples of a step. After each step RANSAC looks at its stopping rule."""
-    steps_at_once: int = 1
+    steps_at_once: int = 2
     """Number of steps whose samples are solved and scored together. Steps that the stopping rule
     then leaves out count for nothing, so other numbers give the same planes."""
     two_way: bool = False
@@ -56,8 +56,11 @@ class PairShape:
     """Number of rows of the coarse similarity matrix that are held at once."""
     fine_chunk: int = 16
     """Number of coarse matches whose windows are compared at once."""
-    score_chunk: int = 2048
-    """Number of correspondences that are scored at once; they stay in the cache."""
+    compared_first: int = 1024
+    """Number of correspondences on which hypotheses are compared. Only one that is better there
+    than all before is tested on every correspondence. Of up to 1024 correspondences, all count. Of
+    more, 26 inliers are so small a share that 10 000 samples find them once in 300 times. With 512,
+    pairs of 700 to 1000 matches lose planes (docs/decisions/accelerators.md)."""
     correspondences_per_cell: float = 2.0
     """Capacity of the list of correspondences, per fine cell."""
 
@@ -71,7 +74,7 @@ class PairShape:
             "coarse_columns",
             "coarse_tile",
             "fine_chunk",
-            "score_chunk",
+            "compared_first",
         ):
             if getattr(self, name) < 1:
                 raise ValueError(f"PairShape.{name} must be at least 1; got {getattr(self, name)}")

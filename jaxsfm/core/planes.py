@@ -9,11 +9,13 @@ Source: Isack and Boykov 2012, "Energy-based geometric multi-model fitting", wit
 smoothness term.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsfm.core import homography as hg
+from jaxsfm.core.lanes import in_turn_on_cpus
 from jaxsfm.core.types import Correspondences
 
 
@@ -51,6 +53,7 @@ def settle(
       threshold: largest error of a member, in image 1, in the same coordinates.
     """
     which = jnp.arange(h.shape[0], dtype=jnp.int32)
+    fit = jax.vmap(in_turn_on_cpus(hg.least_squares), in_axes=(None, None, 0))
 
     def members(h, alive):
         plane = nearest_plane(h, alive, found, threshold)
@@ -61,7 +64,7 @@ def settle(
         _, mine = members(h, alive)
         alive = alive & (mine.sum(axis=1, dtype=jnp.int32) >= floor)
         weights = mine.astype(found.xy0.dtype)
-        fitted = lax.map(lambda w: hg.least_squares(found.xy0, found.xy1, w), weights)
+        fitted = fit(found.xy0, found.xy1, weights)
         return (jnp.where(alive[:, None, None], fitted, h), alive), None
 
     (h, alive), _ = lax.scan(turn, (h, num > 0), length=rounds)

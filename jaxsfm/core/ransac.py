@@ -1,16 +1,22 @@
-"""Homography RANSAC: vmapped hypotheses, chunked scoring, adaptive stop, planes peeled in turn.
+"""Homography RANSAC: vmapped hypotheses, compared on few matches, adaptive stop, planes in turn.
 
 The structure is that of the authors' code: at most 10 000 samples, a confidence of 0.999, one
 least-squares refit at each new best hypothesis, and up to five planes of at least 26 inliers, each
 on the correspondences that the earlier ones left. The minimal solution differs: their code takes
 the wrong singular vector, and here it is the true solution.
 
+Hypotheses are compared on at most `PairShape.compared_first` correspondences. Only one that is
+better there than all before is tested on every correspondence, and refitted (preemptive tests:
+Chum and Matas 2002, "Randomized RANSAC with T(d,d) test", and Nister 2003, "Preemptive RANSAC").
+
 Correspondences are compacted first, so the amount of work follows their number and not the capacity
 of their list. Random numbers depend on (key, plane, step) and not on the capacity either.
 
 Everything here may be vmapped (`jaxsfm.core.lanes`). A CPU computes the lanes of a batch in turn.
-Elsewhere they take their steps together until the last one has finished. A lane that has finished
-is left as it is, and refits run in those steps only in which a lane has found a better hypothesis.
+Elsewhere they take their steps together until the last one has finished. All samples of a plane are
+then one turn, and the n-th new best hypotheses of all lanes are refitted at the same time. The
+loops give what steps one after the other would give, however many steps are one turn; programs of
+another shape only round differently.
 """
 
 import functools
@@ -22,7 +28,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsfm.core import homography as hg
-from jaxsfm.core.lanes import anywhere, in_turn_on_cpus
+from jaxsfm.core.lanes import in_turn_on_cpus
 from jaxsfm.core.numerics import compact
 from jaxsfm.core.pair_shape import PairShape
 from jaxsfm.core.planes import settle
@@ -44,15 +50,18 @@ def sample_indices(key: PRNGKey, num: int, count: Int[Array, ""]) -> Int[Array, 
 
     The i-th index is drawn below count - i and then moved past the indices drawn before.
     """
+    bits = jax.random.bits(key, (4, num), jnp.uint32)
     drawn: list[Array] = []
+    ascending: list[Array] = []
     for i in range(4):
-        most = jnp.maximum(count - i, 1)
-        x = jax.random.randint(jax.random.fold_in(key, i), (num,), 0, most, jnp.int32)
-        earlier = jnp.sort(jnp.stack(drawn, axis=1), axis=1) if drawn else None
-        for j in range(i):
-            assert earlier is not None
-            x = x + (x >= earlier[:, j]).astype(x.dtype)
+        most = jnp.maximum(count - i, 1).astype(jnp.uint32)
+        x = lax.rem(bits[i], most).astype(jnp.int32)
+        for smaller in ascending:
+            x = x + (x >= smaller).astype(x.dtype)
         drawn.append(x)
+        for j, other in enumerate(ascending):
+            ascending[j], x = jnp.minimum(other, x), jnp.maximum(other, x)
+        ascending.append(x)
     return jnp.stack(drawn, axis=1)
 
 
@@ -73,6 +82,27 @@ def hypotheses_needed(
     return jnp.where(p > 0, wrong / jnp.where(p > 0, miss, -1.0), jnp.inf)
 
 
+class _Few(NamedTuple):
+    """The correspondences on which hypotheses are compared first.
+
+    They are columns, because slices of (k, 2) would be read with a stride of two, which is four
+    times as slow.
+    """
+
+    columns: tuple[Array, ...]
+    """x0, y0, x1 and y1, each (m,)."""
+    num_live: Int[Array, ""]
+
+
+def _few(problem: _Problem, shape: PairShape) -> _Few:
+    """Correspondences at even distances in the list; all of them if they are no more than that."""
+    size = min(shape.compared_first, problem.xy0.shape[0])
+    place = jnp.arange(size, dtype=jnp.int32)
+    row = jnp.where(problem.num_live > size, place * problem.num_live // size, place)
+    columns = tuple(xy[:, axis][row] for xy in (problem.xy0, problem.xy1) for axis in (0, 1))
+    return _Few(columns, jnp.minimum(problem.num_live, size))
+
+
 def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
     xy0, xy1 = problem.xy0, problem.xy1
     live = jnp.arange(xy0.shape[0], dtype=jnp.int32) < problem.num_live
@@ -81,54 +111,38 @@ def _inliers(h: Array, problem: _Problem, shape: PairShape) -> Array:
     )
 
 
-def count_inliers(
-    h: Float[Array, "s 3 3"], problem: _Problem, *, shape: PairShape
-) -> Int[Array, " s"]:
-    """The number of inliers of every hypothesis, computed a chunk of correspondences at a time.
-
-    Coordinates are separated into columns first. Slices of (k, 2) would be read with a stride of
-    two, which is four times as slow.
-    """
-    k = problem.xy0.shape[0]
-    chunk = min(shape.score_chunk, k)
-    columns = [xy[:, axis] for xy in (problem.xy0, problem.xy1) for axis in (0, 1)]
-
-    def body(state):
-        i, counts = state
-        start = jnp.minimum(i * chunk, k - chunk)
-        x0, y0, x1, y1 = (lax.dynamic_slice_in_dim(c, start, chunk) for c in columns)
-        xy0, xy1 = jnp.stack([x0, y0], axis=1), jnp.stack([x1, y1], axis=1)
-        index = start + jnp.arange(chunk, dtype=jnp.int32)
-        # The last chunk is moved back to fit. Count only rows that no earlier chunk has counted.
-        live = (index >= i * chunk) & (index < problem.num_live)
-        hit = hg.inliers(h, xy0, xy1, problem.threshold0, problem.threshold1, two_way=shape.two_way)
-        return i + 1, counts + jnp.sum(hit & live, axis=1, dtype=jnp.int32)
-
-    start = (jnp.int32(0), jnp.zeros((h.shape[0],), jnp.int32))
-    return lax.while_loop(lambda s: s[0] * chunk < problem.num_live, body, start)[1]
+def _count(h: Array, few: _Few, problem: _Problem, shape: PairShape) -> Array:
+    """The number of inliers of every hypothesis among few correspondences."""
+    x0, y0, x1, y1 = few.columns
+    some = problem._replace(
+        xy0=jnp.stack([x0, y0], axis=1), xy1=jnp.stack([x1, y1], axis=1), num_live=few.num_live
+    )
+    return jnp.sum(_inliers(h, some, shape), axis=-1, dtype=jnp.int32)
 
 
-def _refit(
-    h: Array, num: Array, problem: _Problem, shape: PairShape, *, wanted: Array | bool = True
-) -> tuple[Array, Array]:
+def _refit(h: Array, than: Array, problem: _Problem, shape: PairShape) -> tuple[Array, Array]:
     """Least squares on the inliers, at most `local_refits` times, as long as inliers are gained.
 
-    Where it is not `wanted`, h and num stay as they are.
+    If h has `than` inliers or fewer, it is not refitted.
+
+    Returns:
+      the homography and its number of inliers.
     """
+    inlier = _inliers(h, problem, shape)
+    num = inlier.sum(dtype=jnp.int32)
 
     def body(state):
-        i, h, num, _ = state
-        weight = _inliers(h, problem, shape).astype(jnp.float32)
-        candidate = hg.least_squares(problem.xy0, problem.xy1, weight)
-        count = _inliers(candidate, problem, shape).sum(dtype=jnp.int32)
+        i, h, num, inlier, _ = state
+        candidate = hg.least_squares(problem.xy0, problem.xy1, inlier.astype(jnp.float32))
+        near = _inliers(candidate, problem, shape)
+        count = near.sum(dtype=jnp.int32)
         better = count > num
-        return i + 1, jnp.where(better, candidate, h), jnp.maximum(count, num), better
+        return i + 1, jnp.where(better, candidate, h), jnp.maximum(count, num), near, better
 
     def more(state):
-        return (state[0] < shape.local_refits) & state[3]
+        return (state[0] < shape.local_refits) & state[-1]
 
-    _, h, num, _ = lax.while_loop(more, body, (jnp.int32(0), h, num, jnp.asarray(wanted)))
-    return h, num
+    return lax.while_loop(more, body, (jnp.int32(0), h, num, inlier, num > than))[1:3]
 
 
 class _Search(NamedTuple):
@@ -137,6 +151,8 @@ class _Search(NamedTuple):
     steps: Int[Array, ""]
     h: Float[Array, "3 3"]
     num: Int[Array, ""]
+    bar: Int[Array, ""]
+    """The largest number of inliers, among the few, of a hypothesis that was looked at."""
 
 
 def _one_plane(
@@ -144,41 +160,42 @@ def _one_plane(
 ) -> tuple[Array, Array, Array]:
     """The best homography (normalised), its number of inliers, and the number of hypotheses."""
     step_size, together = shape.hypotheses_per_step, shape.steps_at_once
+    few, each = _few(problem, shape), jnp.arange(together, dtype=jnp.int32)
 
-    def more(search):
-        used = (search.steps * step_size).astype(jnp.float32)
+    def steps_needed(search):
         needed = hypotheses_needed(search.num, problem.num_live, thresholds.confidence)
-        return active & (used < jnp.minimum(needed, shape.max_hypotheses))
+        steps = jnp.ceil(jnp.minimum(needed, shape.max_hypotheses) / step_size)
+        return jnp.where(active, steps.astype(jnp.int32), 0)
 
-    def look(search, found):
-        h, num = found
-        going = more(search)
-        better = going & (num > jnp.maximum(search.num, 4))
-        h, num = jnp.where(better, h, search.h), jnp.where(better, num, search.num)
-        h, num = lax.cond(
-            anywhere(better),
-            lambda: _refit(h, num, problem, shape, wanted=better),
-            lambda: (h, num),
-        )
-        return _Search(search.steps + going.astype(jnp.int32), h, num), None
-
-    def body(state):
+    def turn(state):
         first, search = state
-        keys = jax.vmap(lambda i: jax.random.fold_in(key, first + i))(
-            jnp.arange(together, dtype=jnp.int32)
-        )
+        step = first + each
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(step)
         index = jax.vmap(lambda k: sample_indices(k, step_size, problem.num_live))(keys)
         h, valid = hg.from_four_points(problem.xy0[index], problem.xy1[index])
-        scored = problem._replace(num_live=jnp.where(more(search), problem.num_live, 0))
-        counts = count_inliers(h.reshape(-1, 3, 3), scored, shape=shape).reshape(valid.shape)
-        counts = jnp.where(valid, counts, 0)
-        best, each = jnp.argmax(counts, axis=1), jnp.arange(together, dtype=jnp.int32)
-        search, _ = lax.scan(look, search, (h[each, best], counts[each, best]))
-        return first + together, search
+        counts = jnp.where(valid, _count(h, few, problem, shape), 0)
+        best = jnp.argmax(counts, axis=1)
+        h, counts = h[each, best], counts[each, best]
 
-    start = _Search(jnp.int32(0), jnp.eye(3, dtype=jnp.float32), jnp.int32(0))
+        def promising(search):
+            late = (step >= search.steps) & (step < steps_needed(search))
+            return late & (counts > search.bar)
+
+        def look(search):
+            i = jnp.argmax(promising(search))
+            found, num = _refit(h[i], search.num, problem, shape)
+            bar = jnp.maximum(counts[i], _count(found, few, problem, shape))
+            best = jnp.where(num > search.num, found, search.h)
+            return _Search(step[i] + 1, best, jnp.maximum(num, search.num), bar)
+
+        search = lax.while_loop(lambda search: promising(search).any(), look, search)
+        done = jnp.minimum(steps_needed(search), first + together)
+        return first + together, search._replace(steps=jnp.maximum(search.steps, done))
+
+    # A homography of fewer than five inliers says nothing beside its own sample.
+    start = _Search(jnp.int32(0), jnp.eye(3, dtype=jnp.float32), jnp.int32(0), jnp.int32(4))
     state = (jnp.int32(0), start)
-    _, search = lax.while_loop(lambda state: more(state[1]), body, state)
+    _, search = lax.while_loop(lambda state: state[0] < steps_needed(state[1]), turn, state)
     return search.h, search.num, search.steps * step_size
 
 

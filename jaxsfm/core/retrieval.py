@@ -150,9 +150,14 @@ def netvlad(x: Float[Array, "n c"], head: NetVLADHead) -> Float[Array, " o"]:
 
 
 def partners(
-    x: Float[Array, "n c"], *, k: int, candidates: int, block: int = 256
+    x: Float[Array, "n c"],
+    *,
+    k: int,
+    candidates: int,
+    group: Int[Array, " n"] | None = None,
+    block: int = 256,
 ) -> Int[Array, "n k"]:
-    """For each row k other rows with large products, which differ from each other.
+    """For each row k rows of other groups with large products, which differ from each other.
 
     The candidates of a row are the rows with the largest products with it. They are taken in this
     order, without those that have a larger product with a taken one than with the row itself. If
@@ -166,6 +171,8 @@ def partners(
     Args:
       x: global descriptors of unit length.
       candidates: their number for each row. If there are fewer other rows, those are taken.
+      group: of each row; None: each is one by itself. Where a row has fewer than k rows of other
+        groups, rows of its own follow, and it may be among them.
       block: so many rows of the table of products exist at a time.
 
     Raises:
@@ -177,13 +184,14 @@ def partners(
     if candidates < k:
         raise ValueError(f"candidates must be at least k = {k}; got {candidates}")
     candidates, block = min(candidates, n - 1), min(block, n)
+    group = jnp.arange(n, dtype=jnp.int32) if group is None else group
     padded = jnp.pad(x, ((0, -n % block), (0, 0)))
 
     def rows(start):
         own = lax.dynamic_slice_in_dim(padded, start, block)
         products = jnp.round(jnp.matmul(own, x.T, precision=HIGHEST) / TIE)
         itself = start + jnp.arange(block, dtype=jnp.int32)
-        others = itself[:, None] != jnp.arange(n, dtype=jnp.int32)
+        others = jnp.take(group, itself, mode="clip")[:, None] != group
         return lax.top_k(jnp.where(others, products, -jnp.inf), candidates)
 
     def chosen(row):

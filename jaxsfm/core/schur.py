@@ -16,7 +16,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsfm.core.bundle_problem import Layout, Normal, gathered, places
+from jaxsfm.core.band import BandFactor, band_factor, band_solve
+from jaxsfm.core.border import Border, beside_of, corner_of, eliminated, with_border, without_inner
+from jaxsfm.core.bundle_layout import Layout, gathered, places
+from jaxsfm.core.bundle_problem import Normal
 from jaxsfm.core.numerics import HIGHEST
 
 triangular_solve = functools.partial(lax.linalg.triangular_solve, left_side=True, lower=True)
@@ -31,9 +34,12 @@ class Factor(NamedTuple):
     photos: Float[Array, "c d d"]  # the photos' blocks before points are eliminated
     blocks: Float[Array, "c d d"]  # and after
     added: Float[Array, " z"]  # to the diagonal: damping, and 1 for numbers that are held
-    lower: Float[Array, "z z"] | None  # the factor of the reduced system, if it is a matrix
+    lower: Float[Array, "n n"] | BandFactor | None  # of the reduced system, if it is formed
+    border: Border | None  # of the reduced system: the cameras
+    few: Float[Array, "b b"] | None  # the lower factor of what the border leaves of them
     determined: Bool[Array, " p"]  # which points the rows determine; others do not count
-    solved: Bool[Array, ""]  # whether they determine the rest; without a matrix, true
+    positive: Bool[Array, ""]  # whether the reduced system has a factor; without a matrix, true
+    solved: Bool[Array, ""]  # whether the rows determine the rest; without a matrix, true
     tolerance: Float[Array, ""]  # of conjugate gradients, as a share of the right side
 
 
@@ -41,27 +47,51 @@ def factor(
     model: Normal, layout: Layout, *, damping: Float[Array, ""] | float, tolerance: float
 ) -> Factor:
     """Eliminate the points."""
-    dtype = model.points.dtype
-    lower, determined = _cholesky(model.points, model.points, damping * _diagonal(model.points))
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), lower.shape)
-    inverse = jnp.where(determined[:, None, None], triangular_solve(lower, eye), 0.0)
+    dtype, d = model.points.dtype, model.mixed.shape[-1]
+    inverse, determined = _inverse_factor(model.points, damping)
+    points = beside = None
+    if model.border is not None:
+        points = (inverse[..., None] * model.border[:, None]).sum(2)
+        beside = beside_of(model, layout)
 
-    def eliminated(blocks, rows):
-        photo, point, mixed = rows
-        mixed = lax.optimization_barrier((inverse[point][..., None] * mixed[:, None]).sum(2))
-        known = jnp.einsum("bki,bkj->bij", mixed, mixed, precision=HIGHEST)
-        return blocks.at[photo].add(-known), mixed
+    def without_points(k, state):
+        blocks, mixed, beside = state
+        photo, point = layout.photo[k], layout.point[k]
+        rows = (inverse[point][..., None] * mixed[k][:, None]).sum(2)
+        rows = lax.optimization_barrier(rows)
+        known = jnp.einsum("bki,bkj->bij", rows, rows, precision=HIGHEST)
+        if points is not None:
+            both = jnp.einsum("bki,bkj->bij", rows, points[point], precision=HIGHEST)
+            beside = beside.at[photo].add(-both)
+        return blocks.at[photo].add(-known), mixed.at[k].set(rows), beside
 
-    rows = layout.photo, layout.point, model.mixed
-    blocks, mixed = lax.scan(eliminated, model.photos, rows)
+    photos = model.photos[:, :d, :d]
+    state = lax.fori_loop(0, layout.used[0], without_points, (photos, model.mixed, beside))
+    blocks, mixed, beside = state
     whole = gathered(_diagonal(model.photos), layout)
     added = jnp.where(whole == 0, 1.0, damping * whole).astype(dtype)
-    state = None, determined, jnp.bool_(True), jnp.asarray(tolerance, dtype)
-    made = Factor(layout, inverse, mixed, model.photos, blocks, added, *state)
+    state = determined, jnp.bool_(True), jnp.bool_(True), jnp.asarray(tolerance, dtype)
+    made = Factor(layout, inverse, mixed, photos, blocks, added, None, None, None, *state)
     if layout.pairs is None:
         return made
-    lower, solved = _cholesky(_reduced(made), jnp.diag(whole), added)
-    return made._replace(lower=lower, solved=solved)
+    few = 0 if points is None else points.shape[-1]
+    inner, rest = jnp.split(whole, [len(whole) - few])
+    if layout.band is None:
+        own = jnp.diag(inner), added[: len(inner)]
+        lower, positive, solved = _cholesky(_reduced(made, len(inner)), *own)
+    else:
+        lower, positive, solved = _band_cholesky(made, inner)
+    made = made._replace(lower=lower, positive=positive, solved=solved)
+    if points is None or beside is None:
+        return made
+    beside = beside.reshape(len(inner), few)
+    known = eliminated(beside, functools.partial(_inner, made))
+    corner = corner_of(model, layout) - jnp.einsum("pki,pkj->ij", points, points, precision=HIGHEST)
+    left = without_inner(beside, known, corner)
+    lower, positive, solved = _cholesky(left, jnp.diag(rest), added[len(inner) :])
+    both = made.positive & positive, made.solved & solved
+    made = made._replace(few=lower, border=Border(beside, known, points))
+    return made._replace(positive=both[0], solved=both[1])
 
 
 @jax.custom_vjp
@@ -74,10 +104,25 @@ def solve(
     left = right[0] - _to_photos(made, own)
     if made.lower is None:
         x = _iterated(made, left)
+    elif made.border is None or made.few is None:
+        x = _inner(made, left)
     else:
-        x = triangular_solve(made.lower, left[:, None])
-        x = triangular_solve(made.lower, x, transpose_a=True)[:, 0]
+        inner, few = (functools.partial(f, x) for f, x in ((_inner, made), (_dense, made.few)))
+        x = with_border(made.border, inner, few, left)
     return x, (made.inverse * (own - _to_points(made, x))[..., None]).sum(1)
+
+
+def _inner(made: Factor, right: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The solution of the reduced system without its border."""
+    if isinstance(made.lower, BandFactor):
+        return _from_tiles(made.layout, band_solve(made.lower, _tiles(made.layout, right)))
+    assert made.lower is not None
+    return _dense(made.lower, right)
+
+
+def _dense(lower: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    x = triangular_solve(lower, right[:, None])
+    return triangular_solve(lower, x, transpose_a=True)[:, 0]
 
 
 solve.defvjp(
@@ -85,40 +130,100 @@ solve.defvjp(
 )
 
 
-def _reduced(made: Factor) -> Float[Array, "z z"]:
-    """The matrix of the reduced system without what damping adds."""
-    c, d = made.blocks.shape[:2]
+def _known(made: Factor, count: int) -> Float[Array, "n d d"]:
+    """The blocks that eliminating the points adds for photos with common points; each is there once
+    for two photos."""
+    d, pairs = made.blocks.shape[1], made.layout.pairs
+    assert pairs is not None
     rows = made.mixed.reshape(-1, 3, d)
 
-    def summed(blocks, pairs):
-        index, block = pairs
+    def summed(k, blocks):
+        index, block = (x[k] for x in pairs)
         both = rows.at[index].get(mode="fill", fill_value=0)
         one, other = (both[:, side].reshape(len(block), -1, d) for side in (0, 1))
         known = jnp.einsum("uki,ukj->uij", one, other, precision=HIGHEST)
-        return blocks.at[block].add(-known), None
+        return blocks.at[block].add(-known)
 
-    zeros = jnp.zeros((c * c, d, d), rows.dtype)
-    half = lax.scan(summed, zeros, made.layout.pairs)[0].reshape(c, c, d, d)
+    return lax.fori_loop(0, made.layout.used[1], summed, jnp.zeros((count, d, d), rows.dtype))
+
+
+def _band_cholesky(
+    made: Factor, whole: Float[Array, " z"]
+) -> tuple[BandFactor, Bool[Array, ""], Bool[Array, ""]]:
+    """As `_cholesky`, of the reduced system as a band."""
+    layout, band = made.layout, made.layout.band
+    assert band is not None
+    (t, w), d = band.shape, made.blocks.shape[1]
+    both = _known(made, 2 * t * w * w).reshape(t, 2, w, w, d, d)
+    own = jnp.concatenate([made.blocks, jnp.zeros_like(made.blocks[:1])])[band]
+    half = both[:, 0].at[:, jnp.arange(w), jnp.arange(w)].add(own / 2)
+    half, beside = (x.swapaxes(2, 3).reshape(t, w * d, w * d) for x in (half, both[:, 1]))
+    eye = jnp.eye(w * d, dtype=half.dtype)
+    added = jnp.where(_tiles(layout, whole) == 0, 1.0, _tiles(layout, made.added[: len(whole)]))
+    lower = band_factor(half + half.mT + added[..., None] * eye, beside)
+    pivots, least = _from_tiles(layout, _diagonal(lower.lower)), _least(whole)
+    positive, enough = jnp.all(pivots > 0), (pivots**2 > least) | (whole == 0)
+    sound = BandFactor(jnp.broadcast_to(eye, lower.lower.shape), jnp.zeros_like(beside))
+    lower = jax.tree.map(lambda x, other: jnp.where(positive, x, other), lower, sound)
+    return lower, positive, jnp.all(enough)
+
+
+def _tiles(layout: Layout, x: Float[Array, " z"]) -> Float[Array, "t s"]:
+    """The numbers of the photos of each tile; 0 after the last photo."""
+    assert layout.band is not None
+    by_photo = jnp.concatenate([x.reshape(len(layout.camera), -1), jnp.zeros((1, 6), x.dtype)])
+    return by_photo[layout.band].reshape(len(layout.band), -1)
+
+
+def _from_tiles(layout: Layout, x: Float[Array, "t s"]) -> Float[Array, " z"]:
+    """The numbers of all photos from those of tiles."""
+    assert layout.band is not None
+    to = jnp.zeros((len(layout.camera) + 1, 6), x.dtype)
+    return to.at[layout.band.ravel()].set(x.reshape(-1, 6))[:-1].ravel()
+
+
+def _reduced(made: Factor, size: int) -> Float[Array, "n n"]:
+    """The matrix of the reduced system without its border and what damping adds."""
+    c, d = made.blocks.shape[:2]
+    half = _known(made, c * c).reshape(c, c, d, d)
     half = half.at[jnp.arange(c), jnp.arange(c)].add(made.blocks / 2)
     half = half.transpose(0, 2, 1, 3).reshape(c * d, c * d)
-    matrix, to = half + half.T, places(made.layout).ravel()
-    for _ in range(2):  # photos of one camera share its numbers
-        matrix = jax.ops.segment_sum(matrix, to, len(made.added)).T
+    matrix, to = half + half.T, places(made.layout)[:, :d].ravel()
+    if d > 6:
+        for _ in range(2):  # photos of one camera share its numbers
+            matrix = jax.ops.segment_sum(matrix, to, size).T
     return matrix
 
 
 def _to_points(made: Factor, x: Float[Array, " z"]) -> Float[Array, "p 3"]:
-    """The mixed blocks times the numbers of the photos."""
-    by = x[places(made.layout)][made.layout.photo]
-    rows = (made.mixed * by[..., None, :]).sum(-1)
-    return jnp.zeros(made.inverse.shape[:2], x.dtype).at[made.layout.point].add(rows)
+    """The mixed blocks times the numbers of the photos and cameras."""
+    layout, d = made.layout, made.mixed.shape[-1]
+    by = x[places(layout)[:, :d]]
+
+    def added(k, sums):
+        rows = (made.mixed[k] * by[layout.photo[k]][:, None]).sum(-1)
+        return sums.at[layout.point[k]].add(rows)
+
+    few, nothing = made.border, jnp.zeros(made.inverse.shape[:2], x.dtype)
+    if few is not None:
+        nothing = (few.points * x[-few.points.shape[-1] :]).sum(-1)
+    return lax.fori_loop(0, layout.used[0], added, nothing)
 
 
 def _to_photos(made: Factor, own: Float[Array, "p 3"]) -> Float[Array, " z"]:
     """The mixed blocks, transposed, times the numbers of the points."""
-    rows = (made.mixed * own[made.layout.point][..., None]).sum(-2)
-    sums = jnp.zeros(made.blocks.shape[:2], own.dtype).at[made.layout.photo].add(rows)
-    return gathered(sums, made.layout)
+    layout = made.layout
+
+    def added(k, sums):
+        rows = (made.mixed[k] * own[layout.point[k]][..., None]).sum(1)
+        return sums.at[layout.photo[k]].add(rows)
+
+    sums = jnp.zeros(made.blocks.shape[:2], own.dtype)
+    sums = lax.fori_loop(0, layout.used[0], added, sums)
+    if made.border is None:
+        return gathered(sums, layout)
+    few = jnp.einsum("pkb,pk->b", made.border.points, own, precision=HIGHEST)
+    return jnp.concatenate([sums.ravel(), few])
 
 
 def _multiplied(made: Factor, x: Float[Array, " z"]) -> Float[Array, " z"]:
@@ -135,7 +240,7 @@ def _iterated(made: Factor, right: Float[Array, " z"]) -> Float[Array, " z"]:
     share = 1 / jnp.maximum(gathered(jnp.ones(to.shape, unit.dtype), layout), 1)
     scale = unit[to]
     blocks = made.blocks * scale[:, None] * scale[..., None]
-    lower, _ = _cholesky(blocks, blocks, (share * made.added)[to] * scale**2)
+    lower, *_ = _cholesky(blocks, blocks, (share * made.added)[to] * scale**2)
 
     def preconditioned(x):
         half = triangular_solve(lower, (share * x)[to][..., None])
@@ -155,17 +260,49 @@ def _diagonal(blocks: Float[Array, "*n k k"]) -> Float[Array, "*n k"]:
     return jnp.diagonal(blocks, axis1=-2, axis2=-1)
 
 
+def _inverse_factor(
+    blocks: Float[Array, "p 3 3"], damping: Float[Array, ""] | float
+) -> tuple[Float[Array, "p 3 3"], Bool[Array, " p"]]:
+    """The inverse of the lower factor of each block with its damping, and whether the block
+    determines its point or the point is held. Where it does not, the inverse is zero."""
+    whole = _diagonal(blocks)
+    a, d, f = ((1 + damping) * whole).T
+    b, c, e = blocks[:, 1, 0], blocks[:, 2, 0], blocks[:, 2, 1]
+    first = lax.rsqrt(a)
+    ba, ca = b * first, c * first
+    left = d - ba * ba
+    second = lax.rsqrt(left)
+    ec = (e - ca * ba) * second
+    last = f - ca * ca - ec * ec
+    third = lax.rsqrt(last)
+    determined = jnp.all(jnp.stack([a, left, last], axis=1) > _least(whole), axis=1)
+    lower = -ba * first * second, -ec * second * third
+    corner = (ba * ec * second - ca) * first * third
+    zero = jnp.zeros_like(a)
+    rows = [first, zero, zero, lower[0], second, zero, corner, lower[1], third]
+    inverse = jnp.stack(rows, axis=1).reshape(-1, 3, 3)
+    inverse = jnp.where(determined[:, None, None], inverse, 0.0)
+    return inverse, determined | jnp.all(whole == 0, axis=1)  # held points have no rows
+
+
+def _least(whole: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
+    """The least pivot of numbers that are determined."""
+    # A pivot is what is known of a number while those before it are free. If it is below this share
+    # of what is known while they are held, it is rounding (1e-4 in float32; scenes have 2.5e-4).
+    share = 0.3 * float(jnp.finfo(whole.dtype).eps) ** 0.5
+    return jnp.maximum(whole, share * whole.max(-1, keepdims=True)) * share
+
+
 def _cholesky(
     matrix: Float[Array, "*n k k"], whole: Float[Array, "*n k k"], added: Float[Array, "*n k"]
-) -> tuple[Float[Array, "*n k k"], Bool[Array, "*n"]]:
-    """The lower factor of matrix + diag(added), and whether it determines every number; if not, the
-    identity. Numbers that are held have no row in `whole`, and get a diagonal of 1."""
+) -> tuple[Float[Array, "*n k k"], Bool[Array, "*n"], Bool[Array, "*n"]]:
+    """The lower factor of matrix + diag(added), or the identity if there is none; whether there is
+    one; and whether it determines every number. Numbers that are held have no row in `whole`, and
+    get a diagonal of 1."""
     eye, diagonal = jnp.eye(matrix.shape[-1], dtype=matrix.dtype), _diagonal(whole)
     added = jnp.where(diagonal == 0, 1.0, added).astype(matrix.dtype)
     lower = lax.linalg.cholesky(matrix + added[..., None] * eye)
-    # A pivot is what is known of a number while those before it are free. If it is below this share
-    # of what is known while they are held, it is rounding (1e-4 in float32; scenes have 2.5e-4).
-    share = 0.3 * float(jnp.finfo(matrix.dtype).eps) ** 0.5
-    least = jnp.maximum(diagonal, share * diagonal.max(-1, keepdims=True)) * share
-    determined = jnp.all((_diagonal(lower) ** 2 > least) | (diagonal == 0), axis=-1)
-    return jnp.where(determined[..., None, None], lower, eye), determined
+    enough = _diagonal(lower) ** 2 > _least(diagonal)
+    determined = jnp.all(enough | (diagonal == 0), axis=-1)
+    positive = jnp.all(_diagonal(lower) > 0, axis=-1)
+    return jnp.where(positive[..., None, None], lower, eye), positive, determined

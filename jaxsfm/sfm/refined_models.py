@@ -11,13 +11,15 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxsfm.colmap.bundle_adjustment import adjust_as_one, shares_one_camera
 from jaxsfm.colmap.cameras import pixels_were_turned
+from jaxsfm.colmap.given_model import has_rigs
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import with_all_points
 from jaxsfm.colmap.other_camera import other_camera
 from jaxsfm.colmap.reconstruction import colour_points, registered
+from jaxsfm.colmap.rigs import whole_frames
 from jaxsfm.colmap.tracks import Tracks
+from jaxsfm.colmap.turned_cameras import adjust_as_one, shares_one_camera
 from jaxsfm.config import WORTH, Config
 from jaxsfm.errors import UserError, remark
 from jaxsfm.io.images import ImageError
@@ -151,10 +153,8 @@ class _Refining(NamedTuple):
         asked = self._settings().refinement.weak_octaves > 0
         unconfirmed = done.unconfirmed_views() if asked else set()
         use = np.asarray([name not in unconfirmed for name in names])[arrays.tracks.view]
-        parts = [
-            [names[k] for k in part]
-            for part in covisibility_components(arrays.tracks.select(use), len(names))
-        ]
+        held = covisibility_components(arrays.tracks.select(use), len(names))
+        parts = whole_frames(([names[k] for k in part] for part in held), model)
         left = [part for part in parts if len(part) >= MIN_VIEWS]
         if len(parts) == 1 or not left:
             return [(model, dataclasses.replace(done, holds=bool(left)))]
@@ -183,7 +183,9 @@ class _Refining(NamedTuple):
     def _settings(self) -> PassSettings:
         assert self.config.refinement is not None
         options = self.options
-        return PassSettings(self.config.refinement, options.refine_intrinsics, options.threads)
+        return PassSettings(
+            self.config.refinement, options.refine_intrinsics, options.threads, options.held
+        )
 
     def _whole(self, model: "pycolmap.Reconstruction") -> "pycolmap.Reconstruction":
         return with_all_points(model, self.believed.database, self.options)
@@ -227,7 +229,8 @@ def _with_one_camera(
     """A model whose photos of one camera were turned differently, adjusted for that camera."""
     files = {name: photos.files[name] for name in registered(model)}
     codes = {name: file.orientation for name, file in files.items()}
-    if not (pixels_were_turned(list(files.values())) and shares_one_camera(model, codes)):
+    turned = pixels_were_turned(list(files.values()))
+    if has_rigs(model) or not (turned and shares_one_camera(model, codes)):
         return model
     try:
         return adjust_as_one(model, codes, threads=threads)

@@ -90,12 +90,12 @@ def test_counted_coarse_products_of_a_pair_are_those_of_its_program(name):
         )
 
     counted = products(jax.make_jaxpr(program)(a, a, grid, parts).jaxpr)
-    ours = named(pair_work(SIDE, SIDE, config, Found(10, 10, 10)), "coarse products")
+    ours = named(pair_work(SIDE, SIDE, config, Found(10, 10)), "coarse products")
     assert ours.products == pytest.approx(counted, rel=1e-6)
 
 
 def test_numbers_of_sixteen_bits_need_fewer_bytes_and_the_same_products():
-    config, found = PRESETS["default"], Found(4370, 22216, 21376)
+    config, found = PRESETS["default"], Found(4370, 22216)
     short = dataclasses.replace(config, convolutions="bfloat16", products="bfloat16")
     for ours, fewer in (
         (image_work(SIDE, SIDE, config), image_work(SIDE, SIDE, short)),
@@ -124,7 +124,7 @@ def test_a_small_run_measures_every_preset_and_writes_its_figures(tmp_path, caps
 def test_agreement_counts_what_both_devices_give():
     def programs(keypoints, cells, plane):
         rest = (np.asarray(x) for x in (cells, plane, [0], [1], 1, 1, 0, 0))
-        matches, found = accelerator_programs.PairMatches(*rest), Found(1, 1, 1)
+        matches, found = accelerator_programs.PairMatches(*rest), Found(1, 1)
         return accelerator_programs.Programs(
             lambda: None, lambda: None, 1, 1, 0.0, 0.0, np.asarray(keypoints), matches, found
         )

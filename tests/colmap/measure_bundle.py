@@ -19,7 +19,8 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from jaxsfm.core.bundle import adjust, frame_held
-from jaxsfm.core.bundle_problem import Free, Observations, Poses, Scene, layout_of
+from jaxsfm.core.bundle_layout import Free, layout_of
+from jaxsfm.core.bundle_problem import Observations, Poses, Scene
 from jaxsfm.core.cameras import intrinsics_of
 
 PHOTOS, POINTS, ROWS = 49, 7776, 31843

@@ -8,15 +8,14 @@ import pytest
 from room_scene import Room, arrays, camera, exact_model
 
 from jaxsfm.colmap import bundle_adjustment
-from jaxsfm.colmap.bundle_adjustment import (
-    VIEWS_FOR_CENTRE,
-    adjust_as_one,
-    bundle_adjust,
-    shares_one_camera,
-)
+from jaxsfm.colmap.adjustment import adjustable
+from jaxsfm.colmap.bundle_adjustment import VIEWS_FOR_CENTRE, bundle_adjust
+from jaxsfm.colmap.bundle_adjustment import adjusted as adjusted_model
 from jaxsfm.colmap.intrinsics import Intrinsics
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.poses import model_poses
+from jaxsfm.colmap.turned_cameras import adjust_as_one, shares_one_camera
+from jaxsfm.core import bundle_layout
 from jaxsfm.io.orientation import to_stored
 from jaxsfm.sfm.evaluation import evaluate
 
@@ -38,7 +37,7 @@ def diverging(room: Room, points: int):
             row = np.flatnonzero((tracks.point == point) & (tracks.view == view))[0]
             ray = model.views[other].centre - model.views[view].centre
             towards, _ = model.views[view].project((tracks.points[point] + 0.3 * ray)[None])
-            xy[row] += 3 * (towards[0] - xy[row])  # past the parallel, to the other side
+            xy[row] -= 3 * (towards[0] - xy[row])  # past the parallel: they meet behind
     return model.with_tracks(tracks._replace(xy=xy)).select(~drop).to_colmap()
 
 
@@ -195,3 +194,81 @@ def test_what_counts_as_one_camera(rendered, codes, own, shared):
         each.camera_id = own.get(view.name, codes[view.name])
         views.append(dataclasses.replace(view, camera=each))
     assert shares_one_camera(exact.with_views(views).to_colmap(), codes) == shared
+
+
+@pytest.mark.parametrize("solver", ["core", "colmap"])
+def test_a_camera_that_becomes_none_that_a_lens_can_be_stays_as_it_was(
+    rendered, monkeypatch, solver
+):
+    """One view has a camera of its own, and its keypoints are mirrored: a focal length below 0 fits
+    them."""
+    exact = exact_model(rendered)
+    views = list(exact.views)
+    own = camera()
+    own.camera_id = 2
+    views[2] = dataclasses.replace(views[2], camera=own)
+    xy = exact.tracks.xy.copy()
+    rows = exact.tracks.view == 2
+    xy[rows] = 2 * (np.asarray(own.params[2:]) - 0.5) - xy[rows]
+    model = Model(views, exact.tracks._replace(xy=xy), {}).to_colmap()
+    if solver == "colmap":
+        monkeypatch.setattr(bundle_adjustment, "adjustable", lambda *_, **__: False)
+    bundle_adjust(model, loss_px=1000.0, refine_intrinsics=True, threads=1)
+    np.testing.assert_array_equal(model.camera(2).params, own.params)
+    monkeypatch.setattr(bundle_adjustment, "_impossible", lambda *_: False)
+    wrong = Model(views, exact.tracks._replace(xy=xy), {}).to_colmap()
+    bundle_adjust(wrong, loss_px=1000.0, refine_intrinsics=True, threads=1)
+    assert wrong.camera(2).mean_focal_length() < 0
+
+
+def test_models_without_a_formed_system_and_unknown_cameras_are_left_to_colmap(
+    rendered, monkeypatch
+):
+    model = exact_model(rendered)
+    assert adjustable(model, refine_intrinsics=True)
+    views = [dataclasses.replace(view, camera=full_opencv(view.camera)) for view in model.views]
+    assert not adjustable(model.with_views(views), refine_intrinsics=False)
+    monkeypatch.setattr(bundle_layout, "MOST_PHOTOS", 4)
+    assert not adjustable(model, refine_intrinsics=False)  # five photos of one room are no band
+
+
+def full_opencv(camera: pycolmap.Camera) -> pycolmap.Camera:
+    params = [*camera.params, *[0.0] * 8]
+    return pycolmap.Camera(
+        camera_id=camera.camera_id,
+        model="FULL_OPENCV",
+        width=camera.width,
+        height=camera.height,
+        params=params,
+    )
+
+
+def test_a_model_of_another_camera_keeps_its_place_too(rendered):
+    """COLMAP adjusts it."""
+    exact = exact_model(rendered)
+    views = [dataclasses.replace(view, camera=full_opencv(view.camera)) for view in exact.views]
+    found = adjusted_model(
+        Model(views, exact.tracks, {}), loss_px=1.0, refine_intrinsics=False, threads=1
+    )
+    for old, new in zip(views, found.views, strict=True):
+        np.testing.assert_allclose(new.centre, old.centre, atol=1e-4)
+
+
+def test_points_that_colmap_would_leave_out_are_left_out_of_arrays_too(rendered):
+    """Points of one view, of two views near each other, and of all views."""
+    exact = exact_model(rendered)
+    views = list(exact.views)
+    near = views[0].centre + 0.02 * (views[1].centre - views[0].centre)
+    views[1] = dataclasses.replace(views[1], centre=near)
+    tracks = exact.tracks
+    some = (tracks.view < 2) | (tracks.point % 3 == 0)
+    model = Model(views, exact.select(some & ((tracks.view > 0) | (tracks.point % 5 > 0))).tracks)
+    by_colmap = model.numbered_colmap()[1]
+    kept = model.triangulated().tracks.points
+    assert 10 < len(kept) < len(tracks.points) - 10
+    np.testing.assert_array_equal(
+        kept,
+        model.tracks.points[sorted(by_colmap.values())][
+            np.isin(sorted(by_colmap), sorted(model.to_colmap().point3D_ids()))
+        ],
+    )

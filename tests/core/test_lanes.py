@@ -1,13 +1,12 @@
-"""Laws of conditions that the lanes of a batch share, and of lanes that take turns."""
+"""Laws of lanes that take turns."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from compiled import compiled
 from jax import lax
 
-from jaxsfm.core.lanes import anywhere, in_turn_on_cpus
+from jaxsfm.core.lanes import in_turn_on_cpus
 
 
 def counted(calls):
@@ -18,31 +17,6 @@ def counted(calls):
         return x + 1
 
     return function
-
-
-def test_it_is_its_argument_for_one_and_any_for_a_batch():
-    for wanted in (False, True):
-        assert compiled(anywhere)(np.bool_(wanted)) == wanted
-    table = np.asarray([[False, False], [False, True], [True, True]])
-    seen = compiled(jax.vmap(anywhere))(table[:, 0])
-    assert seen.tolist() == [True] * 3
-    twice = compiled(jax.vmap(jax.vmap(anywhere)))
-    assert not twice(table & False).any()
-    assert twice(table).all()
-
-
-@pytest.mark.parametrize("wanted", [[False] * 3, [False, True, False]])
-def test_a_branch_that_no_lane_wants_is_not_computed(wanted):
-    calls: list[int] = []
-    add = counted(calls)
-
-    def one(x, w):
-        return lax.cond(anywhere(w), lambda: jnp.where(w, add(x), x), lambda: x)
-
-    found = jax.jit(jax.vmap(one))(np.arange(3), np.asarray(wanted))
-    jax.effects_barrier()
-    np.testing.assert_array_equal(found, np.arange(3) + np.asarray(wanted))
-    assert bool(calls) == any(wanted)
 
 
 def test_lanes_in_turn_are_the_function_with_and_without_batched_arguments():

@@ -73,6 +73,21 @@ def test_equally_near_rows_come_in_their_order_and_nothing_is_near_itself():
     np.testing.assert_array_equal(few, [row[:2] for row in others])
 
 
+def test_rows_of_one_group_are_no_partners_while_there_are_others():
+    """They follow where no others are left."""
+    x = drawn(21)
+    group = np.arange(21, dtype=np.int32) // 7
+    found = chosen(x, k=6, candidates=9, group=group)
+    assert (group[found] != group[:, None]).all()
+    products = np.where(group != group[:, None], x @ x.T, -9)
+    nearest = np.argsort(-products, axis=1)[:, :6]
+    np.testing.assert_array_equal(
+        np.sort(chosen(x, k=6, candidates=6, group=group)), np.sort(nearest)
+    )
+    many = chosen(x, k=16, candidates=20, group=group)
+    assert ((group[many] != group[:, None]).sum(1) == 14).all()
+
+
 @pytest.mark.parametrize("k", [0, 3])
 def test_more_partners_than_there_are_rows_is_an_error(k):
     with pytest.raises(ValueError, match=f"1..2, .*; got {k}"):

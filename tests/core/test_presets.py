@@ -46,8 +46,8 @@ PAPER_PAIR = {
     "coarse_columns": 128,
     "coarse_tile": 1024,
     "fine_chunk": 16,
-    "score_chunk": 2048,
-    "steps_at_once": 1,
+    "compared_first": 1024,
+    "steps_at_once": 2,
     "correspondences_per_cell": 2.0,
 }
 REFINEMENT = {
@@ -139,7 +139,7 @@ def test_what_the_paper_fixes_for_all_presets():
         *((name, 1, "at least 1; got 0") for name in ("coarse_columns", "coarse_tile")),
         *(
             (name, 1, "at least 1; got 0")
-            for name in ("fine_chunk", "score_chunk", "steps_at_once")
+            for name in ("fine_chunk", "compared_first", "steps_at_once")
         ),
         *((name, 0, "at least 0; got -1") for name in ("consensus", "plane_rounds")),
     ],

@@ -66,7 +66,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     "core/alexnet": (BACKBONES,),
     "core/align": ALIGN,
     "core/blocks": ("tests/core/test_blocks.py", "tests/core/test_vgg.py"),
-    "core/bundle_problem": ("tests/core/test_bundle.py",),
+    "core/bundle_layout": (
+        "tests/core/test_bundle_step.py",
+        "tests/core/test_band.py",
+        "tests/core/test_bundle.py",
+    ),
+    "core/bundle_problem": ("tests/core/test_bundle_problem.py", "tests/core/test_bundle.py"),
     "core/cameras": ("tests/core/test_projections.py",),
     "core/features": ("tests/core/test_features.py", BACKBONES),
     "core/grid": (NUMERICS,),

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.bundle_adjustment import adjusted
 from jaxsfm.colmap.mapper import MIN_MODEL_POINTS
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.tracks import Observations, Tracks
 from jaxsfm.colmap.view import View
 from jaxsfm.config import Refinement
-from jaxsfm.sfm.parts.straighten import straightened
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.patch_alignment import AlignmentLimits
 from jaxsfm.sfm.refine.track_alignment import AlignedBlock, align_blocks
@@ -67,6 +66,8 @@ class PassSettings(NamedTuple):
     """Whether bundle adjustment moves focal lengths and distortion."""
     threads: int
     """Of bundle adjustment."""
+    held: tuple[int, ...] = ()
+    """Cameras that stay where they are on their rig (`jaxsfm.colmap.bundle_adjustment`)."""
 
 
 class Refined(NamedTuple):
@@ -171,14 +172,8 @@ def _gather(model: Model, blocks: Sequence[AlignedBlock]) -> tuple[Model, np.nda
     return model.with_tracks(Tracks.from_parts(points, parts, ordered=True)), weak
 
 
-def _adjust(
-    model: Model,
-    weak: np.ndarray,
-    settings: PassSettings,
-) -> Refined | None:
+def _adjust(model: Model, weak: np.ndarray, settings: PassSettings) -> Refined | None:
     """Filter the observations and adjust the bundle, twice; None if (nearly) nothing is left.
-
-    The first adjustment of a long row of photos is that of its parts.
 
     Args:
       weak: views whose observations were not aligned; they may have four times the error.
@@ -186,31 +181,19 @@ def _adjust(
     loss_px = float(np.median([view.mean_scale for view in model.views]))
     weak_view = np.isin(np.arange(len(model.views)), weak)
     limit = settings.refinement.max_error_px * np.where(weak_view, 4.0, 1.0)
-    sizes = model.sizes
-    adjusted = None
-    # The first filter is coarse: a point far behind or beside its plane makes the solver fail.
+    # The first filter is coarse: a point far behind or beside its plane draws its views with it.
     for slack in (4.0, 1.0):
         good = model.errors_px() < slack * limit[model.tracks.view]
-        model = model.select(good)
-        if slack > 1:
-            straight = straightened(
-                model,
-                error_px=settings.refinement.max_error_px,
-                loss_px=loss_px,
-                threads=settings.threads,
-            )
-            if straight is not None:
-                model = straight
-                continue
-        reconstruction = model.to_colmap()
-        if reconstruction.num_points3D() < MIN_MODEL_POINTS:
+        model = model.select(good).triangulated()
+        if len(model.tracks.points) < MIN_MODEL_POINTS:
             return None
-        bundle_adjust(
-            reconstruction,
+        model = adjusted(
+            model,
             loss_px=loss_px,
             refine_intrinsics=settings.refine_intrinsics,
             threads=settings.threads,
+            held=settings.held,
         )
-        model = Model.from_colmap(reconstruction, sizes)
-        adjusted = Refined(reconstruction, model)
-    return adjusted
+    reconstruction = model.to_colmap()
+    reconstruction.update_point_3d_errors()
+    return Refined(reconstruction, Model.from_colmap(reconstruction, model.sizes))

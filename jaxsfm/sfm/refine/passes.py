@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from jaxsfm.colmap.mapper import MIN_MODEL_POINTS
 from jaxsfm.colmap.model import Model, Sizes
 from jaxsfm.colmap.other_camera import OtherCamera
+from jaxsfm.colmap.rigs import mounted_photos
 from jaxsfm.io.photos import Reader
 from jaxsfm.sfm.refine.device_images import DeviceImages
 from jaxsfm.sfm.refine.fixed_structure import NO_MATCHES, ResectionMatches
@@ -140,7 +141,8 @@ def refine_model(
     if with_all_points is not None:  # the passes ended early
         now = _as_arrays(with_all_points(now.reconstruction), sizes)
     reconstruction, attempts = now.reconstruction, list[RegistrationAttempt]()
-    if wanted := _to_register(figures):
+    mounted = mounted_photos(reconstruction)  # their rig holds them
+    if wanted := [name for name in _to_register(figures) if name not in mounted]:
         model, attempts = register_weak_views(
             now.model,
             wanted,
