@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.reconstruction import registered
+from jaxsfm.colmap.rigs import whole_frames
 from jaxsfm.colmap.two_views import TwoView
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.images import ImageError
@@ -68,7 +69,10 @@ class Checker(NamedTuple):
                 checks.append(None)
                 continue
             try:
-                checks.append(check_model(*self._opened(each), matches, self._refinement()))
+                done = check_model(*self._opened(each), matches, self._refinement())
+                if done is not None:
+                    done = done._replace(components=whole_frames(done.components, each))
+                checks.append(done)
             except ImageError as error:  # a photo was deleted since; the model remains
                 logger.warning("a model was not checked: %s", error)
                 checks.append(None)

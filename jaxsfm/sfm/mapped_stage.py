@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsfm.colmap.cameras import Cameras
-from jaxsfm.colmap.database import write_database
+from jaxsfm.colmap.database import drop_pairs, write_database
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import LOW_ANGLE_DEG
 from jaxsfm.colmap.model_files import read_models, write_models
+from jaxsfm.colmap.rigs import pairs_against_rigs
 from jaxsfm.colmap.two_views import read_two_views, verify
 from jaxsfm.config import Config, Refinement
 from jaxsfm.io.atomic import Json
@@ -27,6 +28,7 @@ from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.sfm.check.check_model import CHECKED_BY, MIN_CHECKED_POINTS, Checked
 from jaxsfm.sfm.check.model_check import MIN_VIEWS, ModelCheck
 from jaxsfm.sfm.checker import VerifiedPairs
+from jaxsfm.sfm.limits import TRUST
 from jaxsfm.sfm.mapping import MappedModels, Mapper, Trust
 from jaxsfm.sfm.one_place import from_one_place
 
@@ -127,7 +129,7 @@ def matched_photos(
         config=config,
         described=described,
         cameras=cameras,
-        options=dataclasses.replace(options, scale=scale),
+        options=dataclasses.replace(options, scale=scale, held=cameras.held(images)),
     )
 
 
@@ -147,6 +149,10 @@ def verify_matches(given: MatchedPhotos, kept: StageCache) -> VerifiedStage:
         write_database(folder / DATABASE, given.images, given.matches, given.cameras)
         verify(folder / DATABASE, options.verification(relative_poses=config.view_graph))
         views = read_two_views(folder / DATABASE)
+        contrary = pairs_against_rigs(folder / DATABASE, views, TRUST.rotation_deg)
+        if contrary:
+            drop_pairs(folder / DATABASE, contrary)
+            views = {pair: view for pair, view in views.items() if pair not in contrary}
         figures = VerificationFigures(
             verified={pair: view.geometry.num_inliers for pair, view in views.items()},
             angles={pair: view.tri_angle_deg for pair, view in views.items()},

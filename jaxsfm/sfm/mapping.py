@@ -21,6 +21,8 @@ from jaxsfm.colmap.database import drop_pairs
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import Attempt, complete, run_mapper, with_all_points
 from jaxsfm.colmap.reconstruction import registered
+from jaxsfm.colmap.rigid_model import rigid_models
+from jaxsfm.colmap.rigs import clear_rigs, have_common_centre, rigs_of_database
 from jaxsfm.colmap.two_views import PairGeometry, keep_inliers, read_inliers
 from jaxsfm.config import Config
 from jaxsfm.io.pairs import Pair
@@ -223,13 +225,21 @@ class Mapper:
         shutil.copyfile(self.given.database, database)
         drop_pairs(database, sorted(trust.dropped()))
         options = self._options if trust.thorough else self._draft
+        rigs = rigs_of_database(database)
+        alone = rigs is not None and not (
+            options.mapper == "incremental" and have_common_centre(rigs)
+        )
         with tempfile.TemporaryDirectory(dir=database.parent) as scratch:
             source = database
-            if self._share:
+            if self._share or alone:
                 source = Path(scratch) / "mapper.db"
                 shutil.copyfile(database, source)
+            if self._share:
                 keep_inliers(source, mapper_matches(read_inliers(source)))
+            if alone:
+                clear_rigs(source)
             models = run_mapper(source, options, on_image=on_image)
+        models = rigid_models(models, database, self._options)
         checks = self.checker(database).check(models)
         return MappedModels(trust=trust, database=database, models=models, checks=checks)
 

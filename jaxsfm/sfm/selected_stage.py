@@ -295,5 +295,6 @@ def adjusted_component(
         loss_px=loss_px,
         refine_intrinsics=options.refine_intrinsics,
         threads=options.threads,
+        held=options.held,
     )
     return part

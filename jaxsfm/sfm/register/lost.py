@@ -4,18 +4,28 @@ These are photos that the mapper has lost, that were split off, or that the refi
 out. They are located as photos that are added later (`jaxsfm.sfm.register.grow`), in the best of
 all refined models, and their places have to stand the same tests. The matches that the run has are
 tried first, then those with the best partners at full size, and last those as seen from one place.
+
+A photo is located by points that stay where they are. Errors add up from photo to photo if many
+follow each other in this way, so a model that has got photos is adjusted as a whole, unless one of
+its photos is too dark or too different for its full size.
 """
 
 import dataclasses
+import functools
 import logging
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
+from jaxsfm.colmap.bundle_adjustment import adjusted
 from jaxsfm.colmap.database import read_images
 from jaxsfm.colmap.model import Model
 from jaxsfm.colmap.model_files import read_models
 from jaxsfm.colmap.reconstruction import colour_points, fingerprint, registered_in_any
+from jaxsfm.colmap.rigid_model import with_frame_mates
+from jaxsfm.colmap.rigs import Rigs, rigs_of_database
 from jaxsfm.colmap.view import View
 from jaxsfm.io.images import ImageError
 from jaxsfm.io.pairs import Pair, PairResult
@@ -46,6 +56,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("jaxsfm")
 
+RIGID_PX = 4.0
+"""Observations in photos that a rig has moved may be so far off, working pixels: as far as those of
+COLMAP's mapper."""
+
 
 class MatchLost(Protocol):
     """Matches photos without a place with their best partners, at full size."""
@@ -74,7 +88,8 @@ def register_lost(
     kept: StageCache,
     match_lost: MatchLost | None,
 ) -> Reconstructed:
-    """Register the photos that have no place in the refined models, which stay as they are.
+    """Register the photos that have no place in the refined models. Models without new photos stay
+    as they are.
 
     Args:
       made: the refined models.
@@ -88,6 +103,7 @@ def register_lost(
     def compute(folder: Path) -> None:
         found = _Registration(given, selected, made)
         found.register(believed_matches(given, selected))
+        found.adjust()
         if match_lost is not None:
             false = selected.figures.misleading()
             for further in (False, True):
@@ -96,6 +112,7 @@ def register_lost(
                     # A photo that was registered may be the partner of another one.
                     matches = match_lost(lost, found.registered(), false, further=further)
                     more = found.register(matches)
+                found.adjust()
         write_refined(folder, found.outcome())
 
     models = [fingerprint(model) for model in made.models]
@@ -124,11 +141,22 @@ class _Registration:
         self._photos = Photos(given.images, given.config)
         self._cameras = read_images(selected.database)
         self._refined = [k for k, done in enumerate(made.refinement) if done is not None]
-        self._models: list[Model] = [opened(made.models[k], self._photos)[0] for k in self._refined]
+        all_rigs = rigs_of_database(selected.database)
+        self._models: list[Model] = []
+        for k in self._refined:
+            model = opened(made.models[k], self._photos)[0]
+            if all_rigs is not None:  # it has rigs and frames without a pose as well
+                own = model.rigs.rigs if model.rigs else {}
+                rigs = Rigs({**all_rigs.rigs, **own}, all_rigs.frames)
+                cameras = {camera.camera_id: camera for _, camera in self._cameras.values()}
+                cameras |= dict(model.cameras)
+                model = dataclasses.replace(model, rigs=rigs, cameras=cameras)
+            self._models.append(model)
         self._images = DeviceImages(self._photos.gray)
         self._outcomes: dict[str, Localization] = {}
         self._registered: dict[str, int] = {}
         self._unreadable: set[str] = set()
+        self._grown: set[int] = set()
 
     def registered(self) -> set[str]:
         """The photos with a place."""
@@ -158,10 +186,61 @@ class _Registration:
             self._images,
             refinement=self._given.config.refinement,
         )
-        self._models = grown.models
+        self._models = [
+            with_frame_mates(model, functools.partial(self._view_of, model))
+            for model in grown.models
+        ]
         self._outcomes |= grown.located
-        self._registered |= {name: self._refined[k] for name, k in grown.registered.items()}
+        self._grown |= {*grown.registered.values()}
+        before = self.registered()
+        for k, model in zip(self._refined, self._models, strict=True):
+            # A photo that is in a frame with one that was registered has a place, too.
+            self._registered |= {view.name: k for view in model.views if view.name not in before}
         return bool(grown.registered)
+
+    def adjust(self) -> None:
+        """Adjust the models that have got photos since the last time."""
+        for k in sorted(self._grown):
+            if not self._coarse(k):
+                self._models[k] = self._adjusted(self._models[k])
+        self._grown.clear()
+
+    def _coarse(self, k: int) -> bool:
+        """Whether a photo of a model has its place by a smaller size. An error of its keypoints is
+        a multiple of those of other photos, for which an adjustment does not allow."""
+        done = self._made.refinement[self._refined[k]]
+        assert done is not None
+        own = {name for name, of in self._registered.items() if of == self._refined[k]}
+        octaves = [self._outcomes[name].octave_px for name in own & self._outcomes.keys()]
+        octaves += [row.octave_px for row in done.registrations if row.registered]
+        return any(px is not None and px > 1 for px in octaves)
+
+    def _adjusted(self, model: Model) -> Model:
+        """A model with new photos after a bundle adjustment, in which all photos move. Cameras stay
+        if photos were turned: one camera may then stand for several, which must agree."""
+        options = self._given.options
+        turns = {self._photos.files[view.name].orientation for view in model.views}
+        found = adjusted(
+            model,
+            loss_px=float(np.median([view.mean_scale for view in model.views])),
+            refine_intrinsics=options.refine_intrinsics and len(turns) == 1,
+            threads=options.threads,
+            held=options.held,
+        )
+        if model.rigs is None:
+            return found
+        # COLMAP's model knows only the frames that have a place; later photos are of others.
+        rigs = {**model.rigs.rigs, **(found.rigs.rigs if found.rigs else {})}
+        cameras = {**model.cameras, **found.cameras}
+        return dataclasses.replace(found, cameras=cameras, rigs=model.rigs._replace(rigs=rigs))
+
+    def _view_of(self, model: Model, image_id: int) -> View:
+        """A photo without a pose, with its camera in a model."""
+        name = next(name for name, (number, _) in self._cameras.items() if number == image_id)
+        size, scale = self._photos.working_size(name)
+        camera = self._cameras[name][1]
+        camera = model.cameras.get(camera.camera_id, camera)
+        return View.without_pose(name, image_id, camera, size, Pixels(scale))
 
     def _unregistered(
         self, name: str, registered: Collection[str], matches: Mapping[Pair, PairResult]
@@ -188,6 +267,8 @@ class _Registration:
         image_id, camera = self._cameras[name]
         views, shared = [], False
         for model in self._models:
+            if model.rigs and not model.rigs.is_placed(image_id):
+                return None
             cameras = {view.camera.camera_id: view.camera for view in model.views}
             shared |= camera.camera_id in cameras
             refined = cameras.get(camera.camera_id, camera)
@@ -202,7 +283,10 @@ class _Registration:
         """The models with the photos that were registered, the one with most photos first."""
         models: list[pycolmap.Reconstruction] = list(self._made.models)
         for k in sorted({*self._registered.values()}):
-            models[k] = self._models[self._refined.index(k)].to_colmap()
+            model = self._models[self._refined.index(k)]
+            if model.rigs is not None:  # photos of one frame may have been located apart
+                model = model.select(model.errors_px() < RIGID_PX)
+            models[k] = model.to_colmap()
             colour_points(models[k], self._photos.rgb)
         order = sorted(range(len(models)), key=lambda k: -models[k].num_reg_images())
         figures = [self._figures(k) for k in range(len(models))]
