@@ -117,7 +117,7 @@ def warped_examples(
     return Examples(maps0, maps1, cells, pairs.h)
 
 
-def _scored(scores: dict | None, maps: tuple[Array, ...]) -> list[Array]:
+def scored(scores: dict | None, maps: tuple[Array, ...]) -> list[Array]:
     """The score maps of one view, coarse to fine."""
     heads = heads_of(scores)
     return [score(x, head) for x, head in zip(maps, heads, strict=True)][::-1]
@@ -140,7 +140,7 @@ def loss(
     def one(maps0, maps1, cells, known):
         first, second = (
             walk(
-                _scored(scores, maps),
+                scored(scores, maps),
                 cell[:, 0],
                 cell[:, 1],
                 temperature=objective.temperature,
@@ -179,7 +179,7 @@ def shares(scores: dict | None, examples: Examples) -> dict[str, Array]:
     """
 
     def places(maps: tuple[Array, ...], cell: Int[Array, "m 2"]) -> Float[Array, "m 2"]:
-        return relocalize(_scored(scores, maps), cell[:, 0], cell[:, 1])
+        return relocalize(scored(scores, maps), cell[:, 0], cell[:, 1])
 
     def one(maps0, maps1, cells, known):
         moved = warp_points(known, places(maps0, cells.cell0))

@@ -9,7 +9,7 @@ both photos around one match, and uses all matches that lie inside both windows.
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -164,7 +164,7 @@ def posed_pairs(
     config = preset("paper")
     config = dataclasses.replace(config, max_size=MAX_SIZE)
     features = extract(weights, images, config=config)
-    found = match(features, _neighbours(by_name, poses), config=config, seed=seed)
+    found = match(features, neighbours(by_name, poses), config=config, seed=seed)
     pairs = []
     for (a, b), result in sorted(found.items()):
         files = (by_name[a], by_name[b])
@@ -173,7 +173,7 @@ def posed_pairs(
             np.stack(np.divmod(result.cells[:, k].astype(np.int64), columns[k]), axis=1)
             for k in (0, 1)
         ]
-        k0, k1 = (_camera_matrix(intrinsics, features[name].scale) for name in (a, b))
+        k0, k1 = (camera_matrix(intrinsics, features[name].scale) for name in (a, b))
         f = _fundamental(poses[a], poses[b], k0, k1)
         centres = [Pixels.octave(FINE_STRIDE).to_original(cell[:, ::-1]) for cell in cells]
         near = np.abs(sampson_error(f, *centres)) < MAX_ERROR_PX
@@ -190,7 +190,7 @@ def _working(image: ImageFile) -> np.ndarray:
     return read_image(image, max_size=MAX_SIZE).rgb
 
 
-def _neighbours(images: dict[str, ImageFile], poses: Poses) -> set[tuple[str, str]]:
+def neighbours(images: Collection[str], poses: Poses) -> set[tuple[str, str]]:
     chosen = set()
     for a in images:
         seen = [
@@ -201,7 +201,7 @@ def _neighbours(images: dict[str, ImageFile], poses: Poses) -> set[tuple[str, st
     return chosen
 
 
-def _camera_matrix(intrinsics: Intrinsics, scale: tuple[float, float]) -> np.ndarray:
+def camera_matrix(intrinsics: Intrinsics, scale: tuple[float, float]) -> np.ndarray:
     """The camera matrix of the working image; the centre of its top-left pixel is (0, 0)."""
     if intrinsics.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
         raise UserError(f"--intrinsics: training needs a pinhole camera; got {intrinsics.model}")

@@ -16,7 +16,6 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import safetensors
 import safetensors.numpy
 from jaxtyping import PyTree
@@ -26,6 +25,7 @@ from jaxsfm.core.scores import HIDDEN, init_scores
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
 from jaxsfm.io.atomic import Json, write_atomic
+from jaxsfm.io.extras import extra
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.relocalizer import save_relocalizer
 from jaxsfm.io.weights import Weights
@@ -38,6 +38,9 @@ from jaxsfm.training.objective import (
     warped_examples,
 )
 from jaxsfm.training.photos import Crops, PosedPairs, split
+
+with extra("train", "jaxsfm train needs"):
+    import optax
 
 EVALUATION_BATCHES = 8
 """The number of batches of held-out views on which the progress is measured."""
