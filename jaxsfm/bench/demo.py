@@ -6,6 +6,7 @@ from pathlib import Path
 from jaxsfm.bench.synthetic import write_scene
 from jaxsfm.config import preset
 from jaxsfm.errors import UserError
+from jaxsfm.io.entries import PAGE
 from jaxsfm.report.summary import summary_lines
 from jaxsfm.runs.reconstruct import reconstruct_folder
 from jaxsfm.runs.run_options import RunOptions
@@ -53,4 +54,5 @@ def run_demo(out: Path | None, *, seed: int) -> tuple[list[str], bool]:
         f"{len(truth)} cameras, mean errors at most {MAX_POSITION} units and "
         f"{MAX_ROTATION_DEG} deg"
     )
-    return [*summary_lines(report), f"files            {out}", verdict], passed
+    where = f"where to look    {out / 'run' / PAGE}, in a browser; all files are in {out}"
+    return [*summary_lines(report), where, verdict], passed

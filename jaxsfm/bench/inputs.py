@@ -88,7 +88,7 @@ def strecha_intrinsics(folder: Path) -> tuple[str, float]:
 
     The sets' K counts pixels from the image's corner, as COLMAP does: K was halved together with
     the images, which is exact only for that convention, and rotations agree better with it
-    (docs/results.md).
+    (docs/decisions/benchmarks.md).
 
     Raises:
       UserError: images/K.txt is missing or not a camera matrix.

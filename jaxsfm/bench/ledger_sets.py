@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import h5py
 import numpy as np
 from PIL import Image
 
@@ -27,6 +26,7 @@ from jaxsfm.bench.synthetic import camera_text, write_photo
 from jaxsfm.colmap.poses import CameraPose, Poses, read_poses
 from jaxsfm.errors import UserError, writing
 from jaxsfm.io.atomic import atomic_folder
+from jaxsfm.io.extras import extra
 from jaxsfm.io.photo_folder import find_images
 from jaxsfm.sfm.evaluation import of_photos
 
@@ -94,6 +94,8 @@ def as_photos_with_poses(folder: Path, home: Path) -> SetPhotos:
 def as_phototourism(folder: Path, home: Path) -> SetPhotos:
     """mapping/NAME.jpg, and ground_truth/calibration_NAME.h5 with x = K (R X + T)."""
     del home
+    with extra("hdf5", f"{folder}: the files of its cameras need"):
+        import h5py
     truth = {}
     for path in sorted((folder / "ground_truth").glob("calibration_*.h5")):
         try:

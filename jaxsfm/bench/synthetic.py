@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from jaxsfm.colmap.poses import CameraPose, Poses
-from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import atomic_folder
+from jaxsfm.io.extras import extra
 
 SUPERSAMPLING = 2
 
@@ -32,12 +32,8 @@ class TexturedPlane:
 
 def photo_textures() -> list[np.ndarray]:
     """Photographs from the scikit-image package, uint8 RGB."""
-    try:
+    with extra("demo", "the photographs of rendered scenes need"):
         import skimage.data as data
-    except ImportError as error:
-        raise UserError(
-            "the demo's photographs come with scikit-image: pip install 'jaxsfm[demo]'"
-        ) from error
     photos = [data.astronaut(), data.coffee(), data.chelsea(), data.rocket(), data.brick()]
     photos += [data.gravel(), data.grass(), data.coins(), data.camera()]
     return [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in photos]

@@ -4,7 +4,6 @@ Heavy modules are imported inside the commands, so that --help is quick.
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 
 from jaxsfm.cli.arguments import (
@@ -16,6 +15,7 @@ from jaxsfm.cli.arguments import (
 )
 from jaxsfm.config import BackboneName
 from jaxsfm.errors import UserError
+from jaxsfm.io.extras import require
 from jaxsfm.io.libraries import limit_threads
 from jaxsfm.options import (
     EngineChoice,
@@ -47,7 +47,9 @@ def reconstruct(
         $ jaxsfm reconstruct PHOTOS --out OUT --intrinsics K.txt --preset robust
         $ jaxsfm reconstruct PHOTOS --out OUT --cameras single --camera-model OPENCV
         $ jaxsfm reconstruct PHOTOS --out OUT --masks MASKS
+        $ jaxsfm reconstruct PHOTOS --out OUT --rig rig_config.json
         $ jaxsfm reconstruct PHOTOS --out OUT --georeference gcp_list.txt
+        $ jaxsfm reconstruct PHOTOS --out OUT --panorama yes --nadir 55
         $ jaxsfm reconstruct VIDEO.mp4 --out OUT
 
     The exit status is 0 for a model, 1 if no model could be built, and 3 for a model that may be
@@ -62,6 +64,7 @@ def reconstruct(
     limit_threads(run.threads)
     from jaxsfm.io.entries import FAILED
     from jaxsfm.matching.execution import Execution
+    from jaxsfm.report.closing import closing_lines
     from jaxsfm.report.summary import summary_lines
     from jaxsfm.runs.reconstruct import reconstruct_folder, reconstruct_video
     from jaxsfm.runs.run_options import RunOptions
@@ -73,22 +76,12 @@ def reconstruct(
     )
     work = reconstruct_video if images.is_file() else reconstruct_folder
     report = work(images, out, config=chosen, options=options)
-    print("\n".join(summary_lines(report)))
+    failed = not report.models and (out / "sparse").exists()  # beside an earlier model
+    ending = closing_lines(report, out / FAILED if failed else out)
+    print("\n".join([*summary_lines(report), "", *ending]))
     if not report.models:
-        where = out / FAILED if (out / "sparse").exists() else out
-        print(
-            "jaxsfm: no model could be built: see the lost images above and "
-            f"{where / 'report.json'}",
-            file=sys.stderr,
-        )
         return 1
-    if report.verdict in ("amber", "red"):
-        print(
-            f"jaxsfm: the model may be wrong: see the verdict above and {out / 'report.html'}",
-            file=sys.stderr,
-        )
-        return DOUBTFUL
-    return 0
+    return DOUBTFUL if report.verdict in ("amber", "red") else 0
 
 
 def match(
@@ -126,6 +119,8 @@ def match(
     config = matching.config(network.relocalizer)
     check_writable(out, "--out", (".npz",))
     check_writable(plot, "--plot", (".png", ".jpg"))
+    if plot is not None:
+        require("plots", "--plot needs")
     import numpy as np
 
     from jaxsfm.io.atomic import atomic_file

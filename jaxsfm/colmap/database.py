@@ -5,7 +5,7 @@ native code, and some unset options fail silently.
 """
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import SPARE_BYTES, check_disk_space
 from jaxsfm.io.images import ImageFile
 from jaxsfm.io.pairs import Pair, PairResult, describe
+from jaxsfm.io.rig_config import Rig, frames_of, rig_photos
 
 PIXEL_OFFSET = np.float32(0.5)
 """COLMAP puts the centre of the top-left pixel at (0.5, 0.5)."""
@@ -186,8 +187,55 @@ def _write(
             )
             xy = keypoints.get(image.name, empty)
             db.write_keypoints(ids[image.name], (xy + PIXEL_OFFSET).astype(np.float32))
+        _write_rigs(db, cameras.rigs, ids, camera_ids)
         for (a, b), index in matches:
             db.write_matches(ids[a], ids[b], index.astype(np.uint32))
+
+
+def _write_rigs(
+    db: pycolmap.Database,
+    rigs: Sequence[Rig],
+    ids: Mapping[str, int],
+    camera_ids: Mapping[str, int],
+) -> None:
+    """Write rigs and frames; without rigs, COLMAP makes a frame of each photo by itself.
+
+    A rig has the number of its reference camera, and a frame that of its first photo.
+    """
+    photos = rig_photos(rigs, ids)
+    number = {photo[:2]: camera_ids[name] for name, photo in photos.items()}
+
+    def write(rig_id: int, names: Sequence[str]) -> None:
+        frame = pycolmap.Frame(frame_id=min(ids[name] for name in names), rig_id=rig_id)
+        for name in names:
+            frame.add_data_id(pycolmap.data_t(camera_sensor(camera_ids[name]), ids[name]))
+        db.write_frame(frame, use_frame_id=True)
+
+    for r, rig in enumerate(rigs):
+        made = pycolmap.Rig(rig_id=number[r, rig.reference])
+        made.add_ref_sensor(camera_sensor(made.rig_id))
+        for c, camera in enumerate(rig.cameras):
+            if c != rig.reference:
+                pose = None
+                if camera.rotation is not None and camera.translation is not None:
+                    turn = pycolmap.Rotation3d(np.ascontiguousarray(camera.rotation))
+                    pose = pycolmap.Rigid3d(turn, camera.translation)
+                made.add_sensor(camera_sensor(number[r, c]), pose)
+        db.write_rig(made, use_rig_id=True)
+    for (r, _), names in frames_of(photos).items():
+        write(number[r, rigs[r].reference], names)
+    alone = sorted(ids.keys() - photos.keys()) if rigs else []
+    for camera_id in sorted({camera_ids[name] for name in alone}):
+        made = pycolmap.Rig(rig_id=camera_id)
+        made.add_ref_sensor(camera_sensor(camera_id))
+        db.write_rig(made, use_rig_id=True)
+    for name in alone:
+        write(camera_ids[name], [name])
+
+
+def camera_sensor(camera_id: int) -> pycolmap.sensor_t:
+    """A camera as COLMAP names it in rigs."""
+    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
 
 
 def image_ids(db: pycolmap.Database) -> dict[str, int]:

@@ -108,7 +108,7 @@ def updated(
     Ids and names of images and cameras, rigs and frames are those of the original. An image that
     the refinement took out keeps no pose. The images of a frame of a rig with several cameras move
     together: the frame gets the pose that the refinement gave to one of them, the reference camera
-    if it can. The caller adjusts such a model (`has_rigs`).
+    if it can. The caller adjusts such a model once more (`has_rigs`).
 
     Args:
       original: not changed.
@@ -124,6 +124,11 @@ def updated(
     for camera_id in model.cameras:
         if refined.exists_camera(camera_id):
             model.camera(camera_id).params = refined.camera(camera_id).params.tolist()
+    for rig in model.rigs.values():
+        number = rig.ref_sensor_id.id  # that of the rig in the refined model
+        for sensor in rig.non_ref_sensors if refined.exists_rig(number) else ():
+            if refined.rig(number).has_sensor(sensor):
+                rig.set_sensor_from_rig(sensor, refined.rig(number).sensor_from_rig(sensor))
     left = set(refined.reg_image_ids())
     for frame_id in sorted(model.reg_frame_ids()):
         frame = model.frame(frame_id)

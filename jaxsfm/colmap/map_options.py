@@ -42,6 +42,8 @@ class MapOptions:
     is repeatable to the last byte."""
     scale: float = 1.0
     """Original pixels per working pixel. COLMAP's pixel thresholds are multiplied by it."""
+    held: tuple[int, ...] = ()
+    """Ids of cameras whose place on their rig is known, and stays."""
     draft: bool = False
     """The models are refined afterwards, so the first run of the incremental mapper makes a draft.
     It adjusts the whole model less often and less exactly, and leaves out images that see too few
@@ -63,7 +65,7 @@ def incremental_options(options: MapOptions) -> pycolmap.IncrementalPipelineOpti
     """The options as the incremental mapper takes them."""
     p = pycolmap.IncrementalPipelineOptions()
     p.ba_refine_focal_length = p.ba_refine_extra_params = options.refine_intrinsics
-    p.ba_refine_principal_point = False
+    p.ba_refine_principal_point = p.ba_refine_sensor_from_rig = False
     p.num_threads = p.mapper.num_threads = options.threads
     p.random_seed = p.mapper.random_seed = options.seed
     p.min_model_size = 2

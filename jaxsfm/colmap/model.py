@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 import pycolmap
 
+from jaxsfm.colmap.rigs import Rigs, rigs_of_model
 from jaxsfm.colmap.tracks import Tracks, grouped
 from jaxsfm.colmap.view import View
 from jaxsfm.io.photos import Pixels
@@ -30,6 +31,8 @@ class Model:
     """Its indices of views are positions in `views`."""
     cameras: Mapping[int, pycolmap.Camera] = dataclasses.field(default_factory=dict)
     """Cameras by id. Where a view has another camera of the same id, the view's is written."""
+    rigs: Rigs | None = None
+    """The rigs that cameras are mounted on, if any. The model that is written is rigid."""
 
     @classmethod
     def from_colmap(cls, reconstruction: pycolmap.Reconstruction, sizes: Sizes) -> "Model":
@@ -70,7 +73,7 @@ class Model:
             xy[own] = at[rows[own, 2]]
         tracks = Tracks(points.reshape(-1, 3), rows[:, 0], rows[:, 1], xy)
         cameras = {i: reconstruction.camera(i) for i in reconstruction.cameras}
-        return cls(views, tracks, cameras)
+        return cls(views, tracks, cameras, rigs_of_model(reconstruction))
 
     @functools.cached_property
     def rows(self) -> list[np.ndarray]:
@@ -94,8 +97,12 @@ class Model:
         """The same, and the index of a point by its number in COLMAP's model."""
         model = pycolmap.Reconstruction()
         cameras = {**self.cameras, **{view.camera.camera_id: view.camera for view in self.views}}
+        mounted = self.rigs.cameras() if self.rigs else set[int]()
         for camera_id in sorted(cameras):
-            model.add_camera_with_trivial_rig(cameras[camera_id])
+            add = model.add_camera if camera_id in mounted else model.add_camera_with_trivial_rig
+            add(cameras[camera_id])
+        if self.rigs:
+            self.rigs.add_to(model, self.views, [len(rows) for rows in self.rows])
         tracks = self.tracks
         place = np.zeros(len(tracks.xy), np.int64)
         for view, rows in zip(self.views, self.rows, strict=True):
@@ -106,7 +113,11 @@ class Model:
                 image_id=view.image_id,
                 keypoints=view.pixels.to_colmap(tracks.xy[rows]),
             )
-            model.add_image_with_trivial_frame(image, view.cam_from_world())
+            if self.rigs and view.image_id in self.rigs.frames:
+                image.frame_id, _ = self.rigs.frames[view.image_id]
+                model.add_image(image)
+            else:
+                model.add_image_with_trivial_frame(image, view.cam_from_world())
         order = np.argsort(tracks.point, kind="stable")
         ends = np.searchsorted(tracks.point[order], np.arange(len(tracks.points) + 1))
         index = {}
@@ -150,6 +161,23 @@ class Model:
         tracks = seen._replace(view=place[seen.view]).select_points(points)
         views = [self.views[k] for k in chosen]
         return dataclasses.replace(self, views=views, tracks=tracks), points
+
+    def triangulated(self) -> "Model":
+        """The model without points that fewer than two views see, or whose rays are all closer to
+        each other than `MIN_TRI_ANGLE_DEG`, as COLMAP measures angles."""
+        tracks = self.tracks
+        order = np.argsort(tracks.point, kind="stable")
+        centres = np.stack([view.centre for view in self.views])[tracks.view[order]]
+        rays = centres - tracks.points[tracks.point[order]]
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)
+        wide = np.zeros(len(tracks.points), bool)
+        for apart in range(1, int(tracks.num_observations().max(initial=1))):
+            one, other = order[:-apart], order[apart:]
+            same = np.flatnonzero(tracks.point[one] == tracks.point[other])
+            cosine = np.abs((rays[same] * rays[same + apart]).sum(1))
+            far = same[cosine <= np.cos(np.deg2rad(MIN_TRI_ANGLE_DEG))]
+            wide[tracks.point[one[far]]] = True
+        return self.with_tracks(tracks.select_points(np.flatnonzero(wide)))
 
     def in_octave(self, px: int) -> "Model":
         """The same model, with pixels that are `px` times as large."""

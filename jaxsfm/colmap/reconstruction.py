@@ -86,6 +86,15 @@ def move_model(
     model.transform(pycolmap.Sim3d(scale, turned, translation))
 
 
+def forget_behind(model: pycolmap.Reconstruction) -> None:
+    """Take out the observations of points behind cameras, and compute the errors of points anew.
+
+    A solver moves points behind cameras, where COLMAP gives them an error of 1e154.
+    """
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+    model.update_point_3d_errors()
+
+
 def usual_distance(model: pycolmap.Reconstruction) -> float:
     """The median distance from points to an image that observes them, world units; nan if there
     are no points. At most `ASKED` points are asked."""

@@ -28,12 +28,20 @@ FRAMES = "frames"
 """The folder with the frames of a video. It is there before the first run begins."""
 FRAMES_RECORD = "frames.json"
 """The file in it that says what the frames were made from."""
+VIEWS = "views"
+"""The folder with the pinhole views of panoramas, and the other photos of their run."""
+VIEWS_RECORD = "views.json"
+"""The file in it that says what the views were made from."""
+VIEW_MASKS = "view_masks"
+"""The folder with the masks of the photos in it."""
+PANORAMAS = "panoramas.csv"
+"""The table with the poses of the panoramas."""
 PAGE = "report.html"
 """The report page (`jaxsfm.report.page`). It is made from the other results, after them."""
 STILL = "still.png"
 """The mask of what shows at the same pixels in all photos (`jaxsfm.io.still_pattern`)."""
 DATABASE = "database.db"
-RESULTS = (PAGE, "report.json", "sparse", "alternative", DATABASE)
+RESULTS = (PAGE, "report.json", "sparse", "alternative", DATABASE, PANORAMAS)
 LOGS = ("-journal", "-wal", "-shm")
 """What SQLite appends to the name of a database for the names of its log files. It reads them when
 it opens the database, and a journal can name another file that is to be deleted."""
@@ -50,6 +58,7 @@ ENTRIES = frozenset(
         *(DATABASE + end for end in LOGS),
         *(RECORD, LOCK, UNUSABLE, STILL, FAILED, FRESH, PUBLISHING, FRAMES, FRAMES + PARTIAL),
         *(FEATURES, MATCHES, DESCRIPTORS, STAGES),
+        *(VIEWS, VIEWS + PARTIAL, VIEW_MASKS, VIEW_MASKS + PARTIAL),
     ]
 )
 """The names of all that jaxsfm writes, replaces or deletes in a work folder. Beside them are files

@@ -18,6 +18,22 @@ SUFFIXES = frozenset(
     (*".jpg .jpeg .jpe .png .tif .tiff .bmp .webp .ppm .pgm .jp2".split(), *decoders.SUFFIXES)
 )
 
+VIDEOS = frozenset(".mp4 .mov .m4v .avi .mkv .webm .mts .m2ts .mpg .mpeg .wmv .3gp".split())
+"""The suffixes of files that are videos; one is only told about, so no other one is needed."""
+
+
+def find_videos(folder: Path) -> list[str]:
+    """The names of the video files in a folder and its sub-folders, sorted, without hidden ones."""
+    names = []
+    for root, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        names += [
+            (Path(root) / name).relative_to(folder).as_posix()
+            for name in files
+            if Path(name).suffix.lower() in VIDEOS and not name.startswith(".")
+        ]
+    return sorted(names)
+
 
 def find_images(folder: Path) -> list[str]:
     """The names of the image files in a folder and its sub-folders, sorted, without hidden ones.

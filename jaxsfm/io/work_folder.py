@@ -38,6 +38,9 @@ from jaxsfm.io.entries import (
     RECORD,
     RESULTS,
     STAGES,
+    VIEW_MASKS,
+    VIEWS,
+    VIEWS_RECORD,
     check_entries,
     entry,
     lock_file,
@@ -198,9 +201,11 @@ def _prepare(path: Path) -> None:
         if path.is_dir() and not (path / RECORD).exists():
             begun = {*path.glob(f"{RECORD}.*{PARTIAL}"), path / LOCK}
             if (path / LOCK).exists():
-                begun.add(path / (FRAMES + PARTIAL))
-            if (path / FRAMES / FRAMES_RECORD).is_file():
-                begun.add(path / FRAMES)
+                begun |= {path / (name + PARTIAL) for name in (FRAMES, VIEWS, VIEW_MASKS)}
+                begun.add(path / VIEW_MASKS)
+            for name, made_of in ((FRAMES, FRAMES_RECORD), (VIEWS, VIEWS_RECORD)):
+                if (path / name / made_of).is_file():
+                    begun.add(path / name)
             strangers = sorted(p.name for p in {*path.iterdir()} - begun)
             if strangers:
                 raise UserError(

@@ -5,11 +5,12 @@ import importlib.metadata
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 from tqdm import tqdm
 
-from jaxsfm.colmap.cameras import Cameras
+from jaxsfm.colmap.cameras import Cameras, rig_intrinsics
 from jaxsfm.colmap.external_matches import read_external_matches
 from jaxsfm.colmap.given_cameras import parse_cameras
 from jaxsfm.colmap.intrinsics import used_cameras
@@ -21,7 +22,8 @@ from jaxsfm.io.entries import FAILED, FRAMES, STILL, entry
 from jaxsfm.io.images import ImageFile, named, orientations
 from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
 from jaxsfm.io.pairs import Pair
-from jaxsfm.io.photo_folder import masks_of, too_few, with_masks
+from jaxsfm.io.photo_folder import find_videos, masks_of, too_few, with_masks
+from jaxsfm.io.rig_config import Rig, incomplete_frames, read_rigs
 from jaxsfm.io.still_pattern import StillPattern, find_still_pattern
 from jaxsfm.io.video import open_video
 from jaxsfm.io.weights import chosen_weights
@@ -35,11 +37,14 @@ from jaxsfm.report.run_inputs import LowResolution, RunIdentity, SamePixels, Use
 from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
+from jaxsfm.runs.first_words import first_words
 from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.runs.job import Job, pairs_without, timed
+from jaxsfm.runs.panoramas import prepared_panoramas
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
 from jaxsfm.runs.run_stages import RunStages
+from jaxsfm.runs.time_estimate import tell_time
 from jaxsfm.runs.video.frames import frames_folder
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.check.still_model import with_still_models
@@ -58,7 +63,12 @@ def run_folder(images: Path, out: Path, *, config: Config, options: RunOptions) 
 
 
 def reconstruct_folder(
-    images: Path, out: Path, *, config: Config, options: RunOptions
+    images: Path,
+    out: Path,
+    *,
+    config: Config,
+    options: RunOptions,
+    rigs: tuple[Rig, ...] = (),
 ) -> RunReport:
     """Reconstruct a folder of photos; returns the report, also written to `out`/report.json.
 
@@ -70,6 +80,7 @@ def reconstruct_folder(
     Args:
       images: folder of the photos.
       out: folder for the results; it is made if it does not exist.
+      rigs: cameras that are mounted together, instead of those in the file `options.rig`.
 
     Raises:
       UserError: a photo, a file or an option cannot be used. What was computed is kept.
@@ -77,11 +88,20 @@ def reconstruct_folder(
     check_options(options)
     reference = read_poses(options.reference) if options.reference else None
     intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
+    rigs = read_rigs(options.rig) if options.rig else rigs
     usable, skipped = open_images(images, progress=options.progress)
+    given, panoramas = images, prepared_panoramas(usable, out, config, options)
+    apart = dict[str, str]()
+    if panoramas is not None:
+        images, rigs, apart = panoramas.folder, (*rigs, panoramas.rig), panoramas.panorama_of
+        options = dataclasses.replace(options, masks=panoramas.masks)
+        usable, lost = open_images(images, progress=options.progress)
+        skipped |= lost | panoramas.lost
     names = [*(image.name for image in usable), *skipped]
     options = dataclasses.replace(options, pairs=chosen_pairs(options.pairs, len(usable)))
     selection = parse_pair_selection(options.pairs)
     pairs = selected_pairs(selection, (image.name for image in usable), names)
+    pairs = [(a, b) for a, b in pairs if apart.get(a, a) != apart.get(b, b)]
     _check_enough(images, usable, skipped)
     if options.masks is not None:
         usable, bare = with_masks(usable, options.masks)
@@ -89,8 +109,17 @@ def reconstruct_folder(
             logger.warning("%s: no mask in %s, so all of it is used", named(bare), options.masks)
     if intrinsics is not None:
         intrinsics = used_cameras(intrinsics, usable)
-    cameras = Cameras(known=intrinsics, sharing=options.cameras, model=options.camera_model)
+    mounted = rig_intrinsics(rigs, usable)
+    if intrinsics is None and len(mounted) == len(usable):
+        intrinsics = mounted
+        if options.refine_intrinsics == "auto":
+            options = dataclasses.replace(options, refine_intrinsics="no")
+    cameras = Cameras(
+        known=intrinsics, sharing=options.cameras, model=options.camera_model, rigs=rigs
+    )
     cameras.check_fits(usable)
+    if lacking := incomplete_frames(rigs, (image.name for image in usable)):
+        logger.warning("%s: frames without a photo of each camera of their rig", named(lacking))
     measured = measured_positions(options.georeference, usable)
     external = read_external_matches(
         options.with_database, options.with_hloc, usable, intrinsics, dense=options.with_dense
@@ -111,6 +140,9 @@ def reconstruct_folder(
     )
     seconds: dict[str, float] = {}
     with open_folder(out, to_json(identity)) as folder:
+        if given.name != FRAMES:  # its photos were chosen from a video
+            for words in first_words(given, usable, find_videos(given)):
+                logger.info("%s", words)
         job = Job(
             store=folder,
             weights=weights,
@@ -122,10 +154,17 @@ def reconstruct_folder(
         )
         still = None if options.masks else _still_pattern(usable, out)
         skipped |= {i.name: why for i in usable if (why := folder.why_unusable(i)) is not None}
+        if options.progress:
+            by_name = {image.name: image for image in usable if image.name not in skipped}
+            first = RunPhotos(
+                job=job, identity=identity, images=by_name, pairs=pairs_without(pairs, skipped)
+            )
+            tell_time(first, selection.retrieval, seconds)
         if selection.retrieval:
             with timed(seconds, "retrieval"):
                 tried = [image for image in usable if image.name not in skipped]
-                found, lost = _retrieve(job, tried, options.retrieval, selection.retrieval)
+                wanted = _Partners(options.retrieval, selection.retrieval, apart)
+                found, lost = _retrieve(job, tried, wanted)
                 pairs, skipped = sorted({*pairs, *found}), skipped | lost
         by_name = {image.name: image for image in usable if image.name not in skipped}
         photos = RunPhotos(
@@ -135,6 +174,7 @@ def reconstruct_folder(
         skipped |= lost
         good = [image for image in usable if image.name not in skipped]
         _check_enough(images, good, skipped)
+        cameras.check_fits(good)
         stages = RunStages(
             folder=folder,
             images=good,
@@ -146,7 +186,7 @@ def reconstruct_folder(
             seconds=seconds,
         )
         photos = photos.without(lost)
-        if config.checked and "upright" not in options.without:
+        if config.checked and "upright" not in options.without and not rigs:
             photos, matched = photos.upright(matched, seconds)
             stages = dataclasses.replace(stages, images=[photos.images[i.name] for i in good])
         with folder.publish() as target:
@@ -162,6 +202,8 @@ def reconstruct_folder(
                 models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
             made = models.made if still is None else with_still_models(models.made, still.still)
             moved = stages.write(made, target)
+            if panoramas is not None:
+                panoramas.write_poses(target, made.models)
             report = run_report(
                 StageResults(
                     folder=images,
@@ -244,8 +286,18 @@ def _lacks_detail(made: Reconstructed, images: Sequence[ImageFile]) -> bool:
     return largest < min(MIN_VIEWS, len(images)) and not made.verification.no_depth
 
 
+class _Partners(NamedTuple):
+    """Which photos are partners of a photo."""
+
+    kind: Retrieval
+    k: int
+    """Their number."""
+    apart: dict[str, str]
+    """The panoramas of views. Those of one are no partners."""
+
+
 def _retrieve(
-    job: Job, images: list[ImageFile], kind: Retrieval, k: int
+    job: Job, images: list[ImageFile], wanted: _Partners
 ) -> tuple[list[Pair], dict[str, str]]:
     """Pairs of each image with k similar ones, and why images have no descriptor."""
     total, quiet = len(images), not job.progress
@@ -253,7 +305,7 @@ def _retrieve(
         found = describe_photos(
             job.weights,
             images,
-            kind=kind,
+            kind=wanted.kind,
             store=job.store,
             execution=job.execution,
             on_image=bar.update,
@@ -261,4 +313,4 @@ def _retrieve(
     for image, error in found.lost:
         job.store.record_failure(image, error)
     lost = {image.name: str(error) for image, error in found.lost}
-    return partner_pairs(found.vectors, k), lost
+    return partner_pairs(found.vectors, wanted.k, wanted.apart), lost

@@ -64,6 +64,8 @@ def check_options(options: RunOptions) -> None:
             f"--cameras {options.cameras} and --intrinsics exclude each other, because a known "
             "camera is that of all photos, and a list says the camera of each"
         )
+    if options.positions_inside and options.georeference == "off":
+        raise UserError("--positions-inside and --georeference off exclude each other")
     check_seed(options.seed)
     check_threads(options.threads)
     chosen_engine(options.engine)

@@ -164,10 +164,10 @@ def test_rigs_with_sensors_are_followed_to_their_end(tmp_path, file):
 
 
 def test_keypoints_of_a_point_that_is_not_there_are_refused(tmp_path, whole):
-    """COLMAP reads such a model, but cannot adjust it."""
+    """COLMAP reads such a model, but cannot count its observations."""
     bad = copied(whole, tmp_path, "points3D.bin", struct.pack("<Q", 0))
     model = pycolmap.Reconstruction(bad)
-    with pytest.raises(ValueError, match="IsValid"):
+    with pytest.raises(IndexError, match="does not exist"):
         bundle_adjust(model, loss_px=1.0, refine_intrinsics=False, threads=1)
     with pytest.raises(
         UserError, match=f"{re.escape(str(tmp_path))}: .*its files do not fit together"

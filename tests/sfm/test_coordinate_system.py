@@ -26,7 +26,7 @@ def test_the_origin_of_a_gps_frame_lies_amid_the_positions():
 def test_longitude_and_latitude_need_no_other_package(text, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
     assert coordinate_system(text, "here").kind == "geographic"
-    with pytest.raises(UserError, match=r"needs pyproj; pip install 'jaxsfm\[geo\]'"):
+    with pytest.raises(UserError, match=r"needs pyproj: pip install 'jaxsfm\[geo\]'"):
         coordinate_system("EPSG:32632", "here")
 
 

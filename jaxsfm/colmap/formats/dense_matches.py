@@ -15,15 +15,18 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import h5py
 import numpy as np
 from scipy.spatial import KDTree
 
 from jaxsfm.colmap.formats.hloc import DAMAGED, dataset, pairs_in
 from jaxsfm.colmap.formats.tables import MAX_KEYPOINTS, Tables, checked_keypoints
 from jaxsfm.errors import UserError
+from jaxsfm.io.extras import extra
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, describe, make_pair
+
+with extra("hdf5", "reading and writing HDF5 files needs"):
+    import h5py
 
 CELL_SHARE = 1 / 400
 """The side of a cell as a share of the photo's longer side: 4 pixels of 1600."""

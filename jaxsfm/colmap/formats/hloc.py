@@ -18,7 +18,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from jaxsfm.colmap.formats.tables import (
@@ -29,8 +28,12 @@ from jaxsfm.colmap.formats.tables import (
     checked_matches,
 )
 from jaxsfm.errors import UserError
+from jaxsfm.io.extras import extra
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.pairs import Pair, describe
+
+with extra("hdf5", "reading and writing HDF5 files needs"):
+    import h5py
 
 FEATURES, MATCHES, PAIRS = "features.h5", "matches.h5", "pairs.txt"
 MAX_COLUMNS = 16

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxsfm.colmap.measured_positions import east_north_up
 from jaxsfm.errors import UserError
+from jaxsfm.io.extras import extra
 from jaxsfm.io.images import shown_name
 from jaxsfm.io.position_tables import OPTION
 
@@ -152,14 +153,9 @@ def coordinate_system(text: str | None, where: str) -> CoordinateSystem:
     plain_wgs84 = {"+proj=longlat", "+proj=latlong"} & tokens and "+datum=wgs84" in tokens
     if text.strip().lower() in _GEOGRAPHIC or plain_wgs84:
         return CoordinateSystem("geographic", text, None)
-    try:
+    with extra("geo", f"{where}: the coordinate system {shown_name(text)} needs"):
         import pyproj
         from pyproj.exceptions import CRSError
-    except ImportError as error:
-        raise UserError(
-            f"{where}: the coordinate system {shown_name(text)} needs pyproj; "
-            "pip install 'jaxsfm[geo]'"
-        ) from error
     try:
         crs = pyproj.CRS(_code(text))
     except CRSError as error:

@@ -8,12 +8,16 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from jaxsfm.colmap.poses import model_poses
-from jaxsfm.colmap.reconstruction import move_model, usual_distance
+from jaxsfm.colmap.reconstruction import move_model, registered, usual_distance
+from jaxsfm.colmap.rigs import one_of_each_frame
+from jaxsfm.colmap.turned_cameras import shares_one_camera
 from jaxsfm.colmap.view import View
+from jaxsfm.io.orientation import UPRIGHT
 from jaxsfm.io.photos import Pixels
 from jaxsfm.io.position_tables import ControlPoint, Position
 from jaxsfm.sfm.evaluation import Similarity
 from jaxsfm.sfm.georeference.coordinate_system import CoordinateSystem, Frame
+from jaxsfm.sfm.georeference.inside import Settings, positions_inside
 from jaxsfm.sfm.georeference.model_georeference import (
     ModelGeoreference,
     NamedAnchors,
@@ -156,7 +160,8 @@ class MeasuredPositions:
     def _photos_in(self, model: "pycolmap.Reconstruction", frame: Frame | None) -> NamedAnchors:
         poses = model_poses(model)
         known = self.local(frame)
-        names = sorted(poses.keys() & known.keys())
+        # Photos of one frame have one position, which counts once.
+        names = one_of_each_frame(sorted(poses.keys() & known.keys()), model)
         flat = sorted(poses.keys() & self.positions.keys() - known.keys())
         deviations = [known[name].deviation for name in names]
         usual = np.median([each for each in deviations if each is not None] or [1.0])
@@ -212,6 +217,7 @@ def move_models(
     models: "list[pycolmap.Reconstruction]",
     measured: MeasuredPositions,
     turned: Mapping[str, int] | None = None,
+    settings: Settings | None = None,
 ) -> Georeference:
     """Move models, each by itself, onto measured positions. The models change in place.
 
@@ -219,6 +225,8 @@ def move_models(
 
     Args:
       turned: how photos are turned that are not stored upright, by name.
+      settings: of an adjustment in which positions of cameras take part. None: there is none, and
+        the models are moved as they are.
     """
     frame, placed = measured.frame(), []
     for model in models:
@@ -235,8 +243,21 @@ def move_models(
             )
             figures = replace(figures, upside_down=hang)
             move_model(model, *similarity)
+            if settings is not None and not measured.points:
+                figures = positions_inside(model, given, figures, _held(model, settings, turned))
         placed.append(figures)
     return Georeference(source=measured.source, file=measured.file, frame=frame, models=placed)
+
+
+def _held(
+    model: "pycolmap.Reconstruction", settings: Settings, turned: Mapping[str, int] | None
+) -> Settings:
+    """The settings for a model. Photos of one camera that were turned differently could not share
+    it any more, so their cameras are held."""
+    codes = dict.fromkeys(registered(model), UPRIGHT) | dict(turned or {})
+    return settings._replace(
+        refine_intrinsics=settings.refine_intrinsics and not shares_one_camera(model, codes)
+    )
 
 
 def _contradiction(

@@ -17,6 +17,8 @@ MAX_TURN_DEG = 10.0
 """A model whose direction is less certain is not moved unless the user asked for it."""
 MAX_SCALE = 0.1
 """Likewise for its scale, as a share."""
+SAME = Similarity(1.0, np.eye(3), np.zeros(3))
+"""Of a model that is in metres already."""
 Vector = tuple[float, float, float]
 """East, north and up, or x, y and z."""
 
@@ -76,6 +78,22 @@ class AppliedSimilarity:
 
 
 @dataclass(frozen=True, kw_only=True)
+class AdjustedPositions:
+    """What positions inside an adjustment are worth (`jaxsfm.sfm.georeference.inside`)."""
+
+    kept: bool
+    """Whether the model is the adjusted one: positions that were left out fit it better."""
+    moved_only: Rms
+    """Of the positions that took part in the move, each after a move without its group."""
+    adjusted: Rms
+    """Of the same, each after an adjustment without its group."""
+    noise_px: float
+    """The deviation of a coordinate of a keypoint, original pixels."""
+    deviation: float
+    """The deviation of a coordinate of a usual position, as the adjustment weighed it, metres."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ModelGeoreference:
     """How one model was moved."""
 
@@ -94,8 +112,10 @@ class ModelGeoreference:
     residual: Rms | None = None
     """Of the positions that took part."""
     held_out: Rms | None = None
-    """Of the same, each after a move without it."""
+    """Of the same, each after a move without it, or an adjustment without its group."""
     expected: Expected | None = None
+    inside: AdjustedPositions | None = None
+    """None: positions did not take part in an adjustment."""
 
     @property
     def outliers(self) -> list[str]:
@@ -133,10 +153,10 @@ def georeferenced(
 
     if len(given.names) < LEAST:
         return refused(f"the model has {len(given.names)} {what}; at least {LEAST} are needed")
-    if _on_line(anchors):
+    if on_line(anchors):
         return refused(f"the {what} lie on one line, so the turn about this line is not known")
     similarity, used = robust_similarity(anchors)
-    if not similarity.scale > 0 or _on_line(anchors.select(used)):
+    if not similarity.scale > 0 or on_line(anchors.select(used)):
         return refused(f"the {what} that agree with each other lie on one line or in one place")
     part = anchors.select(used)
     sigma = certainty(part, similarity)
@@ -152,8 +172,8 @@ def georeferenced(
         AnchorRow(
             name=name,
             used=bool(used[k]),
-            residual=_vector(residuals[k]),
-            held_out=None if held_out is None else _vector(held_out[k]),
+            residual=vector(residuals[k]),
+            held_out=None if held_out is None else vector(held_out[k]),
             deviation=given.deviation[k],
             errors_px=given.errors_px[k],
         )
@@ -163,19 +183,25 @@ def georeferenced(
         similarity=AppliedSimilarity(
             scale=similarity.scale,
             rotation=(
-                _vector(similarity.rotation[0]),
-                _vector(similarity.rotation[1]),
-                _vector(similarity.rotation[2]),
+                vector(similarity.rotation[0]),
+                vector(similarity.rotation[1]),
+                vector(similarity.rotation[2]),
             ),
-            translation=_vector(similarity.translation),
+            translation=vector(similarity.translation),
         ),
         anchors=rows,
         unused=given.unused,
-        residual=_rms(residuals[used]),
-        held_out=None if held_out is None else _rms(held_out[used]),
-        expected=Expected(shift=_vector(sigma.shift), turn_deg=sigma.turn_deg, scale=sigma.scale),
+        residual=rms_of(residuals[used]),
+        held_out=None if held_out is None else rms_of(held_out[used]),
+        expected=expected_of(part, similarity),
     )
     return found, similarity
+
+
+def expected_of(anchors: Anchors, similarity: Similarity = SAME) -> Expected:
+    """How certain the place of a model is that was moved onto anchors, or adjusted with them."""
+    sigma = certainty(anchors, similarity)
+    return Expected(shift=vector(sigma.shift), turn_deg=sigma.turn_deg, scale=sigma.scale)
 
 
 def contradicted(figures: ModelGeoreference, why: str) -> ModelGeoreference:
@@ -183,7 +209,7 @@ def contradicted(figures: ModelGeoreference, why: str) -> ModelGeoreference:
     return ModelGeoreference(similarity=None, why_not=why, contradicted=True, unused=figures.unused)
 
 
-def _on_line(anchors: Anchors) -> bool:
+def on_line(anchors: Anchors) -> bool:
     """Whether either side of the anchors lies on one line, or in one place."""
     for points in (anchors.source, anchors.target):
         spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
@@ -204,18 +230,19 @@ def _held_out(anchors: Anchors, used: np.ndarray, residuals: np.ndarray) -> np.n
         others = used.copy()
         others[k] = False
         part = anchors.select(others)
-        if _on_line(part):
+        if on_line(part):
             return None
         held_out[k] = anchors.select(np.asarray([k])).residuals(part.fit())[0]
     return held_out
 
 
-def _vector(values: np.ndarray) -> Vector:
+def vector(values: np.ndarray) -> Vector:
+    """Three numbers of an array."""
     x, y, z = (float(value) for value in values)
     return x, y, z
 
 
-def _rms(errors: np.ndarray) -> Rms:
+def rms_of(errors: np.ndarray) -> Rms:
     """The root mean squares of errors float64 (n, 3)."""
     east, north, up = (float(value) for value in (errors**2).mean(0))
     return Rms(
