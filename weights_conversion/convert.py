@@ -9,15 +9,15 @@ from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import sha256_of
 from jaxsfm.io.weight_files import FORMAT, is_converted, save_weights
-from weights_conversion.keras_files import Kernels, read_keras
-from weights_conversion.matlab_files import read_matlab
-from weights_conversion.source import (
+from jaxsfm.weights_conversion.keras_files import Kernels, read_keras
+from jaxsfm.weights_conversion.matlab_files import read_matlab
+from jaxsfm.weights_conversion.source import (
     Family,
     Source,
     canonical_layers,
     canonical_preprocessing,
 )
-from weights_conversion.torchvision import read_torchvision
+from jaxsfm.weights_conversion.torchvision import read_torchvision
 
 CONVERTER = 1
 """The version of the converter. It changes when a conversion gives other numbers than before."""

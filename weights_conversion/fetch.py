@@ -10,8 +10,8 @@ import platformdirs
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.download import download, progress_bar
-from weights_conversion.convert import read_source, write_converted
-from weights_conversion.source import Family
+from jaxsfm.weights_conversion.convert import read_source, write_converted
+from jaxsfm.weights_conversion.source import Family
 
 
 class PublicWeights(NamedTuple):

@@ -22,7 +22,8 @@ import numpy as np
 
 from jaxsfm.core.vgg import LAYERS, Preprocessing
 from jaxsfm.errors import UserError
-from weights_conversion.source import Convention, Source, check_layers
+from jaxsfm.io.extras import require
+from jaxsfm.weights_conversion.source import Convention, Source, check_layers
 
 Kernels = Literal["auto", "tensorflow", "theano"]
 
@@ -100,8 +101,10 @@ def read_keras(
       shapes: input and output channels of each layer.
 
     Raises:
-      UserError: the file is damaged or not a VGG-16, or nothing says whether kernels are turned.
+      UserError: the file is damaged or not a VGG-16, nothing says whether kernels are turned, or
+        h5py is not installed.
     """
+    require("hdf5", f"{path}: reading HDF5 files needs")  # here, as the child would say it worse
     found = _read_apart(path)
     arrays = _by_layer(found)
     first = arrays["conv1_1"][0]

@@ -18,8 +18,8 @@ import numpy as np
 from jaxsfm.core.vgg import LAYERS, Preprocessing
 from jaxsfm.errors import UserError
 from jaxsfm.io.weight_files import EXTRAS
-from weights_conversion.mat5 import Value, read_variables
-from weights_conversion.source import Convention, Source, check_layers
+from jaxsfm.weights_conversion.mat5 import Value, read_variables
+from jaxsfm.weights_conversion.source import Convention, Source, check_layers
 
 CONVENTION = Convention(layout="HWIO", bgr=False, convolution=False)
 VARIABLES = ["layers", "meta", "normalization", "net"]

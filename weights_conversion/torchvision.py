@@ -9,8 +9,8 @@ import safetensors
 from jaxsfm.core.vgg import BLOCKS, BLOCKS_19, LAYERS, Blocks, layers_of
 from jaxsfm.errors import UserError
 from jaxsfm.io.weights import TORCHVISION
-from weights_conversion.source import Convention, Source, check_layers
-from weights_conversion.torch_files import read_tensors
+from jaxsfm.weights_conversion.source import Convention, Source, check_layers
+from jaxsfm.weights_conversion.torch_files import read_tensors
 
 CONVENTION = Convention(layout="OIHW", bgr=False, convolution=False)
 

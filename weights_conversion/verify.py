@@ -19,7 +19,7 @@ from jaxsfm.core.blocks import Layer, convolve, pool
 from jaxsfm.core.vgg import preprocess
 from jaxsfm.errors import UserError
 from jaxsfm.io.weight_files import ConvertedWeights, read_converted, read_extras
-from weights_conversion.source import Source
+from jaxsfm.weights_conversion.source import Source
 
 LIMIT = 1e-5
 """The largest difference of a map that is accepted, relative to the map's largest value. Rounding

@@ -10,6 +10,7 @@ import tyro
 
 from jaxsfm.cli.arguments import unwrapped
 from jaxsfm.cli.bench_commands import bench, data
+from jaxsfm.cli.doctor_command import doctor
 from jaxsfm.cli.export_commands import export
 from jaxsfm.cli.model_commands import evaluate, extend, localize, merge, refine, report, view
 from jaxsfm.cli.network_commands import train, weights, with_action
@@ -42,6 +43,7 @@ COMMANDS = {
     "view": view,
     "export": export,
     "demo": demo,
+    "doctor": doctor,
     "weights": weights,
     "train": train,
     "data": data,

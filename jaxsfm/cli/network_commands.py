@@ -68,7 +68,7 @@ def convert(
         they are not. auto: the file says which.
     """
     check_writable(target, "TARGET", (".safetensors",))
-    from weights_conversion.convert import read_source, write_converted
+    from jaxsfm.weights_conversion.convert import read_source, write_converted
 
     found = read_source(source, family=family, kernels=kernels)
     write_converted(found, target)
@@ -101,8 +101,8 @@ def verify(
     """
     if not 40 <= size <= 2048:  # the shorter side is four fifths of it, and pool5 1/32 of that
         raise UserError(f"--size must lie in 40 .. 2048; got {size}")
-    from weights_conversion.convert import read_source
-    from weights_conversion.verify import agrees, compare, table_lines
+    from jaxsfm.weights_conversion.convert import read_source
+    from jaxsfm.weights_conversion.verify import agrees, compare, table_lines
 
     found = read_source(source, family=family, kernels=kernels)
     rows = compare(found, target, size=(size * 4 // 5, size))
@@ -119,7 +119,7 @@ def fetch(name: Positional[str] = "list", *, out: Path | None = None) -> int:
         data folder.
     """
     check_writable(out, "--out", (".safetensors",))
-    from weights_conversion.fetch import fetch_weights, public_lines
+    from jaxsfm.weights_conversion.fetch import fetch_weights, public_lines
 
     if name == "list":
         print("\n".join(public_lines()))

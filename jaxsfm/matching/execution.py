@@ -23,7 +23,7 @@ from jaxsfm.core.sharded import device_mesh
 from jaxsfm.core.types import DenseFeatures
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
-from jaxsfm.io.features import total_memory
+from jaxsfm.io.libraries import total_memory
 from jaxsfm.options import ExecutionChoice
 
 HOST_SHARE, DEVICE_SHARE = 1 / 8, 1 / 2

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from jaxsfm.errors import UserError
+from jaxsfm.io.extras import extra
 from jaxsfm.io.libraries import usable_cores
 
 if TYPE_CHECKING:
@@ -27,10 +28,8 @@ def import_ray() -> "ModuleType":
     """Import Ray with `ENVIRONMENT`. Raises UserError if it is not installed."""
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    try:
+    with extra("ray", "--engine ray needs"):
         import ray
-    except ImportError as error:
-        raise UserError("--engine ray needs Ray: pip install 'jaxsfm[ray]'") from error
     return ray
 
 

@@ -3,7 +3,7 @@
 import contextlib
 import importlib.metadata
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -111,7 +111,9 @@ def describe_photos(
     )
 
 
-def partner_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
+def partner_pairs(
+    vectors: Mapping[str, np.ndarray], k: int, frame_of: Mapping[str, Hashable] | None = None
+) -> list[Pair]:
     """Pairs of each name with `k` partners, each pair once, in order of names.
 
     Partners are similar to it, and differ from each other (`jaxsfm.core.retrieval`). With fewer
@@ -119,6 +121,8 @@ def partner_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
 
     Args:
       vectors: global descriptors of unit length, float32 (c,).
+      frame_of: the frame of photos that rigs have taken. Photos of one frame are no partners: they
+        overlap and were taken from one place.
 
     Raises:
       ValueError: k is less than 1.
@@ -130,5 +134,9 @@ def partner_pairs(vectors: Mapping[str, np.ndarray], k: int) -> list[Pair]:
         return []
     table = jnp.asarray(np.stack([vectors[name] for name in names]))
     few = min(k, len(names) - 1)
-    rows = np.asarray(_partners(table, k=few, candidates=CANDIDATES * k))
-    return sorted({make_pair(names[i], names[j]) for i, row in enumerate(rows) for j in row})
+    frames = [(frame_of or {}).get(name, name) for name in names]
+    numbers = {frame: number for number, frame in enumerate(dict.fromkeys(frames))}
+    group = jnp.asarray([numbers[frame] for frame in frames], jnp.int32)
+    rows = np.asarray(_partners(table, k=few, candidates=CANDIDATES * k, group=group))
+    found = ((i, j) for i, row in enumerate(rows) for j in row if frames[i] != frames[j])
+    return sorted({make_pair(names[i], names[j]) for i, j in found})

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
 from jaxsfm.errors import UserError
+from jaxsfm.io.extras import extra
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.io.photos import Pixels
+from jaxsfm.report.plane_colours import COLOURS, MAX_LINES
 
-COLOURS = ("#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#42d4f4", "#f032e6", "#bfef45")
-MAX_LINES = 60
-"""The most lines of a plane. Every match has a dot."""
+with extra("plots", "a picture of matches or curves needs"):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
 
 
 def draw_matches(

@@ -153,7 +153,7 @@ def summary_lines(report: RunReport) -> list[str]:
         lines += refinement_lines(refinement)
     lines += georeference_lines(report.georeference)
     lines += verdict_lines(model_verdicts(report.checked))
-    if report.georeference and any(each.contradicted for each in report.georeference.models):
+    if contradicted_positions(report):
         lines.append(f"positions        {CONTRADICTED}")
     lines.append("seconds          " + ", ".join(f"{k} {v:.1f}" for k, v in report.seconds.items()))
     if pairs.overflowed:
@@ -172,6 +172,12 @@ def summary_lines(report: RunReport) -> list[str]:
     if report.evaluation_failed:
         lines.append(f"not evaluated    {report.evaluation_failed}")
     return lines
+
+
+def contradicted_positions(report: RunReport) -> bool:
+    """Whether the photos contradict the measured positions of a file."""
+    found = report.georeference
+    return found is not None and any(each.contradicted for each in found.models)
 
 
 CONTRADICTED = (
@@ -223,7 +229,16 @@ def _model_lines(found: Georeference, best: ModelGeoreference) -> list[str]:
         f"residuals: {_errors(best.residual)}",
     ]
     if best.held_out is not None:
-        lines.append(f"each left out    RMS: {_errors(best.held_out)}")
+        label = "fifth left out" if best.inside and best.inside.kept else "each left out"
+        lines.append(f"{label:<16} RMS: {_errors(best.held_out)}")
+    if (inside := best.inside) is not None:
+        before, after = (_errors(each) for each in (inside.moved_only, inside.adjusted))
+        lines.append(
+            "positions inside a last adjustment; a fifth left out in turn, RMS of the residuals: "
+            f"{after}; after the move alone: {before}"
+            + "; it was dropped, because these fit no better"
+            * (not inside.kept)
+        )
     if (sigma := best.expected) is not None:
         east, north, up = sigma.shift
         lines.append(

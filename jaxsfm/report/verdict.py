@@ -132,7 +132,10 @@ def _reasons(check: ModelCheck, places: Sequence[PoseAmbiguity]) -> list[Reason]
 
 
 def verdict_lines(verdicts: Sequence[ModelVerdict]) -> list[str]:
-    """The verdicts as lines of the summary; one line if all are green, none if there are none."""
+    """The verdicts as lines of the summary; one line if all are green, none if there are none.
+
+    What to do next is not among them: it ends the run's output (`jaxsfm.report.closing`).
+    """
     if verdicts and all(each.colour == "green" for each in verdicts):
         models = "the models" if len(verdicts) > 1 else "the model"
         return [f"verdict          green: no photo contradicts {models}"]
@@ -145,8 +148,6 @@ def _model_lines(verdict: ModelVerdict) -> list[str]:
         lines += [f"{label:<17}{each.text}" for each in findings[:MAX_FINDINGS]]
         if more := len(findings[MAX_FINDINGS:]):
             lines.append(f"{label:<17}{more} more {'is' if more == 1 else 'are'} in report.json")
-    if verdict.advice:
-        lines.append(f"what next        {verdict.advice}")
     return lines
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxsfm.errors import UserError
 from jaxsfm.io import interrupt
+from jaxsfm.io.extras import extra
 from jaxsfm.io.images import shown_name, working_size
 from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.scene import ShownCamera, shown_scene
@@ -150,10 +151,8 @@ def serve(run: FinishedRun, *, host: str, port: int) -> None:
     Raises:
       UserError: viser is not installed, the run has no model, or the address cannot be used.
     """
-    try:
+    with extra("view", "jaxsfm view needs"):
         import viser
-    except ImportError as error:
-        raise UserError("jaxsfm view needs viser: pip install 'jaxsfm[view]'") from error
     if run.model is None:
         raise UserError(f"{run.folder}: no model to show (sparse/0)")
     _check_address(host)

@@ -238,7 +238,7 @@ def _recorded_options(config: Config, options: RunOptions) -> dict[str, object]:
     recorded = dataclasses.asdict(config) | {"enlarge": float(config.enlarge)}
     plain = dataclasses.asdict(options) | {"config": recorded}
     del plain["progress"]
-    for name in ("reference", "masks"):  # to be found from any working directory
+    for name in ("reference", "masks", "rig"):  # to be found from any working directory
         path = getattr(options, name)
         plain[name] = path and path.absolute()
     needed = [field.name for field in dataclasses.fields(RecordedOptions)]

@@ -104,6 +104,8 @@ def _extend(
     if not images and not skipped:
         return None
     models = read_working_models(finished)
+    if any(each.model.rigs for each in models):
+        raise UserError(f"{run}: a model with rigs cannot be extended; run reconstruct again")
     _check_database(run / "database.db", models)
     names = sorted({view.name for model in models for view in model.views})
     files = _unchanged_photos(finished, usable, names) | images

@@ -189,7 +189,7 @@ def match_pairs(
         before = {p: r.counts for p in pairs if (r := store.load_matches(p)) is not None}
         missing = [pair for pair in pairs if pair not in before]
         if before and job.progress:  # a trial of a few pairs is no news
-            logger.info("%d of %d pairs have been matched before", len(before), len(pairs))
+            logger.info("%d of %d pairs are matched already", len(before), len(pairs))
         lost = job.extract_missing(images_of(missing, by_name))
         counts = {pair: before[pair] for pair in pairs_without(before, lost)}
     with timed(seconds, "matching"):

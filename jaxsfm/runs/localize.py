@@ -21,6 +21,7 @@ from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, inspect_image, orientations
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
+from jaxsfm.io.panoramas import is_panorama
 from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import Store
@@ -240,6 +241,11 @@ def open_queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str
     for path in dict.fromkeys(paths):
         try:
             image = inspect_image(path, name=str(path))
+            if is_panorama(image):
+                why = (
+                    "localize takes no 360-degree photos; give them to reconstruct with the others"
+                )
+                raise ImageError(f"{path}: {why}")
             usable[str(path)] = dataclasses.replace(image, name=f"photo {image.sha256}")
         except ImageError as error:
             unusable[str(path)] = str(error)

@@ -16,11 +16,13 @@ from jaxsfm.colmap.model_files import write_models
 from jaxsfm.config import Config
 from jaxsfm.io.images import ImageFile, orientations
 from jaxsfm.io.pairs import Pair
+from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import SavedMatches, digest
 from jaxsfm.io.work_folder import WorkFolder
 from jaxsfm.runs.job import MatchedPairs, timed
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.georeference.georeference import Georeference, MeasuredPositions, move_models
+from jaxsfm.sfm.georeference.inside import Settings
 from jaxsfm.sfm.mapped_stage import (
     ALTERNATIVE,
     DATABASE,
@@ -143,4 +145,8 @@ class RunStages:
         write_pose_priors(database, priors, geographic=geographic)
         if not made.models:
             return None
-        return move_models(made.models, measured, orientations(self.images))
+        settings = None
+        if self.options.positions_inside:
+            scale = Photos(self.images, self.config).median_scale()
+            settings = Settings(loss_px=scale, refine_intrinsics=self.options.refines)
+        return move_models(made.models, measured, orientations(self.images), settings)

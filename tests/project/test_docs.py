@@ -94,6 +94,20 @@ def test_the_command_line_reference_is_what_the_commands_print():
     assert page == reference.page(), "python -m jaxsfm.cli.reference docs/reference/cli.md"
 
 
+def test_the_reference_shows_an_option_again_only_where_it_differs():
+    shown: dict[str, str] = {}
+    first = "usage: a\n\n options\n -----\n  -h, --help  help\n  --seed INT  The seed. (default: 0)"
+    again = (
+        "usage: b\n\n options\n --\n  --seed INT\n    The seed. (default: 0)\n  --out PATH  Here."
+    )
+    other = "usage: c\n\n options\n --\n  --seed INT  The seed. (default: 1)"
+    assert "--seed INT  The seed. (default: 0)" in reference.without_repeats(first, "a", shown)
+    assert reference.without_repeats(again, "b", shown) == (
+        "usage: b\n\n options\n  --out PATH  Here.\n  --seed: as in jaxsfm a"
+    )
+    assert "(default: 1)" in reference.without_repeats(other, "c", shown)
+
+
 def test_the_architecture_names_the_packages_and_only_modules_that_exist():
     text = (ROOT / "docs/architecture.md").read_text()
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())

@@ -42,8 +42,8 @@ LONG = (
     "jaxsfm.matching.extraction.image_features",
     "jaxsfm.bench.datasets.fetch",
     "jaxsfm.report.viewer.serve",
-    "weights_conversion.convert.read_source",
-    "weights_conversion.fetch.fetch_weights",
+    "jaxsfm.weights_conversion.convert.read_source",
+    "jaxsfm.weights_conversion.fetch.fetch_weights",
     *(
         f"jaxsfm.bench.{name}.bench_{name}"
         for name in ("ledger", "strecha", "daynight", "ambiguous", "sequence", "wxbs")

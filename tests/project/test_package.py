@@ -1,10 +1,12 @@
 """What is released: wheel and sdist hold the package whole, and it works away from the sources."""
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -17,6 +19,34 @@ DATA = (
     "jaxsfm/relocalizer.safetensors",
     *(f"jaxsfm/report/page/page.{kind}" for kind in ("html", "css", "js")),
 )
+
+
+def test_every_package_is_named_for_the_build():
+    """The build takes the packages of a list; one that the list lacks would not be installed."""
+    named = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {path.parent.relative_to(ROOT) for path in (ROOT / "jaxsfm").rglob("__init__.py")}
+    there = {".".join(folder.parts) for folder in folders} | {"jaxsfm.weights_conversion"}
+    assert sorted(named) == sorted(there)
+
+
+def test_the_weights_conversion_of_a_checkout_is_the_one_that_is_installed():
+    from jaxsfm.weights_conversion import convert
+
+    assert Path(convert.__file__).resolve() == ROOT / "weights_conversion" / "convert.py"
+
+
+def test_every_action_of_the_workflows_is_pinned_by_a_commit():
+    """A tag can be moved to other code. The comment says which version the commit is."""
+    for path in (ROOT / ".github" / "workflows").glob("*.yml"):
+        used = re.findall(r"uses: *(.*)", path.read_text())
+        assert used and all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40} # v[\d.]+", each) for each in used)
+
+
+def test_the_citation_is_of_this_version_and_has_a_date():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {version}\n" in citation
+    assert re.search(r"\ndate-released: \d{4}-\d\d-\d\d\n", citation)
 
 
 def run(*command: object, cwd: Path, **environment: str) -> str:
@@ -51,11 +81,14 @@ def test_wheel_and_sdist_hold_all_modules_and_data(built):
     in_wheel = set(zipfile.ZipFile(wheel).namelist())
     with tarfile.open(sdist) as archive:
         in_sdist = {name.partition("/")[2] for name in archive.getnames()}
-    packages = (ROOT / "jaxsfm", ROOT / "weights_conversion")
-    sources = {str(path.relative_to(ROOT)) for each in packages for path in each.rglob("*.py")}
-    for names in (in_wheel, in_sdist):
-        assert sources | set(DATA) <= names
-    assert not [name for name in in_wheel if name.startswith(("tests", "benchmarks", "docs"))]
+    beside = {path.name for path in (ROOT / "weights_conversion").glob("*.py")}
+    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "jaxsfm").rglob("*.py")}
+    installed = sources | {f"jaxsfm/weights_conversion/{name}" for name in beside}
+    assert installed | set(DATA) <= in_wheel
+    assert sources | {f"weights_conversion/{name}" for name in beside} | set(DATA) <= in_sdist
+    top = {name.partition("/")[0] for name in in_wheel}
+    assert {name for name in top if not name.endswith(".dist-info")} == {"jaxsfm"}
+    assert not [name for name in in_wheel if re.search(r"(^|/)(tests|test_|conftest)", name)]
     assert wheel.stat().st_size < 1_000_000
 
 

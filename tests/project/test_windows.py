@@ -220,7 +220,7 @@ for package in posix_only.OURS:
 from jaxsfm.cli.main import main
 from jaxsfm.errors import UserError
 from jaxsfm.io.download import download
-from jaxsfm.io.features import total_memory
+from jaxsfm.io.libraries import total_memory
 from jaxsfm.io.libraries import usable_cores
 from jaxsfm.io.work_folder import lock_folder, open_folder
 

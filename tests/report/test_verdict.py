@@ -52,7 +52,8 @@ def test_green_is_one_line_for_any_number_of_models(report):
 
 
 def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(report):
-    head, place, advice = lines(report, "amber")
+    head, place = lines(report, "amber")
+    advice = model_verdict(check_of("amber")).advice
     assert head == (
         "verdict          amber: two models may explain these photos; 1 photo fits into the model "
         "in a second place"
@@ -62,7 +63,7 @@ def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(repor
         f"second place     {NAMES[0]}, turned by 90 degrees: the pairs with {others} put it there; "
         "seen from there, it agrees with 120 points of the model and contradicts 3"
     )
-    assert advice.startswith(f"what next        look whether {NAMES[0]} stands")
+    assert advice.startswith(f"look whether {NAMES[0]} stands")
     assert f"add photos taken on the way from {NAMES[0]} to {others}" in advice
     assert "overlap by more than half" in advice and "occurs only once" in advice
 
@@ -70,7 +71,8 @@ def test_amber_names_the_photo_the_pairs_the_figures_and_what_would_decide(repor
 def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move():
     verdict = model_verdict(dataclasses.replace(check_of("green"), alternative=OTHER))
     assert verdict.colour == "amber" and len(verdict.reasons) == 1
-    head, other, advice = verdict_lines([verdict])
+    head, other = verdict_lines([verdict])
+    advice = verdict.advice
     assert head == "verdict          amber: two models may explain these photos"
     assert other == (
         "other model      alternative/0 is another mapping, which follows the order of the photos' "
@@ -83,14 +85,16 @@ def test_another_model_is_amber_and_says_what_it_follows_and_which_photos_move()
 def test_another_model_without_a_photo_elsewhere_is_matched_too():
     other = dataclasses.replace(OTHER, elsewhere=[])
     verdict = model_verdict(dataclasses.replace(check_of("green"), alternative=other))
-    _, found, advice = verdict_lines([verdict])
+    _, found = verdict_lines([verdict])
+    advice = verdict.advice
     assert found.endswith("which follows the order of the photos' names")
-    assert advice.endswith("look at alternative/0, too, and use the model that is right")
+    assert advice == "look at alternative/0, too, and use the model that is right"
 
 
 def test_neighbours_that_disagree_are_amber_and_named():
     verdict = model_verdict(dataclasses.replace(check_of("green"), apart=[NAMES[3:5]]))
-    head, neighbours, advice = verdict_lines([verdict])
+    head, neighbours = verdict_lines([verdict])
+    advice = verdict.advice
     assert head == "verdict          amber: two models may explain these photos"
     assert neighbours == (
         f"neighbours       {NAMES[3]} and {NAMES[4]} follow each other, but their matches do not "
@@ -103,7 +107,8 @@ def test_neighbours_that_disagree_are_amber_and_named():
 def test_photos_that_were_split_off_are_amber_and_each_group_is_named():
     groups = [NAMES[:3], NAMES[3:5], *([name] for name in NAMES[5:])]
     verdict = model_verdict(dataclasses.replace(check_of("green"), split_groups=groups))
-    head, parts, advice = verdict_lines([verdict])
+    head, parts = verdict_lines([verdict])
+    advice = verdict.advice
     assert head == "verdict          amber: two models may explain these photos"
     assert parts == (
         "split            these photos were in one model, which something spoke against; each "
@@ -121,7 +126,8 @@ def test_photos_that_were_split_off_are_amber_and_each_group_is_named():
 
 def test_a_part_whose_scale_may_have_drifted_is_amber_and_its_photos_are_named():
     verdict = model_verdict(dataclasses.replace(check_of("green"), scale_drift=NAMES[:2]))
-    head, scale, advice = verdict_lines([verdict])
+    head, scale = verdict_lines([verdict])
+    advice = verdict.advice
     assert head == "verdict          amber: the scale of a part of the model may have drifted"
     assert scale == (
         f"scale            {NAMES[0]}, {NAMES[1]} see their points a hundred times nearer than "
@@ -136,7 +142,8 @@ def test_a_part_whose_scale_may_have_drifted_is_amber_and_its_photos_are_named()
 
 def test_a_model_of_which_the_photos_show_few_points_is_amber():
     verdict = model_verdict(dataclasses.replace(check_of("green"), unconfirmed=True), "sparse/2")
-    head, said, advice = verdict_lines([verdict])
+    head, said = verdict_lines([verdict])
+    advice = verdict.advice
     assert head == (
         "verdict          amber: the photos do not show most points of the model (sparse/2)"
     )
@@ -146,7 +153,8 @@ def test_a_model_of_which_the_photos_show_few_points_is_amber():
 
 def test_a_model_of_still_pixels_is_amber_and_its_mask_is_named():
     verdict = model_verdict(dataclasses.replace(check_of("green"), same_pixels=True))
-    head, said, advice = verdict_lines([verdict])
+    head, said = verdict_lines([verdict])
+    advice = verdict.advice
     assert head == (
         "verdict          amber: most of the model stays at the same pixels in all photos"
     )
@@ -158,13 +166,13 @@ def test_the_model_that_was_split_off_is_shown_as_one_way_to_join_the_groups():
     whole = Alternative(basis="order", images=8, elsewhere=NAMES[3:], contradicted=9, whole=True)
     groups = [NAMES[:3], NAMES[3:5]]
     check = dataclasses.replace(check_of("green"), split_groups=groups, alternative=whole)
-    lines = verdict_lines([model_verdict(check)])
-    assert lines[1] == (
+    verdict = model_verdict(check)
+    assert verdict_lines([verdict])[1] == (
         "other model      alternative/0 has 8 photos in one model, as it was before it was "
         "split; photos contradict each other at 9 of its points"
     )
-    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in lines[3]
-    assert "look at each model by itself" in lines[3] and "alternative/0" in lines[3]
+    assert f"on the way from {', '.join(NAMES[:3])} to {NAMES[3]}, {NAMES[4]}" in verdict.advice
+    assert "look at each model by itself" in verdict.advice and "alternative/0" in verdict.advice
 
 
 def test_a_photo_that_was_split_off_alone_leaves_the_others_green():
@@ -180,18 +188,19 @@ def test_a_red_model_points_to_the_other_one():
     verdict = model_verdict(dataclasses.replace(check_of("red"), alternative=other))
     lines = verdict_lines([verdict])
     assert "another mapping, which follows most of the pairs" in lines[2]
-    assert "look whether alternative/0 is the right one" in lines[-1]
+    assert "look whether alternative/0 is the right one" in verdict.advice
 
 
 def test_red_names_both_groups_and_how_many_points_are_missing(report):
-    head, groups, advice = lines(report, "red")
+    head, groups = lines(report, "red")
     assert head == "verdict          red: photos contradict each other"
     assert groups.startswith(
         f"contradiction    {NAMES[0]}, {NAMES[1]}, {NAMES[2]} and 1 more against {NAMES[4]}, "
         f"{NAMES[5]}, {NAMES[6]} and 2 more: 312 of 400 points that one group shows are missing in "
         "the other"
     )
-    assert advice.startswith("what next        do not use this model as it is: add photos")
+    advice = model_verdict(check_of("red")).advice
+    assert advice.startswith("do not use this model as it is: add photos")
 
 
 def test_words_on_several_models_say_which_one(report):
@@ -219,4 +228,4 @@ def test_a_red_model_tells_of_second_places_too():
     places = check_of("amber").pose_ambiguities
     check = dataclasses.replace(check_of("red"), pose_ambiguities=places)
     labels = [line[:17].strip() for line in verdict_lines([model_verdict(check)])]
-    assert labels == ["verdict", "contradiction", "second place", "what next"]
+    assert labels == ["verdict", "contradiction", "second place"]

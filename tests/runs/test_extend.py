@@ -142,7 +142,7 @@ def test_reconstruct_goes_on_from_what_extend_matched(extended, scene, tmp_path,
     run = Path(shutil.copytree(extended.run, tmp_path / "run"))
     args = ["--out", str(run), "--intrinsics", str(scene / "K.txt"), "--refine", "0"]
     assert main(["reconstruct", str(extended.photos), *args]) == 0
-    assert "10 of 10 pairs have been matched before" in capsys.readouterr().err
+    assert "10 of 10 pairs are matched already" in capsys.readouterr().err
 
 
 @pytest.fixture

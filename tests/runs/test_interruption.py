@@ -141,7 +141,7 @@ def test_ctrl_c_during_refinement_keeps_features_and_matches(scene, tmp_path, mo
 
     args = ["reconstruct", str(scene / "images"), "--threads", "1", "--out", str(tmp_path / "out")]
     with monkeypatch.context() as patch:
-        patch.setattr(jaxsfm.sfm.refine.one_pass, "bundle_adjust", interrupted)
+        patch.setattr(jaxsfm.sfm.refine.one_pass, "adjusted", interrupted)
         assert main(args) == 130
     assert len(list((tmp_path / "out" / "matches").glob("*/*.safetensors"))) == 3
     assert not (tmp_path / "out" / "sparse").exists()

@@ -26,4 +26,4 @@ def test_a_run_says_how_many_pairs_were_matched_before_and_a_trial_does_not(capl
     with caplog.at_level(logging.INFO, "jaxsfm"):
         found, lost = match_pairs(job, {}, PAIRS, {})
     assert found == dict.fromkeys(PAIRS, counts) and not lost
-    assert ("2 of 2 pairs have been matched before" in caplog.text) == progress
+    assert ("2 of 2 pairs are matched already" in caplog.text) == progress

@@ -64,7 +64,9 @@ def said_once(text: str) -> str:
     """The last line, after a check that no error was said in another way, or twice."""
     assert "Traceback" not in text and "stack trace" not in text, text
     lines = [
-        line for line in text.splitlines() if not re.search("continuing|before|compiles", line)
+        line
+        for line in text.splitlines()
+        if not re.search("continuing|before|compiles|already", line)
     ]
     assert len(lines) == 1 and lines[0].startswith("jaxsfm: "), text
     return lines[0]

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from imitations import SMALL, WRITERS, Layers, random_layers
 
-from weights_conversion.convert import read_source
-from weights_conversion.source import Source
+from jaxsfm.weights_conversion.convert import read_source
+from jaxsfm.weights_conversion.source import Source
 
 
 @pytest.fixture(scope="session")

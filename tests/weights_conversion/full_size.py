@@ -16,8 +16,8 @@ from imitations import WRITERS, Layers, netvlad, random_layers  # noqa: E402
 from jaxsfm.core.vgg import LAYERS  # noqa: E402
 from jaxsfm.io.weight_files import EXTRAS  # noqa: E402
 from jaxsfm.io.weights import load_weights  # noqa: E402
-from weights_conversion.convert import read_source, write_converted  # noqa: E402
-from weights_conversion.verify import SIZE, MapComparison, compare  # noqa: E402
+from jaxsfm.weights_conversion.convert import read_source, write_converted  # noqa: E402
+from jaxsfm.weights_conversion.verify import SIZE, MapComparison, compare  # noqa: E402
 
 
 def full_netvlad(path: Path, layers: Layers) -> Path:

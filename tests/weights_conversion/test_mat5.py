@@ -7,8 +7,8 @@ import pytest
 import scipy.io
 from imitations import SMALL, cell, matconvnet, random_layers
 
-from weights_conversion.convert import read_source
-from weights_conversion.mat5 import MAX_DEPTH, read_variables
+from jaxsfm.weights_conversion.convert import read_source
+from jaxsfm.weights_conversion.mat5 import MAX_DEPTH, read_variables
 
 TYPES = ["f4", "f8", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"]
 
@@ -83,7 +83,7 @@ def test_a_cell_of_more_elements_than_the_file_has_is_refused_at_once(tmp_path):
 
 
 def test_a_variable_that_unpacks_without_end_is_refused(tmp_path, monkeypatch):
-    from weights_conversion import mat5
+    from jaxsfm.weights_conversion import mat5
 
     monkeypatch.setattr(mat5, "MAX_VARIABLE", 1000)
     scipy.io.savemat(tmp_path / "a.mat", {"x": np.zeros(10_000)}, do_compression=True)

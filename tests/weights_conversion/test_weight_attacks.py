@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from imitations import SMALL, WRITERS, torchvision_names
 
 from jaxsfm.errors import UserError
-from weights_conversion.convert import LEGACY_TORCH, read_source
-from weights_conversion.torch_files import ADMITTED
+from jaxsfm.weights_conversion.convert import LEGACY_TORCH, read_source
+from jaxsfm.weights_conversion.torch_files import ADMITTED
 
 
 class _Call:
@@ -214,7 +214,7 @@ def test_a_mutated_file_is_converted_or_refused(files, tmp_path, name):
 def test_a_file_on_which_the_hdf5_library_loops_or_crashes_is_damaged(
     files, tmp_path, monkeypatch, script, words
 ):
-    from weights_conversion import keras_files
+    from jaxsfm.weights_conversion import keras_files
 
     child = tmp_path / "child.py"
     child.write_text(script)

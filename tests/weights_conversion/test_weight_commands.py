@@ -6,9 +6,9 @@ from shared import once
 
 from jaxsfm.cli.main import main
 from jaxsfm.core.vgg import LAYERS
-from weights_conversion.convert import read_source, write_converted
-from weights_conversion.source import Source
-from weights_conversion.torchvision import CONVENTION
+from jaxsfm.weights_conversion.convert import read_source, write_converted
+from jaxsfm.weights_conversion.source import Source
+from jaxsfm.weights_conversion.torchvision import CONVENTION
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,8 @@ from local_server import url
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.weight_files import read_converted
-from weights_conversion import fetch
-from weights_conversion.fetch import PUBLIC, PublicWeights, fetch_weights
+from jaxsfm.weights_conversion import fetch
+from jaxsfm.weights_conversion.fetch import PUBLIC, PublicWeights, fetch_weights
 
 
 def public(address: str, content: bytes, family="keras") -> PublicWeights:

@@ -24,9 +24,9 @@ from jaxsfm.core.vgg import BLOCKS_19, layers_of
 from jaxsfm.errors import UserError
 from jaxsfm.io.weight_files import read_converted, read_extras
 from jaxsfm.io.weights import TORCHVISION
-from weights_conversion.convert import read_source, write_converted
-from weights_conversion.torchvision import numbered
-from weights_conversion.verify import agrees, compare
+from jaxsfm.weights_conversion.convert import read_source, write_converted
+from jaxsfm.weights_conversion.torchvision import numbered
+from jaxsfm.weights_conversion.verify import agrees, compare
 
 DEEP = layers_of(BLOCKS_19)
 CAFFE = (1.0, (123.68, 116.779, 103.939), (1.0, 1.0, 1.0))

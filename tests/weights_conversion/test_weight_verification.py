@@ -12,10 +12,10 @@ from scipy.signal import convolve2d, correlate2d
 from jaxsfm.core.vgg import LAYERS, VGG16, preprocess
 from jaxsfm.io.weight_files import read_converted
 from jaxsfm.io.weights import TORCHVISION, load_weights
-from weights_conversion.convert import read_source, write_converted
-from weights_conversion.source import Convention, Source
-from weights_conversion.torchvision import CONVENTION
-from weights_conversion.verify import (
+from jaxsfm.weights_conversion.convert import read_source, write_converted
+from jaxsfm.weights_conversion.source import Convention, Source
+from jaxsfm.weights_conversion.torchvision import CONVENTION
+from jaxsfm.weights_conversion.verify import (
     LIMIT,
     agrees,
     compare,

@@ -13,6 +13,6 @@ def page_after_run(results: Path) -> None:
     try:
         from jaxsfm.report.page.write import write_page
 
-        logger.info("the report, for the browser: %s", write_page(results))
+        write_page(results)
     except Exception as error:
         logger.warning("%s was not written (%s)", results / PAGE, error)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxsfm.io.pairs import PairResult
 from jaxsfm.report.finished_run import FinishedRun
 from jaxsfm.report.page.photos import Embedded, embed
-from jaxsfm.report.plot import COLOURS, MAX_LINES
+from jaxsfm.report.plane_colours import COLOURS, MAX_LINES
 from jaxsfm.report.run_results import PairRow
 
 MAX_PAIRS = 15
