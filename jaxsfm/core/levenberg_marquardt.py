@@ -36,7 +36,7 @@ class Iteration(NamedTuple):
     steps: Int[Array, ""]
     """How many steps were tried. Each solves one system."""
     done: Bool[Array, ""]
-    """Whether the last step promised less than the tolerance."""
+    """Whether the last step promised less than the tolerance, and less damping would not help."""
 
 
 def minimise(
@@ -51,10 +51,14 @@ def minimise(
 
     Args:
       tolerance: the iteration ends if a step promises to lower the cost by less than this share, or
-        by less than the rounding of the cost or of keypoints of a thousand pixels.
+        by less than the rounding of the cost or of keypoints of a thousand pixels. A damped step
+        says nothing about moves that hardly change the cost, such as the bend of a long row. So
+        after one that promises so little the least damping is tried, unless steps with less damping
+        have just failed.
     """
     dtype, layout = scene.points.dtype, problem.layout
     eps = float(jnp.finfo(dtype).eps)
+    least = eps**0.75
     rounding = (1000 * eps) ** 2 * jnp.sum(problem.weight)
 
     def tried(state: Iteration) -> Iteration:
@@ -72,18 +76,21 @@ def minimise(
         better = first | (made.positive & (there.cost <= model.cost))
         gain = (model.cost - there.cost) / jnp.where(promised > 0, promised, 1.0)
         lowered = state.damping * jnp.clip(1 - (2 * gain - 1) ** 3, 1 / 3, 1)
-        lowered = jnp.where(first, state.damping, jnp.maximum(lowered, eps**0.75))
+        lowered = jnp.where(first, state.damping, jnp.maximum(lowered, least))
         scene, there = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (scene, there), (state.scene, model)
         )
         enough = jnp.maximum(jnp.maximum(tolerance, eps) * there.cost, rounding)
+        little = ~first & made.positive & (promised <= enough)
+        free = (state.damping <= least) | (state.raising > 2)
+        lowered = jnp.where(little, least, lowered)
         return Iteration(
             scene,
             there,
             jnp.where(better, lowered, state.damping * state.raising).astype(dtype),
             jnp.where(better, 2, 2 * state.raising).astype(dtype),
             state.steps + 1,
-            ~first & made.positive & (promised <= enough),
+            little & free,
         )
 
     # A model of zeros makes a step of zeros, so that the model at the start needs no program of its
