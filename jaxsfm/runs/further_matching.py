@@ -120,5 +120,9 @@ def closest_pairs(name: str, counts: Mapping[Pair, PairCounts]) -> list[Pair]:
     Args:
       counts: of pairs that were tried.
     """
-    own = [pair for pair in counts if name in pair]
-    return sorted(own, key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))
+    return strongest_first([pair for pair in counts if name in pair], counts)
+
+
+def strongest_first(pairs: Iterable[Pair], counts: Mapping[Pair, PairCounts]) -> list[Pair]:
+    """Pairs, those with most inliers first, then those with most tentative matches."""
+    return sorted(pairs, key=lambda p: (-counts[p].num_inliers, -counts[p].num_tentative, p))

@@ -8,7 +8,7 @@ tried: it is matched at a small size with a few photos of the largest group.
 
 import dataclasses
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 
 from tqdm import tqdm
 
@@ -18,7 +18,12 @@ from jaxsfm.io.pairs import Pair, PairCounts, PairResult, components, make_pair
 from jaxsfm.io.store import Store
 from jaxsfm.report.run_inputs import RunIdentity
 from jaxsfm.report.typed_json import to_json
-from jaxsfm.runs.further_matching import closest_pairs, match_further, pairs_to_rematch
+from jaxsfm.runs.further_matching import (
+    closest_pairs,
+    match_further,
+    pairs_to_rematch,
+    strongest_first,
+)
 from jaxsfm.runs.job import (
     Job,
     MatchedPairs,
@@ -106,17 +111,33 @@ class LostMatcher:
         further: bool,
     ) -> dict[Pair, PairResult]:
         """Matches of lost photos, original pixels (`jaxsfm.sfm.register.lost.MatchLost`)."""
+        counts = {pair: count for pair, count in self.counts.items() if pair not in false}
+        least = self.photos.job.config.min_inliers
+        pairs = pairs_to_rematch(lost, registered, counts, least=least)
+        pairs = [pair for pair in pairs if (pair, further) not in self.tried]
+        if not further:
+            return self._matched(pairs, lost, further=False)
+        for name in self._closest_first({*lost}, pairs):
+            if found := self._matched([p for p in pairs if name in p], [name], further=True):
+                return found
+        return {}
+
+    def _closest_first(self, lost: Set[str], pairs: Sequence[Pair]) -> list[str]:
+        """The lost photos of pairs, first the one whose best pair is the strongest."""
+        ordered = strongest_first(pairs, self.counts)
+        return list(dict.fromkeys(name for pair in ordered for name in pair if name in lost))
+
+    def _matched(
+        self, pairs: Sequence[Pair], lost: Collection[str], *, further: bool
+    ) -> dict[Pair, PairResult]:
         job, identity = self.photos.job, self.photos.identity
         config = job.config if further else dataclasses.replace(job.config, max_rectified_planes=0)
-        counts = {pair: count for pair, count in self.counts.items() if pair not in false}
-        pairs = pairs_to_rematch(lost, registered, counts, least=job.config.min_inliers)
-        pairs = [pair for pair in pairs if (pair, further) not in self.tried]
         if not pairs or (further and not config.max_rectified_planes):
             return {}
         self.tried.update((pair, further) for pair in pairs)
         settings = {**config.matching(), "max_rectified_planes": config.max_rectified_planes}
         store = Store(job.store.path, to_json(dataclasses.replace(identity, config=settings)))
-        sought = sorted({name for pair in pairs for name in pair} & set(lost))
+        sought = sorted({name for pair in pairs for name in pair} & {*lost})
         what = "further passes" if further else "full size"
         logger.info("no place yet, %s: %s", what, named(sought))
         bar = tqdm(pairs, desc=what, unit="pair", disable=not job.progress)

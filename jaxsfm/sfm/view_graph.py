@@ -9,8 +9,9 @@ are compared, the strongest first:
    mean). The edge weight is less if the weight is small compared with those of other images' best
    pairs: an image of which all pairs are false has a best pair, too.
 2. Pairs are joined strongest first, as in a maximum spanning tree. Where two groups of images meet,
-   the pairs between them vote, with their edge weights, on the rotation between the groups; the
-   largest group of agreeing votes decides.
+   the pairs between them vote, with the squares of their edge weights, on the rotation between the
+   groups; the largest group of agreeing votes decides. False pairs agree with each other where a
+   scene repeats itself, so many weak ones say little more than one.
 3. The rotations of all images are then averaged over the agreeing pairs (robustly), and a pair
    whose own rotation is further than `TRUST.rotation_deg` from them is dropped, unless it is
    strong: then its rotation may be poor (a plane, a guessed focal length), but its matches are
@@ -181,7 +182,7 @@ def _grow(
     joined = [(index[a], index[b]) for a, b in ranked]
     ends = np.asarray(joined).reshape(-1, 2)
     relative = np.asarray([_rotation(pair, geometries) for pair in ranked]).reshape(-1, 3, 3)
-    votes = np.asarray([edge_weight[pair] for pair in ranked])
+    votes = np.asarray([edge_weight[pair] for pair in ranked]) ** 2
     rotations = np.tile(np.eye(3), (len(names), 1, 1))
     group = list(range(len(names)))
     members = [[k] for k in group]

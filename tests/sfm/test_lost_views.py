@@ -211,22 +211,38 @@ class FakeGrow:
             [[], ["3.png"], [], []],
             ["full 3.png 4.png", "full 4.png", "further 4.png"],
         ),
+        # A photo that further passes have registered is a new partner for a match at full size.
         (
-            [[], [], ["3.png"], []],
-            ["full 3.png 4.png", "further 3.png 4.png", "further 4.png"],
+            [[], [], ["3.png"], ["4.png"]],
+            ["full 3.png 4.png", "further 3.png", "full 4.png"],
+        ),
+        # Further passes are made for all photos, one after the other.
+        (
+            [[], [], [], []],
+            ["full 3.png 4.png", "further 3.png", "further 4.png"],
         ),
     ],
 )
 def test_more_is_matched_only_while_photos_are_lost_and_a_new_one_was_registered(
     rendered, run, monkeypatch, plan, asked
 ):
-    told, grow = [], FakeGrow(rendered, *plan)
+    told, tried, grow = [], set(), FakeGrow(rendered, *plan)
+    every = all_matches(rendered)
 
     def match_lost(lost, registered, false, *, further) -> Mapping[Pair, PairResult]:
+        """As `LostMatcher`: no pair is matched twice alike, and one photo at a time further."""
         assert not {*lost} & {*registered} and {*lost} | {*registered} == {*NAMES}
         assert {*false} == {("0.png", "1.png")}
-        told.append(" ".join(["further" if further else "full", *sorted(lost)]))
-        return all_matches(rendered)
+        new = {pair for pair in every if len({*pair} & {*lost}) == 1} - {
+            pair for pair, before in tried if before == further
+        }
+        sought = sorted({name for pair in new for name in pair} & {*lost})
+        sought = sought[:1] if further else sought
+        new = {pair for pair in new if {*pair} & {*sought}}
+        tried.update((pair, further) for pair in new)
+        if new:
+            told.append(" ".join(["further" if further else "full", *sought]))
+        return {pair: every[pair] for pair in new}
 
     monkeypatch.setattr(module, "grow", grow)
     given = run(model_with(rendered, [0, 1, 2]), false=[("0.png", "1.png")])

@@ -115,6 +115,13 @@ def test_one_strong_pair_outweighs_several_weak_ones():
     assert two_groups({**false, ("a", "e"): 400}, false.keys()) == false.keys()
 
 
+def test_one_strong_pair_outweighs_many_that_are_half_as_strong():
+    """The two sides of a temple look alike: ten weak pairs agreed with each other."""
+    false = dict.fromkeys(itertools.product("abc", "def"), 330)
+    false.pop(("b", "e"))
+    assert two_groups({**false, ("b", "e"): 800}, false.keys()) == false.keys()
+
+
 @pytest.mark.parametrize(("inliers", "trusted"), [(20, False), (1500, True)])
 def test_a_pair_that_alone_joins_an_image_to_others_has_to_be_strong(inliers, trusted):
     """Any rotation agrees with its own one. A night photo may still be registered later."""
@@ -176,7 +183,7 @@ def test_pairs_for_which_something_else_speaks_are_joined_first():
     """A false pair of the ends of a row is the strongest. Joined first, it takes an end along."""
     names, turn = [*"abcdef"], Rotation.from_euler("y", 180, degrees=True).as_matrix()
     row, false = [*itertools.pairwise(names)], ("a", "f")
-    weaker = dict.fromkeys([("a", "b"), ("a", "c")], 500)
+    weaker = dict.fromkeys([("a", "b"), ("a", "c")], 600)
     inliers = {**dict.fromkeys([*row, ("d", "f")], 700), **weaker, false: 800}
     pairs = {
         pair: PairGeometry(num_inliers=count, rotation=turn if pair == false else np.eye(3))
@@ -205,7 +212,8 @@ def test_groups_that_pairs_join_are_those_of_a_search_through_all_pairs(seed):
         turn = Rotation.from_rotvec([0, 2, 0]) if rng.random() < 0.4 else Rotation.identity()
         noise = Rotation.from_rotvec(rng.normal(0, 0.02, 3))
         pairs[a, b] = (noise * rotations[b] * turn * rotations[a].inv(), float(rng.uniform(1, 2)))
-    expected = grown_rotations(pairs, 5, TRUST.rotation_deg)
+    votes = {pair: (rotation, weight**2) for pair, (rotation, weight) in pairs.items()}
+    expected = grown_rotations(votes, 5, TRUST.rotation_deg)
     with mock.patch.object(view_graph, "MAX_VOTES", 5):
         found = view_graph._grow(
             list(pairs),

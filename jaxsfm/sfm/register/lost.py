@@ -75,8 +75,9 @@ class MatchLost(Protocol):
         """The matches, original pixels. Pairs that were found to be false are left out.
 
         Args:
-          further: whether photos are also matched at other scales, turned, and as seen from one
-            place, which takes up to a minute for a pair. Otherwise they are matched as they are.
+          further: whether a photo is also matched at other scales, turned, and as seen from one
+            place, which takes up to a minute for a pair. Then the matches are those of one photo;
+            none are left if there are none. Otherwise all are matched as they are.
         """
         ...
 
@@ -106,13 +107,18 @@ def register_lost(
         found.adjust()
         if match_lost is not None:
             false = selected.figures.misleading()
-            for further in (False, True):
-                more = True
-                while more and (lost := found.lost()):
-                    # A photo that was registered may be the partner of another one.
-                    matches = match_lost(lost, found.registered(), false, further=further)
-                    more = found.register(matches)
-                found.adjust()
+            further = False
+            while lost := found.lost():
+                matches = match_lost(lost, found.registered(), false, further=further)
+                if found.register(matches):
+                    # It may be the partner of another one, for which a match as they are may do.
+                    further = False
+                elif not further:
+                    found.adjust()
+                    further = True
+                elif not matches:
+                    break
+            found.adjust()
         write_refined(folder, found.outcome())
 
     models = [fingerprint(model) for model in made.models]
