@@ -94,18 +94,33 @@ def test_the_command_line_reference_is_what_the_commands_print():
     assert page == reference.page(), "python -m jaxsfm.cli.reference docs/reference/cli.md"
 
 
-def test_the_reference_shows_an_option_again_only_where_it_differs():
-    shown: dict[str, str] = {}
-    first = "usage: a\n\n options\n -----\n  -h, --help  help\n  --seed INT  The seed. (default: 0)"
+def test_the_reference_describes_an_option_again_only_where_it_differs():
+    shown: dict[str, tuple[str, str]] = {}
+    first = (
+        "usage: a\n\nDo it.\n\n options\n -----\n  -h, --help  help\n"
+        "  --seed INT  The seed. (default: 0)\n  --out {None}|PATH\n    Here. (default: None)"
+    )
     again = (
-        "usage: b\n\n options\n --\n  --seed INT\n    The seed. (default: 0)\n  --out PATH  Here."
+        "usage: b\n\nAlso.\n\n options\n --\n  --seed INT\n    The\n    seed. (default: 1)\n"
+        "  --out {None}|PATH  Here. (default: None)\n  --new, --no-new  Here. (default: False)"
     )
-    other = "usage: c\n\n options\n --\n  --seed INT  The seed. (default: 1)"
-    assert "--seed INT  The seed. (default: 0)" in reference.without_repeats(first, "a", shown)
-    assert reference.without_repeats(again, "b", shown) == (
-        "usage: b\n\n options\n  --out PATH  Here.\n  --seed: as in jaxsfm a"
+    other = "usage: c\n\nNo.\n\n options\n --\n  --seed INT  Another seed. (default: 0)"
+    assert reference.section(first, "a", shown) == (
+        "Do it.\n\n* `--seed INT`: The seed. (default: 0)\n* `--out PATH`: Here."
     )
-    assert "(default: 1)" in reference.without_repeats(other, "c", shown)
+    assert reference.section(again, "b", shown) == (
+        "Also.\n\n* `--new`: Here.\n* `--seed` (default: 1), `--out`: as in [jaxsfm a](#jaxsfm-a)"
+    )
+    assert "* `--seed INT`: Another seed." in reference.section(other, "c", shown)
+
+
+def test_the_reference_has_every_option_of_every_command():
+    page = reference.page()
+    for heading, text in re.findall(r"^##+ jaxsfm ([^\n]*)\n(.*?)(?=^##|\Z)", page, re.M | re.S):
+        words = tuple(heading.split())
+        options = set(re.findall(r"^  (--[a-z][\w-]*)", reference.help_text(words), re.M))
+        missing = {option for option in options if not re.search(rf"`{option}[ `]", text)}
+        assert not missing, heading
 
 
 def test_the_architecture_names_the_packages_and_only_modules_that_exist():
