@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from jaxsfm.sfm.georeference.robust_similarity import LEAST
 logger = logging.getLogger("jaxsfm")
 
 
-def measured_positions(choice: str, images: list[ImageFile]) -> MeasuredPositions | None:
+def measured_positions(choice: str, images: Sequence[ImageFile]) -> MeasuredPositions | None:
     """What `--georeference` asks to move the models onto; None if they stay as they are.
 
     Args:

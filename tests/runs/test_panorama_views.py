@@ -14,19 +14,20 @@ from jaxsfm.io.images import ImageFile
 from jaxsfm.io.panoramas import render_views
 from jaxsfm.io.photo_folder import find_images, with_masks
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.runs import reconstruct
+from jaxsfm.options import WeightsChoice
+from jaxsfm.runs import reconstruct, run_inputs, view_folder
 from jaxsfm.runs.localize import open_queries
 from jaxsfm.runs.panoramas import (
     VIEW_SET,
-    ViewOptions,
+    PanoramaPlan,
     panorama_rig,
-    panorama_views,
     panoramas_among,
+    planned_panoramas,
     view_name,
 )
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.runs.view_folder import panorama_views
 
-PLAIN = ViewOptions(most_px=1600, nadir_deg=0.0)
 GPANO = b'<x xmlns:GPano="g" GPano:ProjectionType="equirectangular"/>'
 WIDTH = 512
 
@@ -48,10 +49,18 @@ def of(folder: Path, *names: str) -> list[ImageFile]:
     return [image for image in open_images(folder)[0] if image.name in names]
 
 
-def written(photos: Path, out: Path, options=PLAIN, images=None, names=("a.jpg", "sub/b.png")):
+def plan_of(photos: Path, images=None, names=("a.jpg", "sub/b.png"), nadir_deg=0.0):
     images = images or open_images(photos)[0]
-    chosen = [image for image in images if image.name in names]
-    return panorama_views(images, chosen, out, options)
+    return PanoramaPlan(
+        panoramas=[image for image in images if image.name in names],
+        others=[image for image in images if image.name not in names],
+        side=VIEW_SET.side(WIDTH, 1600),
+        nadir_deg=nadir_deg,
+    )
+
+
+def written(photos: Path, out: Path, **plan):
+    return panorama_views(plan_of(photos, **plan), out)
 
 
 def test_photos_that_say_so_are_panoramas(photos):
@@ -105,7 +114,7 @@ def test_views_are_written_once(photos, tmp_path):
     (tmp_path / "out").mkdir()
 
     def made(**options) -> int:
-        views = written(photos, tmp_path / "out", ViewOptions(**{**vars(PLAIN), **options}))
+        views = written(photos, tmp_path / "out", **options)
         return (views.folder / "pano_camera0" / "a.jpg").stat().st_mtime_ns
 
     first = made()
@@ -117,7 +126,7 @@ def test_views_are_written_once(photos, tmp_path):
 
 def test_the_nadir_is_masked(photos, tmp_path):
     (tmp_path / "out").mkdir()
-    found = written(photos, tmp_path / "out", ViewOptions(most_px=1600, nadir_deg=60.0))
+    found = written(photos, tmp_path / "out", nadir_deg=60.0)
     assert found.masks is not None
     masked, bare = with_masks(open_images(found.folder)[0], found.masks)
     assert bare == ["sub/c.jpg"]
@@ -163,13 +172,13 @@ def test_a_rig_without_the_first_view_has_another_reference():
 def test_a_photo_in_a_folder_of_the_views_is_refused(photos, tmp_path):
     (photos / "sub").rename(photos / "pano_camera2")
     with pytest.raises(UserError, match="pano_camera2/.*rename"):
-        written(photos, tmp_path / "out", names=("a.jpg",))
+        planned_panoramas(open_images(photos)[0], Config(), RunOptions())
 
 
 @pytest.mark.parametrize("nadir", [-1.0, 90.0, float("nan")])
 def test_the_nadir_is_less_than_half_of_the_sphere(nadir):
     with pytest.raises(UserError, match="--nadir must lie in 0 .. 90"):
-        ViewOptions(most_px=1600, nadir_deg=nadir)
+        planned_panoramas([], Config(), RunOptions(nadir=nadir))
 
 
 def test_the_first_view_has_the_axes_of_the_panorama():
@@ -188,7 +197,7 @@ def test_a_run_matches_the_views_but_not_those_of_one_panorama(photos, tmp_path,
         raise Stopped
 
     weights = SimpleNamespace(sha256="0", chosen_relocalizer=lambda config: None)
-    monkeypatch.setattr(reconstruct, "chosen_weights", lambda *_: weights)
+    monkeypatch.setattr(run_inputs, "chosen_weights", lambda *_: weights)
     monkeypatch.setattr(reconstruct, "RunPhotos", stop)
     Image.open(photos / "sub" / "b.png").save(photos / "b.jpg", xmp=GPANO)
     (photos / "sub" / "b.png").unlink()
@@ -208,3 +217,60 @@ def test_known_cameras_are_not_taken_beside_panoramas(photos, tmp_path):
     with pytest.raises(UserError, match=r"--intrinsics: .* panoramas \(a.jpg\)"):
         reconstruct.reconstruct_folder(photos, tmp_path / "out", config=Config(), options=options)
     assert not (tmp_path / "out").exists()
+
+
+RIG = '[{"cameras": [{"image_prefix": "%s", "ref_sensor": true}]}]'
+FILES = {
+    "pairs.txt": "pano_camera0/a.jpg nobody.jpg\n",
+    "table.csv": "image,x,y,z\nnobody.jpg,1,2,3\n",
+    "no.json": RIG % "left/",
+    "ours.json": RIG % "pano_camera1/",
+}
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"nadir": 120.0}, "--nadir must lie"),
+        ({"masks": Path("nowhere")}, "--masks .*nowhere: no such folder"),
+        ({"masks": Path("masks")}, "a.jpg.png: the mask has 8 x 8 pixels"),
+        ({"rig": Path("nowhere.json")}, "--rig .*nowhere.json"),
+        ({"rig": Path("no.json")}, "--rig: no photo has a name that begins with left/"),
+        ({"rig": Path("ours.json")}, "--rig.* pano_camera1/ is the prefix of two cameras"),
+        ({"pairs": "sequental:3"}, "--pairs sequental:3"),
+        ({"pairs": "pairs.txt"}, "--pairs .*pairs.txt line 1: no image named 'nobody.jpg'"),
+        ({"georeference": "nowhere.csv"}, "--georeference .*nowhere.csv: no such file"),
+        ({"georeference": "table.csv"}, "--georeference .*table.csv: 0 photos"),
+        ({"with_database": Path("nowhere.db")}, "--with-database .*nowhere.db"),
+        ({"cameras": "single"}, "--cameras single"),
+        ({"network": WeightsChoice(weights=Path("nowhere.npz"))}, "nowhere.npz"),
+    ],
+)
+def test_options_are_checked_before_a_view_is_rendered(photos, tmp_path, monkeypatch, given, words):
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (8, 8), 255).save(tmp_path / "masks" / "a.jpg.png")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(view_folder, "render_views", None)
+    with pytest.raises(UserError, match=words) as raised:
+        reconstruct.reconstruct_folder(
+            photos, tmp_path / "out", config=Config(), options=RunOptions(**given)
+        )
+    assert "\n" not in str(raised.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_panorama_whose_views_would_be_too_small_is_named(tmp_path):
+    for name in ("a.jpg", "b.jpg"):
+        Image.new("RGB", (128, 64)).save(tmp_path / name, xmp=GPANO)
+    with pytest.raises(UserError, match=r"a.jpg: .* 128 pixels width has views of 41 pixels"):
+        planned_panoramas(open_images(tmp_path)[0], Config(), RunOptions())
+
+
+def test_one_panorama_is_too_few_photos(tmp_path):
+    Image.new("RGB", (WIDTH, WIDTH // 2)).save(tmp_path / "a.jpg", xmp=GPANO)
+    with pytest.raises(UserError, match="1 usable images, at least 2 are needed"):
+        reconstruct.reconstruct_folder(
+            tmp_path, tmp_path / "out", config=Config(), options=RunOptions()
+        )
