@@ -1,5 +1,8 @@
 """Laws of the folder of views that a run makes of its panoramas."""
 
+import dataclasses
+import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,7 +14,7 @@ from PIL import Image
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
-from jaxsfm.io.panoramas import render_views
+from jaxsfm.io.panoramas import read_panorama, render_views
 from jaxsfm.io.photo_folder import find_images, with_masks
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import WeightsChoice
@@ -122,6 +125,87 @@ def test_views_are_written_once(photos, tmp_path):
     assert (second := made(nadir_deg=50.0)) > first
     (tmp_path / "out" / "views" / "pano_camera1" / "a.jpg").unlink()
     assert made(nadir_deg=50.0) > second
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for name in ("views", "view_masks")
+        for path in (folder / name).rglob("*")
+        if path.is_file()
+    }
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-9])
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("harm", [Path.unlink, cut, flip])
+@pytest.mark.parametrize(
+    ("name", "rendered"),
+    [
+        ("views/pano_camera3/a.jpg", ["a.jpg"]),
+        ("view_masks/pano_camera3/a.jpg.png", ["a.jpg"]),
+        ("view_masks/pano_camera0/sub/b.png.jpg.png", ["sub/b.png"]),
+        ("views/sub/c.jpg", []),
+        ("view_masks/sub/c.jpg.png", []),
+        ("views/views.json", ["a.jpg", "sub/b.png"]),
+    ],
+)
+def test_what_is_deleted_or_damaged_is_made_again(
+    photos, tmp_path, monkeypatch, name, rendered, harm
+):
+    """And the views of other panoramas are not rendered again."""
+    out, masks = tmp_path / "out", tmp_path / "masks"
+    (masks / "sub").mkdir(parents=True)
+    Image.new("L", (320, 240), 255).save(masks / "sub" / "c.jpg.png")
+    images = with_masks(open_images(photos)[0], masks)[0]
+    first = written(photos, out, images=images, nadir_deg=60.0)
+    (out / "run.json").write_text(json.dumps({"images": {min(first.view_of): "0"}}))
+    whole, seen = content(out), []
+    assert len(whole) == 2 * (12 + 1) + 1
+
+    def noted(image):
+        seen.append(image.name)
+        return read_panorama(image)
+
+    monkeypatch.setattr(view_folder, "read_panorama", noted)
+    harm(out / name)
+    again = written(photos, out, images=images, nadir_deg=60.0)
+    assert content(out) == whole and seen == rendered
+    assert dataclasses.replace(again, rig=first.rig) == first
+
+
+def test_deleted_views_are_made_again_for_the_run_that_had_them(photos, tmp_path):
+    out = tmp_path / "out"
+    found = written(photos, out)
+    whole = content(out)
+    for images, made_again in (({"other.jpg": "0"}, False), ({min(found.view_of): "0"}, True)):
+        shutil.rmtree(out / "views", ignore_errors=True)
+        (out / "run.json").write_text(json.dumps({"images": images}))
+        if made_again:
+            written(photos, out)
+            assert content(out) == whole
+        else:
+            with pytest.raises(UserError, match="run of other photos"):
+                written(photos, out)
+
+
+def test_only_views_of_a_new_panorama_are_rendered(photos, tmp_path, monkeypatch):
+    out, seen = tmp_path / "out", []
+    written(photos, out)
+    (photos / "b.jpg").write_bytes((photos / "a.jpg").read_bytes())
+    monkeypatch.setattr(
+        view_folder, "read_panorama", lambda image: seen.append(image.name) or read_panorama(image)
+    )
+    found = written(photos, out, names=("a.jpg", "b.jpg", "sub/b.png"))
+    assert seen == ["b.jpg"] and len(found.view_of) == 18
 
 
 def test_the_nadir_is_masked(photos, tmp_path):
