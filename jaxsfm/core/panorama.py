@@ -49,14 +49,17 @@ class ViewSet:
         """Of each view, the rotation from the panorama's frame into that of its camera."""
         return np.stack([_rotation(*np.radians(each)) for each in self.directions])
 
-    def rays(self, side: int, *, samples: int = 1) -> Float[np.ndarray, "rows columns 3"]:
+    def rays(
+        self, side: int, *, samples: int = 1, rows: slice = slice(None)
+    ) -> Float[np.ndarray, "rows columns 3"]:
         """The directions of the pixels of a view of side x side, in its camera's frame (z is 1).
 
         Args:
-          samples: of each pixel and axis; rows and columns are side * samples.
+          samples: of each pixel and axis; there are side * samples rows and columns.
+          rows: the rows of pixels that are wanted.
         """
         at = ((np.arange(side * samples) + 0.5) / samples - side / 2) / self.focal(side)
-        x, y = np.meshgrid(at, at)
+        x, y = np.meshgrid(at, at.reshape(side, samples)[rows].ravel())
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 

@@ -61,6 +61,11 @@ def test_pixels_of_views_look_where_a_tilted_and_turned_camera_looks():
             np.testing.assert_allclose(rays[y, x] @ rotation, wanted, atol=1e-12)
 
 
+def test_some_rows_of_a_view_are_a_part_of_it():
+    whole = AROUND.rays(8, samples=3)
+    np.testing.assert_array_equal(AROUND.rays(8, samples=3, rows=slice(2, 5)), whole[6:15])
+
+
 def test_the_outer_borders_of_a_view_are_its_field_of_view_apart():
     """The border lies half a pixel beyond the centre of the last one."""
     focal = AROUND.focal(100)
