@@ -62,6 +62,19 @@ class ViewSet:
         x, y = np.meshgrid(at, at.reshape(side, samples)[rows].ravel())
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
+    def seen_at(
+        self, direction: Float[np.ndarray, "3"], side: int
+    ) -> tuple[int, Float[np.ndarray, "2"]] | None:
+        """The view of side x side that looks closest to a direction in the panorama's frame, and
+        the pixel (x, y) at which it shows it; None if it does not."""
+        rays = self.rotations() @ direction
+        number = int(np.argmax(rays[:, 2]))
+        x, y, z = rays[number]
+        if z <= 0:
+            return None
+        at = self.focal(side) * np.asarray([x, y]) / z + side / 2 - 0.5
+        return (number, at) if (np.abs(at - (side - 1) / 2) <= side / 2).all() else None
+
 
 def _rotation(heading: float, pitch: float) -> Float[np.ndarray, "3 3"]:
     right = np.asarray([np.cos(heading), 0.0, -np.sin(heading)])

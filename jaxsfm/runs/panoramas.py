@@ -16,16 +16,19 @@ import numpy as np
 from jaxsfm.colmap.panorama_poses import panorama_poses, write_panorama_table
 from jaxsfm.colmap.poses import model_poses
 from jaxsfm.config import MIN_SIDE, Config
-from jaxsfm.core.panorama import Direction, ViewSet
+from jaxsfm.core.panorama import Direction, ViewSet, panorama_directions
 from jaxsfm.errors import UserError
 from jaxsfm.io.entries import PANORAMAS
-from jaxsfm.io.images import ImageFile, named, shown_name
+from jaxsfm.io.images import ImageError, ImageFile, named, shown_name
 from jaxsfm.io.orientation import UPRIGHT
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.io.panoramas import is_equirectangular_size, is_panorama
+from jaxsfm.io.position_tables import Measurement
 from jaxsfm.io.rig_config import Rig, RigCamera
 from jaxsfm.options import PanoramaChoice
+from jaxsfm.report.run_results import PlacedPanoramas
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.georeference.georeference import MeasuredPositions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -55,12 +58,16 @@ class PanoramaViews:
         """Their names."""
         return sorted({name for name, _ in self.view_of.values()})
 
-    def write_poses(self, folder: Path, models: Sequence["pycolmap.Reconstruction"]) -> None:
-        """Write the poses that the panoramas have in models into a table in a folder."""
+    def write_poses(
+        self, folder: Path, models: Sequence["pycolmap.Reconstruction"]
+    ) -> PlacedPanoramas:
+        """Write the poses that the panoramas have in models into a table in a folder, and say how
+        many have one in the first model."""
         found = [panorama_poses(model_poses(each), VIEW_SET, self.view_of) for each in models]
         write_panorama_table(folder / PANORAMAS, found)
         placed = len({name for poses in found for name in poses})
         logger.info("%d of %d panoramas have a pose (%s)", placed, len(self.panoramas), PANORAMAS)
+        return PlacedPanoramas(found=len(self.panoramas), registered=len(found[0]) if found else 0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,6 +104,41 @@ class PanoramaPlan:
     def rig(self) -> Rig:
         """That of all views."""
         return panorama_rig(self.side, range(len(VIEW_SET.directions)))
+
+    @property
+    def views(self) -> list[ImageFile]:
+        """Those of `images` that are views."""
+        return [image for image in self.images if image.name in self.panorama_of]
+
+    def measured(self, of_photos: MeasuredPositions) -> MeasuredPositions:
+        """What was measured of photos, as that of the photos of the run: the position of a panorama
+        is that of its views, and what it shows is measured in the view that looks there."""
+        names = {each.name for each in self.panoramas}
+        positions = {
+            own: at
+            for name, at in of_photos.positions.items()
+            for own in (views_of(name) if name in names else [name])
+        }
+        points = [
+            dataclasses.replace(
+                point, seen=[own for each in point.seen if (own := self._in_view(each))]
+            )
+            for point in of_photos.points
+        ]
+        return dataclasses.replace(of_photos, positions=positions, points=points)
+
+    def _in_view(self, measured: Measurement) -> Measurement | None:
+        """A measurement, if in a panorama, in its view; None if no view shows it."""
+        size = next((each.size for each in self.panoramas if each.name == measured.image), None)
+        if size is None:
+            return measured
+        xy = np.asarray([measured.x, measured.y])
+        found = VIEW_SET.seen_at(panorama_directions(xy, size), self.side)
+        if found is None:
+            return None
+        number, (x, y) = found
+        name = view_name(measured.image, number)
+        return measured._replace(image=name, x=float(x), y=float(y))
 
     def pairs(self, pairs: Iterable[Pair]) -> list[Pair]:
         """The pairs of views that pairs of photos mean. Views of one panorama are no pair."""
@@ -170,6 +212,15 @@ def panoramas_among(images: Iterable[ImageFile], choice: PanoramaChoice) -> list
                 f" has {image.size[0]} x {image.size[1]} pixels"
             )
     return found
+
+
+def refuse_panorama(image: ImageFile, command: str) -> None:
+    """Raise ImageError if a photo says that it is a panorama, for a command that takes none."""
+    if is_panorama(image):
+        raise ImageError(
+            f"{shown_name(image.name)}: {command} takes no 360-degree photos; give them to "
+            "reconstruct with the others"
+        )
 
 
 def panorama_rig(side: int, numbers: Iterable[int]) -> Rig:

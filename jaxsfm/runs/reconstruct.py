@@ -91,13 +91,13 @@ def reconstruct_folder(
         if bare:
             logger.warning("%s: no mask in %s, so all of it is used", named(bare), options.masks)
     plan = planned_panoramas(usable, config, options)
-    seen, mounted = (usable, rigs) if plan is None else (plan.images, (*rigs, plan.rig))
-    options = dataclasses.replace(options, pairs=chosen_pairs(options.pairs, len(seen)))
-    inputs = read_inputs(seen, skipped, mounted, config, options)
+    count = len(usable if plan is None else plan.images)
+    options = dataclasses.replace(options, pairs=chosen_pairs(options.pairs, count))
+    inputs = read_inputs(usable, plan, skipped, rigs, config, options)
     given, pairs, cameras, panoramas = images, inputs.pairs, inputs.cameras, None
     if plan is not None:
         panoramas = panorama_views(plan, out, progress=options.progress)
-        images, rigs, pairs = panoramas.folder, (*rigs, panoramas.rig), plan.pairs(pairs)
+        images, rigs = panoramas.folder, (*rigs, panoramas.rig)
         options = dataclasses.replace(options, masks=panoramas.masks)
         usable, lost = open_images(images, progress=options.progress)
         skipped |= lost | panoramas.lost
@@ -186,8 +186,7 @@ def reconstruct_folder(
                 models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
             made = models.made if still is None else with_still_models(models.made, still.still)
             moved = stages.write(made, target)
-            if panoramas is not None:
-                panoramas.write_poses(target, made.models)
+            placed = None if panoramas is None else panoramas.write_poses(target, made.models)
             report = run_report(
                 StageResults(
                     folder=images,
@@ -202,6 +201,7 @@ def reconstruct_folder(
                     weights=msgspec.convert(weights.described(config), UsedWeights),
                     low_resolution=low_resolution,
                     same_pixels=still and _in_report(still),
+                    panoramas=placed,
                     seconds=seconds,
                 ),
                 config=config,

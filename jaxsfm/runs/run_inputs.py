@@ -18,6 +18,7 @@ from jaxsfm.io.rig_config import Rig, check_prefixes
 from jaxsfm.io.weights import Weights, chosen_weights
 from jaxsfm.matching.retrieval import check_retrieval
 from jaxsfm.runs.georeferencing import measured_positions
+from jaxsfm.runs.panoramas import PanoramaPlan
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.sfm.georeference.georeference import MeasuredPositions
 
@@ -37,7 +38,8 @@ class RunInputs:
 
 
 def read_inputs(
-    images: Sequence[ImageFile],
+    photos: Sequence[ImageFile],
+    plan: PanoramaPlan | None,
     skipped: Collection[str],
     rigs: Sequence[Rig],
     config: Config,
@@ -46,17 +48,24 @@ def read_inputs(
     """Read and check what the options of a run name.
 
     Args:
-      images: the usable photos.
+      photos: the usable photos.
+      plan: of the panoramas among them. Files may name a panorama or its views.
       skipped: names of other photos, which files may name too.
 
     Raises:
       UserError: a file or an option cannot be used.
     """
+    images, views = photos, list[ImageFile]()
+    if plan is not None:
+        images, views, rigs = plan.images, plan.views, (*rigs, plan.rig)
     names = [image.name for image in images]
     selection = parse_pair_selection(options.pairs)
-    pairs = selected_pairs(selection, names, [*names, *skipped])
+    known = [*names, *(photo.name for photo in photos), *skipped]
+    pairs = selected_pairs(selection, names, known)
     cameras = cameras_of(images, rigs, options)
-    measured = measured_positions(options.georeference, images)
+    measured = measured_positions(options.georeference, photos, views)
+    if plan is not None:
+        pairs, measured = plan.pairs(pairs), measured and plan.measured(measured)
     external = read_external_matches(
         options.with_database, options.with_hloc, images, cameras.known, dense=options.with_dense
     )

@@ -5,12 +5,14 @@ import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
+from jaxsfm.colmap.poses import CameraPose
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageFile
@@ -18,7 +20,7 @@ from jaxsfm.io.panoramas import read_panorama, render_views
 from jaxsfm.io.photo_folder import find_images, with_masks
 from jaxsfm.matching.pipeline import open_images
 from jaxsfm.options import WeightsChoice
-from jaxsfm.runs import reconstruct, run_inputs, view_folder
+from jaxsfm.runs import extend, panoramas, reconstruct, run_inputs, view_folder
 from jaxsfm.runs.localize import open_queries
 from jaxsfm.runs.panoramas import (
     VIEW_SET,
@@ -27,8 +29,9 @@ from jaxsfm.runs.panoramas import (
     panoramas_among,
     planned_panoramas,
     view_name,
+    views_of,
 )
-from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.runs.run_options import LocalizeOptions, RunOptions
 from jaxsfm.runs.view_folder import panorama_views
 
 GPANO = b'<x xmlns:GPano="g" GPano:ProjectionType="equirectangular"/>'
@@ -84,6 +87,39 @@ def test_localize_says_that_it_takes_no_panoramas(photos):
     assert {Path(path).name for path in usable} == {"b.png", "c.jpg"}
     (why,) = unusable.values()
     assert "a.jpg: localize takes no 360-degree photos" in why
+
+
+@pytest.mark.parametrize(
+    ("choice", "skipped", "added", "told"),
+    [("auto", {}, False, True), ("auto", {"a.jpg": "why"}, False, False), ("no", {}, True, False)],
+)
+def test_extend_says_that_it_takes_no_panoramas(photos, choice, skipped, added, told):
+    run = Mock()
+    run.store.why_unusable.return_value = None
+    run.report.images.skipped, run.report.identity.images = skipped, {}
+    run.report.options = {"panorama": choice}
+    images, unusable = extend._added_photos(run, open_images(photos)[0], {})
+    assert images.keys() == {"sub/b.png", "sub/c.jpg"} | ({"a.jpg"} if added else set())
+    assert unusable.keys() == ({"a.jpg"} if told else set())
+    assert all("extend takes no 360-degree photos" in why for why in unusable.values())
+
+
+def test_a_run_of_panoramas_is_not_extended(photos, tmp_path, monkeypatch):
+    written(photos, out := tmp_path / "out")
+    (out / "run.json").write_text("{}")
+    monkeypatch.setattr(extend, "read_run", lambda *_, **__: Mock())
+    with pytest.raises(UserError, match="a run of 360-degree photos cannot be extended"):
+        extend.extend_run(out, options=LocalizeOptions())
+
+
+def test_placed_panoramas_are_counted(photos, tmp_path, monkeypatch):
+    views = written(photos, tmp_path / "out")
+    pose = CameraPose(np.eye(3), np.zeros(3))
+    poses = iter([dict.fromkeys(views_of("a.jpg")[:3], pose), {"pano_camera0/sub/b.png.jpg": pose}])
+    monkeypatch.setattr(panoramas, "model_poses", lambda _: next(poses))
+    placed = views.write_poses(tmp_path, [Mock(), Mock()])
+    assert (placed.found, placed.registered) == (2, 1)
+    assert views.write_poses(tmp_path, []).registered == 0
 
 
 def test_each_view_has_a_folder_and_shows_what_the_rig_says(photos, tmp_path):
@@ -303,9 +339,88 @@ def test_known_cameras_are_not_taken_beside_panoramas(photos, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_pairs_of_panoramas_are_pairs_of_their_views(photos):
+    plan = plan_of(photos)
+    found = plan.pairs([("a.jpg", "sub/b.png"), ("a.jpg", "sub/c.jpg"), ("a.jpg", "sub/b.png")])
+    views, others = views_of("a.jpg"), [*views_of("sub/b.png"), "sub/c.jpg"]
+    assert found == sorted((min(a, b), max(a, b)) for a in views for b in others)
+    assert plan.pairs([(views[0], "sub/c.jpg")]) == [(views[0], "sub/c.jpg")]
+    assert plan.pairs([("a.jpg", views[0]), (views[0], views[1])]) == []
+
+
+def inputs_of(photos, **options):
+    chosen = RunOptions(**{"pairs": "exhaustive", **options})
+    return run_inputs.read_inputs(open_images(photos)[0], plan_of(photos), [], (), Config(), chosen)
+
+
+@pytest.fixture
+def no_weights(monkeypatch):
+    weights = SimpleNamespace(sha256="0", chosen_relocalizer=lambda config: None)
+    monkeypatch.setattr(run_inputs, "chosen_weights", lambda *_: weights)
+
+
+def test_a_file_of_pairs_names_panoramas(photos, tmp_path, no_weights):
+    (tmp_path / "pairs.txt").write_text("a.jpg sub/b.png\npano_camera0/a.jpg sub/c.jpg\n")
+    assert len(inputs_of(photos, pairs=str(tmp_path / "pairs.txt")).pairs) == 36 + 1
+
+
+def test_the_position_of_a_panorama_is_that_of_its_views(photos, tmp_path, no_weights):
+    table = tmp_path / "table.csv"
+    table.write_text("image,x,y,z\nA.JPG,1,2,3\nsub/b.png,4,5,6\nsub/c.jpg,7,8,10\n")
+    measured = inputs_of(photos, georeference=str(table)).measured
+    assert measured is not None
+    wanted = dict.fromkeys(views_of("a.jpg"), (1, 2, 3)) | {"sub/c.jpg": (7, 8, 10)}
+    wanted |= dict.fromkeys(views_of("sub/b.png"), (4, 5, 6))
+    assert {name: at[:3] for name, at in measured.positions.items()} == wanted
+    table.write_text("image,x,y,z\na.jpg,1,2,3\nsub/c.jpg,7,8,10\n")
+    with pytest.raises(UserError, match="2 photos of the folder have a position"):
+        inputs_of(photos, georeference=str(table))  # six views are one position
+
+
+def test_gps_positions_count_once_for_each_panorama(photos, no_weights):
+    for name, north in (("a.jpg", 30.0), ("d.jpg", 31.0)):
+        exif = Image.Exif()
+        place = {1: "N", 2: (50.0, north, 0.0), 3: "E", 4: (4.0, 0.0, 0.0), 5: b"\0", 6: 120.0}
+        exif.get_ifd(0x8825).update(place)
+        Image.new("RGB", (WIDTH, WIDTH // 2)).save(photos / name, exif=exif, xmp=GPANO)
+    images = open_images(photos)[0]
+    plan = planned_panoramas(images, Config(), RunOptions())
+    options = RunOptions(pairs="exhaustive")
+    found = run_inputs.read_inputs(images, plan, [], (), Config(), options).measured
+    assert found is not None
+    assert found.positions.keys() == {*views_of("a.jpg"), *views_of("d.jpg")}
+    with pytest.raises(UserError, match="2 photos have a GPS position"):
+        options = dataclasses.replace(options, georeference="gps")
+        run_inputs.read_inputs(images, plan, [], (), Config(), options)
+
+
+def test_control_points_are_measured_in_panoramas_or_in_views(photos, tmp_path, no_weights):
+    (photos / "sub" / "d.jpg").write_bytes((photos / "sub" / "c.jpg").read_bytes())
+    ahead, zenith, side = (WIDTH / 2 - 0.5, WIDTH / 4 - 0.5), (10, 2), VIEW_SET.side(WIDTH, 1600)
+    rows = [
+        f"{k},{k},{k * k},{k**3},{name},{x},{y}"
+        for k in range(3)
+        for name, (x, y) in (
+            ("a.jpg", ahead),
+            ("a.jpg", ahead) if not k else ("sub/b.png", zenith),
+            ("pano_camera2/a.jpg", (7, 8)),
+            ("sub/d.jpg", (3, 4)),
+        )[k > 0 :]
+    ]
+    rows = list(dict.fromkeys(rows))
+    (tmp_path / "t.csv").write_text("\n".join(["point,x,y,z,image,px,py", *rows]))
+    measured = inputs_of(photos, georeference=str(tmp_path / "t.csv")).measured
+    assert measured is not None
+    middle = (side - 1) / 2
+    front = [(view_name("a.jpg", 0), pytest.approx(middle), pytest.approx(middle))]
+    others = [("pano_camera2/a.jpg", 7, 8), ("sub/d.jpg", 3, 4)]
+    seen = {point.name: [each[:3] for each in point.seen] for point in measured.points}
+    assert seen == {"0": front + others, "1": others, "2": others}
+
+
 RIG = '[{"cameras": [{"image_prefix": "%s", "ref_sensor": true}]}]'
 FILES = {
-    "pairs.txt": "pano_camera0/a.jpg nobody.jpg\n",
+    "pairs.txt": "a.jpg nobody.jpg\n",
     "table.csv": "image,x,y,z\nnobody.jpg,1,2,3\n",
     "no.json": RIG % "left/",
     "ours.json": RIG % "pano_camera1/",
