@@ -49,15 +49,31 @@ class ViewSet:
         """Of each view, the rotation from the panorama's frame into that of its camera."""
         return np.stack([_rotation(*np.radians(each)) for each in self.directions])
 
-    def rays(self, side: int, *, samples: int = 1) -> Float[np.ndarray, "rows columns 3"]:
+    def rays(
+        self, side: int, *, samples: int = 1, rows: slice = slice(None)
+    ) -> Float[np.ndarray, "rows columns 3"]:
         """The directions of the pixels of a view of side x side, in its camera's frame (z is 1).
 
         Args:
-          samples: of each pixel and axis; rows and columns are side * samples.
+          samples: of each pixel and axis; there are side * samples rows and columns.
+          rows: the rows of pixels that are wanted.
         """
         at = ((np.arange(side * samples) + 0.5) / samples - side / 2) / self.focal(side)
-        x, y = np.meshgrid(at, at)
+        x, y = np.meshgrid(at, at.reshape(side, samples)[rows].ravel())
         return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    def seen_at(
+        self, direction: Float[np.ndarray, "3"], side: int
+    ) -> tuple[int, Float[np.ndarray, "2"]] | None:
+        """The view of side x side that looks closest to a direction in the panorama's frame, and
+        the pixel (x, y) at which it shows it; None if it does not."""
+        rays = self.rotations() @ direction
+        number = int(np.argmax(rays[:, 2]))
+        x, y, z = rays[number]
+        if z <= 0:
+            return None
+        at = self.focal(side) * np.asarray([x, y]) / z + side / 2 - 0.5
+        return (number, at) if (np.abs(at - (side - 1) / 2) <= side / 2).all() else None
 
 
 def _rotation(heading: float, pitch: float) -> Float[np.ndarray, "3 3"]:

@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 
 MAX_DECODED_PIXELS = 250_000_000
 """Larger images (0.75 GB) are refused, or decoded at reduced size if their format allows it."""
+_ROWS = 256
+"""Rows of an image whose colours are reordered at once."""
 MOST_NAMED = 3
 """The number of photos that a message names of a list."""
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
@@ -208,22 +210,32 @@ def exif_data(image: ImageFile) -> ExifData:
     return found
 
 
+def reduction(image: ImageFile) -> int:
+    """By how much an image is reduced when it is decoded: 1, or 2, 4 or 8 if it is too large.
+
+    Raises:
+      ImageError: it is too large, and its format cannot be decoded at reduced size.
+    """
+    width, height = image.size
+    factors = [f for f in (1, *_REDUCED) if width * height <= MAX_DECODED_PIXELS * f * f]
+    is_jpeg = image.path.suffix.lower() in (".jpg", ".jpeg", ".jpe")
+    if not factors or (factors[0] > 1 and not is_jpeg):
+        raise ImageError(
+            f"{shown_name(image.name)}: {width} x {height} pixels is more than can be decoded "
+            f"({MAX_DECODED_PIXELS} pixels); reduce it first"
+        )
+    return factors[0]
+
+
 def _decode(image: ImageFile) -> np.ndarray:
     shown = shown_name(image.name)
-    width, height = image.size
     flags = _FLAGS
-    if width * height > MAX_DECODED_PIXELS:
-        is_jpeg = image.path.suffix.lower() in (".jpg", ".jpeg", ".jpe")
-        factors = [f for f in _REDUCED if width * height <= MAX_DECODED_PIXELS * f * f]
-        if not is_jpeg or not factors:
-            raise ImageError(
-                f"{shown}: {width} x {height} pixels is more than can be decoded "
-                f"({MAX_DECODED_PIXELS} pixels); reduce it first"
-            )
+    if (factor := reduction(image)) > 1:
+        width, height = image.size
         logger.warning(
-            "%s: has %d x %d pixels, so it is decoded at 1/%d", shown, width, height, factors[0]
+            "%s: has %d x %d pixels, so it is decoded at 1/%d", shown, width, height, factor
         )
-        flags = _REDUCED[factors[0]] | cv2.IMREAD_IGNORE_ORIENTATION
+        flags = _REDUCED[factor] | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         bgr = decoders.decoded(image_bytes(image), image.path.suffix, flags)
     except decoders.MissingReader as error:
@@ -232,7 +244,9 @@ def _decode(image: ImageFile) -> np.ndarray:
         raise DamagedImage(f"{shown}: cannot be decoded") from error
     if bgr is None:
         raise DamagedImage(f"{shown}: the file is damaged, or its format cannot be decoded")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    for top in range(0, len(bgr), _ROWS):  # in its place: a second array would be as large
+        bgr[top : top + _ROWS] = cv2.cvtColor(bgr[top : top + _ROWS], cv2.COLOR_BGR2RGB)
+    return bgr
 
 
 def working_size(size: tuple[int, int], max_size: int, enlarge: float = 1.0) -> tuple[int, int]:
@@ -315,6 +329,8 @@ def _used(rgb: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
     if mask is None:
         return inside
     height, width = rgb.shape[:2]
-    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    whole = share > 0.999
+    whole = mask
+    if mask.shape != (height, width):
+        share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        whole = share > 0.999
     return whole if inside is None else whole & inside

@@ -15,7 +15,7 @@ from PIL import Image
 
 from jaxsfm.core.panorama import ViewSet, panorama_pixels, rows_per_pixel
 from jaxsfm.io import decoders
-from jaxsfm.io.images import ImageFile, image_bytes, read_image
+from jaxsfm.io.images import ImageFile, image_bytes, read_image, reduction
 
 CAMERAS = re.compile(
     r"RICOH THETA|Insta360|GoPro MAX|GoPro, Max|Gear 360|SM-R210|SM-C200|KeyMission 360|LG-R105"
@@ -29,8 +29,8 @@ _FULL, _CROPPED = (
     re.compile(rb"GPano:%s\s*(?:=\s*[\"']|>)\s*(\d{1,9})" % name)
     for name in (b"FullPanoWidthPixels", b"CroppedAreaImageWidthPixels")
 )
-MARGIN = 2
-"""Pixels that are appended to each side of a panorama, so that interpolation needs no border."""
+BAND = 2**18
+"""Samples of a view that are interpolated at once; their directions take 20 MB."""
 
 
 def is_equirectangular_size(size: tuple[int, int]) -> bool:
@@ -68,33 +68,6 @@ def _xmp_of(image: ImageFile) -> bytes:
     return b""
 
 
-def without_poles_detail(rgb: np.ndarray) -> np.ndarray:
-    """A panorama uint8 (h, w, c) whose rows have no more detail than its equator.
-
-    A row near a pole has many pixels for the width of one at the equator. A view has one sample for
-    all of them, so it is given their mean.
-    """
-    smooth = rgb.copy()
-    height, width = rgb.shape[:2]
-    for row, pixels in enumerate(rows_per_pixel(height)):
-        odd = 2 * round((min(pixels, width) - 1) / 2) + 1
-        if odd > 1:
-            half = odd // 2
-            ring = np.pad(rgb[row : row + 1], ((0, 0), (half, half), (0, 0)), mode="wrap")
-            smooth[row] = cv2.blur(ring, (odd, 1))[0, half : half + width].reshape(
-                smooth[row].shape
-            )
-    return smooth
-
-
-def _with_margin(rgb: np.ndarray) -> np.ndarray:
-    """A panorama with `MARGIN` more pixels on each side: round the sphere, and over the poles."""
-    over = np.roll(rgb, rgb.shape[1] // 2, axis=1)
-    top, bottom = over[:MARGIN][::-1], over[-MARGIN:][::-1]
-    whole = np.concatenate([top, rgb, bottom])
-    return np.pad(whole, ((0, 0), (MARGIN, MARGIN), (0, 0)), mode="wrap")
-
-
 def render_views(rgb: np.ndarray, views: ViewSet, side: int) -> Iterator[np.ndarray]:
     """What the pinhole views of a panorama show, each uint8 (side, side, c), in their order.
 
@@ -111,14 +84,72 @@ def render_views(rgb: np.ndarray, views: ViewSet, side: int) -> Iterator[np.ndar
     if not is_equirectangular_size((width, height)):
         raise ValueError(f"rgb must be twice as wide as high; got {width} x {height} pixels")
     samples = max(1, int(np.ceil(width / (2 * np.pi) / views.focal(side))))
-    source = _with_margin(without_poles_detail(rgb))
-    rays = views.rays(side, samples=samples)
+    step = max(1, BAND // (side * samples**2))
     for rotation in views.rotations():
-        at = (panorama_pixels(rays @ rotation, (width, height)) + MARGIN).astype(np.float32)
-        view = cv2.remap(source, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        if samples > 1:
-            view = cv2.resize(view, (side, side), interpolation=cv2.INTER_AREA)
-        yield view.reshape(side, side, channels)
+        view = np.empty((side, side, channels), np.uint8)
+        for top in range(0, side, step):
+            band = view[top : top + step]
+            rays = views.rays(side, samples=samples, rows=slice(top, top + step))
+            shown = _interpolated(rgb, panorama_pixels(rays @ rotation, (width, height)))
+            if samples > 1:
+                shown = cv2.resize(shown, (side, len(band)), interpolation=cv2.INTER_AREA)
+            band[:] = shown.reshape(band.shape)
+        yield view
+
+
+def _interpolated(rgb: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """A panorama at pixels (h, w, 2): uint8 (h, w) or (h, w, c)."""
+    width, x, y = rgb.shape[1], at[..., 0], at[..., 1]
+    if np.ptp(x) > width / 2:  # they lie on both sides of the seam, or round a pole
+        x = np.where(x < width / 2, x + width, x)
+    left, top = int(np.floor(x.min())), int(np.floor(y.min()))
+    right, bottom = int(np.floor(x.max())) + 2, int(np.floor(y.max())) + 2
+    window = _window(rgb, slice(top, bottom), slice(left, right))
+    x, y = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    return cv2.remap(window, x, y, cv2.INTER_LINEAR)
+
+
+def _window(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
+    """A part of a panorama, which goes on round the sphere and, on its other side, over the poles.
+    Its rows have no more detail than the equator."""
+    height, width = rgb.shape[:2]
+    above, below = max(0, -rows.start), max(0, rows.stop - height)
+    opposite = slice(columns.start + width // 2, columns.stop + width // 2)
+    parts = [
+        _columns(_rows(rgb, slice(0, above))[::-1], opposite),
+        _columns(_rows(rgb, slice(max(rows.start, 0), rows.stop)), columns),
+        _columns(_rows(rgb, slice(height - below, height))[::-1], opposite),
+    ]
+    return np.concatenate(parts) if above or below else parts[1]
+
+
+def _columns(rows: np.ndarray, columns: slice) -> np.ndarray:
+    """Columns of rows that go round the sphere, and overlap by a few pixels at most."""
+    width, start = rows.shape[1], columns.start % rows.shape[1]
+    stop = start + columns.stop - columns.start
+    if stop <= width:
+        return rows[:, start:stop]
+    rest = [rows[:, : max(0, stop - turns * width)] for turns in (1, 2)]
+    return np.concatenate([rows[:, start:], *rest], axis=1)
+
+
+def _rows(rgb: np.ndarray, rows: slice) -> np.ndarray:
+    """Rows of a panorama uint8 (h, w, c), with no more detail than its equator has.
+
+    A row near a pole has many pixels for the width of one at the equator. A view has one sample for
+    all of them, so it is given their mean.
+    """
+    height, width = rgb.shape[:2]
+    halves = np.round((np.minimum(rows_per_pixel(height)[rows], width) - 1) / 2).astype(int)
+    if not halves.any():
+        return rgb[rows]
+    smooth = rgb[rows].copy()
+    for row, half in enumerate(halves):
+        if half:
+            ring = np.pad(smooth[row : row + 1], ((0, 0), (half, half), (0, 0)), mode="wrap")
+            means = cv2.blur(ring, (2 * int(half) + 1, 1))[0, half : half + width]
+            smooth[row] = means.reshape(smooth[row].shape)
+    return smooth
 
 
 def render_masks(used: np.ndarray, views: ViewSet, side: int) -> Iterator[np.ndarray]:
@@ -127,7 +158,7 @@ def render_masks(used: np.ndarray, views: ViewSet, side: int) -> Iterator[np.nda
     Args:
       used: bool (h, 2 h), the used pixels of the panorama.
     """
-    shown = render_views(255 * used.astype(np.uint8)[..., None], views, side)
+    shown = render_views(np.multiply(used, 255, dtype=np.uint8)[..., None], views, side)
     return (each[..., 0] == 255 for each in shown)
 
 
@@ -136,16 +167,18 @@ def without_nadir(size: tuple[int, int], degrees: float) -> np.ndarray:
     straight down, bool (h, w): below the camera stands its photographer."""
     width, height = size
     below = 180 * (np.arange(height) + 0.5) / height
-    return np.repeat((180 - below > degrees)[:, None], width, axis=1)
+    return np.broadcast_to((180 - below > degrees)[:, None], (height, width))
 
 
 def read_panorama(image: ImageFile) -> tuple[np.ndarray, np.ndarray | None]:
-    """The pixels of a panorama, uint8 (h, w, 3), and those that its mask allows, None if all.
+    """The pixels of a panorama, uint8 (h, 2 h, 3), and those that its mask allows, None if all.
+
+    They are fewer than the file has if it has more than can be decoded.
 
     Raises:
       ImageError: it cannot be decoded.
     """
-    found = read_image(image, max_size=max(image.size))
+    found = read_image(image, max_size=2 * (image.size[1] // reduction(image)))
     return found.rgb, None if image.mask is None else found.used
 
 

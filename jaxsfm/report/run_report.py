@@ -32,6 +32,7 @@ from jaxsfm.report.run_results import (
     EvaluationReport,
     LostPhoto,
     ModelRow,
+    PlacedPanoramas,
     TriedPairs,
     ViewGraph,
 )
@@ -102,6 +103,8 @@ class RunReport:
     models: list[ModelRow]
     """The one with most photos first, as the run made them; `jaxsfm extend` keeps this order. Empty
     if there is none."""
+    panoramas: PlacedPanoramas | None = field(default=None, metadata=OMITTED)
+    """None if no photo was one."""
     mapping: list[Attempt] = field(default_factory=list)
     """Every start of the mapper."""
     refinement: list[RefinementFigures | None] = field(default_factory=list)

@@ -128,6 +128,16 @@ class Component:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PlacedPanoramas:
+    """The panoramas of a run, whose views are among its photos."""
+
+    found: Count
+    """Those that could be used."""
+    registered: Count
+    """Those with a pose in the best model."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ViewGraph:
     """The groups of photos that trusted pairs join."""
 

@@ -132,6 +132,11 @@ def summary_lines(report: RunReport) -> list[str]:
         )
     if same := report.same_pixels:
         lines.append(f"same pixels      {same.in_words()}")
+    if placed := report.panoramas:
+        lines.append(
+            f"panoramas        {placed.registered} of {placed.found} have a place in the model; "
+            "their views are counted as images"
+        )
     if models:
         best, others = models[0], len(models) - 1
         smaller = f" (and {others} smaller model{'s' * (others > 1)})"

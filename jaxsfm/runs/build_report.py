@@ -30,7 +30,7 @@ from jaxsfm.report.run_inputs import (
     UsedWeights,
 )
 from jaxsfm.report.run_report import FORMAT, Extension, RunReport
-from jaxsfm.report.run_results import ModelRow, PairRow, PairStatus, TriedPairs
+from jaxsfm.report.run_results import ModelRow, PairRow, PairStatus, PlacedPanoramas, TriedPairs
 from jaxsfm.runs.run_options import RunOptions
 from jaxsfm.runs.working_model import CameraPrior
 from jaxsfm.sfm.evaluation import of_photos
@@ -65,6 +65,7 @@ class StageResults:
     weights: UsedWeights
     low_resolution: LowResolution | None
     same_pixels: SamePixels | None
+    panoramas: PlacedPanoramas | None
     seconds: dict[str, float]
     """Wall-clock time of each stage, seconds."""
 
@@ -112,6 +113,7 @@ def run_report(stages: StageResults, *, config: Config, options: RunOptions) -> 
         turned=_turned(stages.usable, stages.identity.orientations),
         same_pixels=stages.same_pixels,
         models=[_model_row(model) for model in made.models],
+        panoramas=stages.panoramas,
         mapping=made.mapping.attempts,
         refinement=made.refinement,
         checks=made.mapping.checks,

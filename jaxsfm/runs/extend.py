@@ -25,7 +25,7 @@ from jaxsfm.colmap.model_files import read_models, write_models
 from jaxsfm.colmap.reconstruction import colour_points
 from jaxsfm.colmap.two_views import VerificationOptions
 from jaxsfm.errors import UserError
-from jaxsfm.io.entries import RECORD
+from jaxsfm.io.entries import RECORD, VIEWS, VIEWS_RECORD
 from jaxsfm.io.images import ImageError, ImageFile, shown_name
 from jaxsfm.io.libraries import versions
 from jaxsfm.io.pairs import make_pair
@@ -41,6 +41,7 @@ from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import NewPhotos, extended_report
 from jaxsfm.runs.job import Job, images_of, pairs_without
+from jaxsfm.runs.panoramas import refuse_panorama
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.working_model import (
     Shortlist,
@@ -90,6 +91,11 @@ def _extend(
     finished = read_run(run, images=options.images, reference=options.reference)
     if finished.model is None:
         raise UserError(f"{run}: this run has no model to extend")
+    if (run / VIEWS / VIEWS_RECORD).exists():
+        raise UserError(
+            f"{run}: a run of 360-degree photos cannot be extended; run reconstruct again with all "
+            "photos, which keeps the views and matches that are there"
+        )
     if finished.photos.folder is None:
         raise UserError(f"{run}: where its photos lie is not known; say it with --images")
     weights, identity = weights_of_run(finished, options.network), finished.report.identity
@@ -164,7 +170,15 @@ def _added_photos(
         and not run.store.why_unusable(i)
     ]
     unusable = {n: why for n, why in broken.items() if n not in used and n not in skipped}
-    return {image.name: image for image in fresh}, unusable
+    added = {image.name: image for image in fresh}
+    if run.report.options.get("panorama") != "no":
+        for image in fresh:
+            try:
+                refuse_panorama(image, "extend")
+            except ImageError as error:
+                del added[image.name]
+                unusable |= {image.name: str(error)} if image.name not in skipped else {}
+    return added, unusable
 
 
 def _unchanged_photos(

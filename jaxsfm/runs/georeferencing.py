@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +24,15 @@ from jaxsfm.sfm.georeference.robust_similarity import LEAST
 logger = logging.getLogger("jaxsfm")
 
 
-def measured_positions(choice: str, images: list[ImageFile]) -> MeasuredPositions | None:
+def measured_positions(
+    choice: str, images: Sequence[ImageFile], views: Sequence[ImageFile] = ()
+) -> MeasuredPositions | None:
     """What `--georeference` asks to move the models onto; None if they stay as they are.
 
     Args:
       choice: auto, off, gps, or a file of positions.
       images: the usable photos.
+      views: those of panoramas among the photos, which a file may name too.
 
     Raises:
       UserError: the file cannot be used, or `gps` is asked for and too few photos have a position.
@@ -60,9 +63,9 @@ def measured_positions(choice: str, images: list[ImageFile]) -> MeasuredPosition
     if (meant := misnamed(given, system)) is not None:
         raise UserError(f"{OPTION} {path}: {meant}")
     system.check(given)
-    names = _MatchedNames(images)
+    names = _MatchedNames(images, views)
     if table.points:
-        points = _points_of(table, names, {image.name: image for image in images}, path)
+        points = _points_of(table, names, {image.name: image for image in (*images, *views)}, path)
         return MeasuredPositions(
             source="control points",
             file=str(path),
@@ -86,12 +89,14 @@ def measured_positions(choice: str, images: list[ImageFile]) -> MeasuredPosition
 
 
 class _MatchedNames:
-    """Photos by the names that files of positions use: with the folder or without it."""
+    """Photos by the names that files of positions use: with the folder or without it. Views of
+    panoramas have their folder, as without it they have the name of the panorama."""
 
-    def __init__(self, images: Iterable[ImageFile]) -> None:
-        self._names = {image.name for image in images}
+    def __init__(self, images: Iterable[ImageFile], views: Iterable[ImageFile]) -> None:
+        names = sorted({image.name for image in images})
+        self._names = {*names, *(view.name for view in views)}
         self._short: dict[str, list[str]] = {}
-        for name in sorted(self._names):
+        for name in names:
             self._short.setdefault(Path(name).name.lower(), []).append(name)
 
     def photo(self, name: str) -> str | None:

@@ -21,7 +21,6 @@ from jaxsfm.config import Refinement
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import ImageError, ImageFile, inspect_image, orientations
 from jaxsfm.io.pairs import Pair, PairResult, make_pair
-from jaxsfm.io.panoramas import is_panorama
 from jaxsfm.io.photo_folder import find_images
 from jaxsfm.io.photos import Photos
 from jaxsfm.io.store import Store
@@ -37,6 +36,7 @@ from jaxsfm.runs.localize_report import (
     UnusablePhoto,
     error_against,
 )
+from jaxsfm.runs.panoramas import refuse_panorama
 from jaxsfm.runs.run_options import LocalizeOptions
 from jaxsfm.runs.working_model import (
     CameraPrior,
@@ -241,11 +241,7 @@ def open_queries(photos: Sequence[Path]) -> tuple[dict[str, ImageFile], dict[str
     for path in dict.fromkeys(paths):
         try:
             image = inspect_image(path, name=str(path))
-            if is_panorama(image):
-                why = (
-                    "localize takes no 360-degree photos; give them to reconstruct with the others"
-                )
-                raise ImageError(f"{path}: {why}")
+            refuse_panorama(image, "localize")
             usable[str(path)] = dataclasses.replace(image, name=f"photo {image.sha256}")
         except ImageError as error:
             unusable[str(path)] = str(error)

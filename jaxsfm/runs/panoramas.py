@@ -1,44 +1,34 @@
-"""Panoramas in a run: before it, each is turned into pinhole views, which are a rig of one centre.
+"""Panoramas in a run: which photos are some, what views they will have, and their poses.
 
-The views lie in the work folder, `views/pano_camera0/NAME.jpg` and so on, beside the ordinary
-photos of a mixed folder. This is the run's folder of photos.
+Everything about them is planned and checked before any view is rendered, which
+`jaxsfm.runs.view_folder` does.
 """
 
 import dataclasses
-import json
+import functools
 import logging
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
-from tqdm import tqdm
 
 from jaxsfm.colmap.panorama_poses import panorama_poses, write_panorama_table
 from jaxsfm.colmap.poses import model_poses
-from jaxsfm.config import Config
-from jaxsfm.core.panorama import Direction, ViewSet
-from jaxsfm.errors import UserError, writing
-from jaxsfm.io.atomic import atomic_folder
-from jaxsfm.io.entries import PANORAMAS, RECORD, VIEW_MASKS, VIEWS, VIEWS_RECORD, entry
-from jaxsfm.io.images import ImageError, ImageFile, image_bytes, named, shown_name
-from jaxsfm.io.masks import mask_path
-from jaxsfm.io.panoramas import (
-    is_equirectangular_size,
-    is_panorama,
-    jpeg_with_gps,
-    read_panorama,
-    render_masks,
-    render_views,
-    without_nadir,
-)
-from jaxsfm.io.photo_folder import with_masks
+from jaxsfm.config import MIN_SIDE, Config
+from jaxsfm.core.panorama import Direction, ViewSet, panorama_directions
+from jaxsfm.errors import UserError
+from jaxsfm.io.entries import PANORAMAS
+from jaxsfm.io.images import ImageError, ImageFile, named, shown_name
+from jaxsfm.io.orientation import UPRIGHT
+from jaxsfm.io.pairs import Pair, make_pair
+from jaxsfm.io.panoramas import is_equirectangular_size, is_panorama
+from jaxsfm.io.position_tables import Measurement
 from jaxsfm.io.rig_config import Rig, RigCamera
-from jaxsfm.io.typed_files import read_json
-from jaxsfm.io.work_folder import lock_folder
 from jaxsfm.options import PanoramaChoice
+from jaxsfm.report.run_results import PlacedPanoramas
 from jaxsfm.runs.run_options import RunOptions
+from jaxsfm.sfm.georeference.georeference import MeasuredPositions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -48,9 +38,6 @@ logger = logging.getLogger("jaxsfm")
 VIEW_SET = ViewSet(tuple(Direction(60.0 * k, 0.0) for k in range(6)), 90.0)
 """Which views a panorama has (docs/decisions/panoramas.md). The first one looks to the middle of
 the panorama, so its axes are those of the panorama, and of the rig."""
-FORMAT = 1
-"""Of the views; another number where they are rendered differently."""
-JPEG_QUALITY = 95
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,70 +54,142 @@ class PanoramaViews:
     """The panoramas that cannot be read, and why."""
 
     @property
-    def panorama_of(self) -> dict[str, str]:
-        """The panorama of each view, by the view's name."""
-        return {view: name for view, (name, _) in self.view_of.items()}
-
-    @property
     def panoramas(self) -> list[str]:
         """Their names."""
         return sorted({name for name, _ in self.view_of.values()})
 
-    def write_poses(self, folder: Path, models: Sequence["pycolmap.Reconstruction"]) -> None:
-        """Write the poses that the panoramas have in models into a table in a folder."""
+    def write_poses(
+        self, folder: Path, models: Sequence["pycolmap.Reconstruction"]
+    ) -> PlacedPanoramas:
+        """Write the poses that the panoramas have in models into a table in a folder, and say how
+        many have one in the first model."""
         found = [panorama_poses(model_poses(each), VIEW_SET, self.view_of) for each in models]
         write_panorama_table(folder / PANORAMAS, found)
         placed = len({name for poses in found for name in poses})
         logger.info("%d of %d panoramas have a pose (%s)", placed, len(self.panoramas), PANORAMAS)
+        return PlacedPanoramas(found=len(self.panoramas), registered=len(found[0]) if found else 0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Record:
-    """What a folder of views was made from, and the views in it: the content of `views.json`."""
+class PanoramaPlan:
+    """The panoramas of a run, before any of their views is rendered."""
 
-    made_from: dict[str, object]
-    view_of: dict[str, tuple[str, int]]
-    lost: dict[str, str] = dataclasses.field(default_factory=dict)
-    """The panoramas that could not be read, and why. They are tried again."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ViewOptions:
-    """How panoramas are turned into views."""
-
-    most_px: int
-    """The largest side of a view, pixels."""
+    panoramas: list[ImageFile]
+    others: list[ImageFile]
+    """The other photos of the run."""
+    side: int
+    """Of the views, pixels. All have one size, that for the largest panorama: they are one rig."""
     nadir_deg: float
     """So many degrees around straight down are not used; 0: all is."""
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.nadir_deg < 90:
-            raise UserError(f"--nadir must lie in 0 .. 90 degrees; got {self.nadir_deg:g}")
+    @functools.cached_property
+    def images(self) -> list[ImageFile]:
+        """The photos as the run will see them. In the place of each view is its panorama's file."""
+        size = (self.side, self.side)
+        views = [
+            dataclasses.replace(
+                image, name=name, size=size, orientation=UPRIGHT, taken_with="", mask=None
+            )
+            for image in self.panoramas
+            for name in views_of(image.name)
+        ]
+        return sorted([*self.others, *views], key=lambda image: image.name)
+
+    @functools.cached_property
+    def panorama_of(self) -> dict[str, str]:
+        """The panorama of each view, by the view's name."""
+        return {view: each.name for each in self.panoramas for view in views_of(each.name)}
+
+    @property
+    def rig(self) -> Rig:
+        """That of all views."""
+        return panorama_rig(self.side, range(len(VIEW_SET.directions)))
+
+    @property
+    def views(self) -> list[ImageFile]:
+        """Those of `images` that are views."""
+        return [image for image in self.images if image.name in self.panorama_of]
+
+    def measured(self, of_photos: MeasuredPositions) -> MeasuredPositions:
+        """What was measured of photos, as that of the photos of the run: the position of a panorama
+        is that of its views, and what it shows is measured in the view that looks there."""
+        names = {each.name for each in self.panoramas}
+        positions = {
+            own: at
+            for name, at in of_photos.positions.items()
+            for own in (views_of(name) if name in names else [name])
+        }
+        points = [
+            dataclasses.replace(
+                point, seen=[own for each in point.seen if (own := self._in_view(each))]
+            )
+            for point in of_photos.points
+        ]
+        return dataclasses.replace(of_photos, positions=positions, points=points)
+
+    def _in_view(self, measured: Measurement) -> Measurement | None:
+        """A measurement, if in a panorama, in its view; None if no view shows it."""
+        size = next((each.size for each in self.panoramas if each.name == measured.image), None)
+        if size is None:
+            return measured
+        xy = np.asarray([measured.x, measured.y])
+        found = VIEW_SET.seen_at(panorama_directions(xy, size), self.side)
+        if found is None:
+            return None
+        number, (x, y) = found
+        name = view_name(measured.image, number)
+        return measured._replace(image=name, x=float(x), y=float(y))
+
+    def pairs(self, pairs: Iterable[Pair]) -> list[Pair]:
+        """The pairs of views that pairs of photos mean. Views of one panorama are no pair."""
+        views = {each.name: views_of(each.name) for each in self.panoramas}
+        every = {
+            make_pair(a, b)
+            for one, other in pairs
+            for a in views.get(one, [one])
+            for b in views.get(other, [other])
+        }
+        own = self.panorama_of
+        return sorted((a, b) for a, b in every if own.get(a, a) != own.get(b, b))
 
 
-def prepared_panoramas(
-    images: Sequence[ImageFile], out: Path, config: Config, options: RunOptions
-) -> PanoramaViews | None:
-    """The views of the panoramas among the photos of a run; None if there are no panoramas.
+def planned_panoramas(
+    images: Sequence[ImageFile], config: Config, options: RunOptions
+) -> PanoramaPlan | None:
+    """The plan for the panoramas among the photos of a run; None if there are no panoramas.
+
+    Args:
+      images: with their masks.
 
     Raises:
-      UserError: an option does not go with panoramas, or the views cannot be written (see
-        `panorama_views`).
+      UserError: an option does not go with panoramas, or the views would be too small.
     """
-    chosen = ViewOptions(most_px=config.max_size, nadir_deg=options.nadir)
-    names = [image.name for image in panoramas_among(images, options.panorama)]
-    if not names:
+    if not 0 <= options.nadir < 90:
+        raise UserError(f"--nadir must lie in 0 .. 90 degrees; got {options.nadir:g}")
+    panoramas = panoramas_among(images, options.panorama)
+    if not panoramas:
         return None
+    names = {image.name for image in panoramas}
     if options.intrinsics is not None:
         raise UserError(
-            f"--intrinsics: among the photos are panoramas ({named(names)}), whose views have a "
-            "known camera; cameras of other photos cannot be given beside them"
+            f"--intrinsics: among the photos are panoramas ({named(sorted(names))}), whose views "
+            "have a known camera; cameras of other photos cannot be given beside them"
         )
-    if options.masks is not None:
-        images = with_masks(images, options.masks)[0]
-    panoramas = [image for image in images if image.name in set(names)]
-    with lock_folder(out):
-        return panorama_views(images, panoramas, out, chosen, progress=options.progress)
+    widest = max(panoramas, key=lambda image: image.size[0])
+    side = VIEW_SET.side(widest.size[0], config.max_size)
+    if side < MIN_SIDE:
+        raise UserError(
+            f"{shown_name(widest.name)}: a panorama of {widest.size[0]} pixels width has views of "
+            f"{side} pixels, which is too small (at least {MIN_SIDE})"
+        )
+    others = [image for image in images if image.name not in names]
+    ours = tuple(views_of(""))
+    if clash := [image.name for image in others if image.name.startswith(ours)]:
+        raise UserError(
+            f"{shown_name(clash[0])}: the folder of this photo has the name of one for the views "
+            "of panoramas; rename it"
+        )
+    return PanoramaPlan(panoramas=panoramas, others=others, side=side, nadir_deg=options.nadir)
 
 
 def panoramas_among(images: Iterable[ImageFile], choice: PanoramaChoice) -> list[ImageFile]:
@@ -153,6 +212,15 @@ def panoramas_among(images: Iterable[ImageFile], choice: PanoramaChoice) -> list
                 f" has {image.size[0]} x {image.size[1]} pixels"
             )
     return found
+
+
+def refuse_panorama(image: ImageFile, command: str) -> None:
+    """Raise ImageError if a photo says that it is a panorama, for a command that takes none."""
+    if is_panorama(image):
+        raise ImageError(
+            f"{shown_name(image.name)}: {command} takes no 360-degree photos; give them to "
+            "reconstruct with the others"
+        )
 
 
 def panorama_rig(side: int, numbers: Iterable[int]) -> Rig:
@@ -178,135 +246,6 @@ def view_name(panorama: str, number: int) -> str:
     return f"pano_camera{number}/{panorama}{'' if jpeg else '.jpg'}"
 
 
-def panorama_views(
-    images: Sequence[ImageFile],
-    panoramas: Collection[ImageFile],
-    out: Path,
-    options: ViewOptions,
-    *,
-    progress: bool = False,
-) -> PanoramaViews:
-    """Write the views of panoramas and copies of the other photos into the work folder, or find
-    those that an earlier call has written of the same photos.
-
-    All views have one size, so that they are one rig: that for the largest panorama.
-
-    Args:
-      images: all photos of the run, with their masks.
-      panoramas: those of `images` that are panoramas.
-      out: the work folder.
-
-    Raises:
-      UserError: a photo cannot be read or a file cannot be written; or the folder holds a run of
-        other photos, or of these photos in another size.
-    """
-    side = VIEW_SET.side(max(image.size[0] for image in panoramas), options.most_px)
-    names = {image.name for image in panoramas}
-    others = [image for image in images if image.name not in names]
-    ours = tuple(view_name("", number) for number in range(len(VIEW_SET.directions)))
-    if clash := [image.name for image in others if image.name.startswith(ours)]:
-        raise UserError(
-            f"{shown_name(clash[0])}: the folder of this photo has the name of one for the views "
-            "of panoramas; rename it"
-        )
-    made_from = {
-        "format": FORMAT,
-        "views": dataclasses.asdict(VIEW_SET),
-        "side": side,
-        "nadir": options.nadir_deg,
-        "panoramas": {image.name: image.content for image in panoramas},
-        "photos": {image.name: image.content for image in others},
-    }
-    folder, masks = entry(out, VIEWS), entry(out, VIEW_MASKS)
-    view_of, lost = _written_before(folder, made_from), dict[str, str]()
-    if view_of is None:
-        _check_folder(out, made_from)
-        # The masks are in their place first: views without them would be taken for whole ones.
-        with writing(folder), atomic_folder(folder) as fresh, atomic_folder(masks) as fresh_masks:
-            view_of = {}
-            bar = tqdm(panoramas, desc="views", unit="panorama", disable=not progress)
-            for image in bar:
-                writer = _Writer(image, fresh, fresh_masks)
-                try:
-                    view_of |= writer.views(side, options.nadir_deg)
-                except ImageError as error:
-                    lost[image.name] = str(error)
-                    logger.warning("%s", error)
-            for image in others:
-                _put(fresh / image.name, image_bytes(image))
-                if image.mask is not None:
-                    _put(mask_path(fresh_masks, image.name), image.mask.path.read_bytes())
-            record = {"made_from": made_from, "view_of": view_of, "lost": lost}
-            (fresh / VIEWS_RECORD).write_text(json.dumps(record, indent=1), encoding="utf-8")
-    logger.info(
-        "%d panoramas are %d views of %d x %d pixels, in %s",
-        len({name for name, _ in view_of.values()}),
-        len(view_of),
-        side,
-        side,
-        folder,
-    )
-    if not view_of:
-        raise UserError(f"{named(sorted(names))}: nothing of these panoramas can be used")
-    masked = masks if any(masks.rglob("*.png")) else None
-    rig = panorama_rig(side, {number for _, number in view_of.values()})
-    return PanoramaViews(folder=folder, masks=masked, view_of=view_of, rig=rig, lost=lost)
-
-
-def _check_folder(out: Path, made_from: dict[str, Any]) -> None:
-    """Raise UserError if views would take the place of those of another run: the run could not go
-    on with them, and what it has made would be of other photos."""
-    record = read_json(entry(out, VIEWS) / VIEWS_RECORD, _Record)
-    before: dict[str, Any] = record.made_from if record is not None else {}
-    shared = before.get("panoramas", {}).keys() & made_from["panoramas"].keys()
-    same = shared and before.get("side") == made_from["side"]
-    if not same and entry(out, RECORD).exists():
-        raise UserError(
-            f"--out {out}: the folder holds a run of other photos, or one that has other views of "
-            "these panoramas or none; choose another folder or delete this one"
-        )
-
-
-def _written_before(folder: Path, made_from: dict[str, Any]) -> dict[str, tuple[str, int]] | None:
-    """The views that are there; None if they were made from anything else, or one is gone."""
-    record = read_json(folder / VIEWS_RECORD, _Record)
-    made_from = json.loads(json.dumps(made_from))  # tuples are lists in JSON
-    if record is None or record.made_from != made_from or record.lost:
-        return None
-    photos = (*record.view_of, *made_from["photos"])
-    return record.view_of if all((folder / name).is_file() for name in photos) else None
-
-
-@dataclasses.dataclass(frozen=True)
-class _Writer:
-    """Writes the views of a panorama into new folders of photos and of masks."""
-
-    image: ImageFile
-    folder: Path
-    masks: Path
-
-    def views(self, side: int, nadir_deg: float) -> dict[str, tuple[str, int]]:
-        """The views that were written: those of which something may be used. ImageError if the
-        panorama cannot be read."""
-        rgb, used = read_panorama(self.image)
-        height, width = rgb.shape[:2]
-        if nadir_deg > 0:
-            upper = without_nadir((width, height), nadir_deg)
-            used = upper if used is None else used & upper
-        shown = None if used is None else [*render_masks(used, VIEW_SET, side)]
-        written = {}
-        for number, view in enumerate(render_views(rgb, VIEW_SET, side)):
-            name = view_name(self.image.name, number)
-            if shown is not None:
-                if not shown[number].any():
-                    continue
-                png = cv2.imencode(".png", 255 * shown[number].astype(np.uint8))[1]
-                _put(mask_path(self.masks, name), png.tobytes())
-            _put(self.folder / name, jpeg_with_gps(view, self.image, JPEG_QUALITY))
-            written[name] = (self.image.name, number)
-        return written
-
-
-def _put(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+def views_of(panorama: str) -> list[str]:
+    """The names of all views of a panorama (`view_name`), in the order of `VIEW_SET`."""
+    return [view_name(panorama, number) for number in range(len(VIEW_SET.directions))]

@@ -10,27 +10,22 @@ from typing import NamedTuple
 import msgspec
 from tqdm import tqdm
 
-from jaxsfm.colmap.cameras import Cameras, rig_intrinsics
-from jaxsfm.colmap.external_matches import read_external_matches
-from jaxsfm.colmap.given_cameras import parse_cameras
-from jaxsfm.colmap.intrinsics import used_cameras
 from jaxsfm.colmap.poses import model_poses, read_poses
 from jaxsfm.config import Config
 from jaxsfm.errors import UserError, remark
 from jaxsfm.io.atomic import Json, write_atomic
 from jaxsfm.io.entries import FAILED, FRAMES, STILL, entry
 from jaxsfm.io.images import ImageFile, named, orientations
-from jaxsfm.io.pair_selection import chosen_pairs, many_frames, parse_pair_selection, selected_pairs
+from jaxsfm.io.pair_selection import chosen_pairs, many_frames
 from jaxsfm.io.pairs import Pair
 from jaxsfm.io.photo_folder import find_videos, masks_of, too_few, with_masks
 from jaxsfm.io.rig_config import Rig, incomplete_frames, read_rigs
 from jaxsfm.io.still_pattern import StillPattern, find_still_pattern
 from jaxsfm.io.video import open_video
-from jaxsfm.io.weights import chosen_weights
 from jaxsfm.io.work_folder import lock_folder, open_folder
 from jaxsfm.matching.engines import chosen_engine
 from jaxsfm.matching.pipeline import open_images
-from jaxsfm.matching.retrieval import check_retrieval, describe_photos, partner_pairs
+from jaxsfm.matching.retrieval import describe_photos, partner_pairs
 from jaxsfm.options import Retrieval
 from jaxsfm.report.page import page_after_run
 from jaxsfm.report.run_inputs import LowResolution, RunIdentity, SamePixels, UsedWeights
@@ -38,14 +33,15 @@ from jaxsfm.report.run_report import RunReport, write_report
 from jaxsfm.report.typed_json import to_json
 from jaxsfm.runs.build_report import StageResults, evaluated, run_report
 from jaxsfm.runs.first_words import first_words
-from jaxsfm.runs.georeferencing import measured_positions
 from jaxsfm.runs.job import Job, pairs_without, timed
-from jaxsfm.runs.panoramas import prepared_panoramas
+from jaxsfm.runs.panoramas import planned_panoramas
+from jaxsfm.runs.run_inputs import cameras_of, read_inputs
 from jaxsfm.runs.run_options import RunOptions, check_options
 from jaxsfm.runs.run_photos import LostMatcher, RunPhotos
 from jaxsfm.runs.run_stages import RunStages
 from jaxsfm.runs.time_estimate import tell_time
 from jaxsfm.runs.video.frames import frames_folder
+from jaxsfm.runs.view_folder import panorama_views
 from jaxsfm.sfm.check.model_check import MIN_VIEWS
 from jaxsfm.sfm.check.still_model import with_still_models
 from jaxsfm.sfm.refined_stage import Reconstructed
@@ -87,47 +83,34 @@ def reconstruct_folder(
     """
     check_options(options)
     reference = read_poses(options.reference) if options.reference else None
-    intrinsics = parse_cameras(options.intrinsics) if options.intrinsics else None
     rigs = read_rigs(options.rig) if options.rig else rigs
     usable, skipped = open_images(images, progress=options.progress)
-    given, panoramas = images, prepared_panoramas(usable, out, config, options)
-    apart = dict[str, str]()
-    if panoramas is not None:
-        images, rigs, apart = panoramas.folder, (*rigs, panoramas.rig), panoramas.panorama_of
-        options = dataclasses.replace(options, masks=panoramas.masks)
-        usable, lost = open_images(images, progress=options.progress)
-        skipped |= lost | panoramas.lost
-    names = [*(image.name for image in usable), *skipped]
-    options = dataclasses.replace(options, pairs=chosen_pairs(options.pairs, len(usable)))
-    selection = parse_pair_selection(options.pairs)
-    pairs = selected_pairs(selection, (image.name for image in usable), names)
-    pairs = [(a, b) for a, b in pairs if apart.get(a, a) != apart.get(b, b)]
     _check_enough(images, usable, skipped)
     if options.masks is not None:
         usable, bare = with_masks(usable, options.masks)
         if bare:
             logger.warning("%s: no mask in %s, so all of it is used", named(bare), options.masks)
-    if intrinsics is not None:
-        intrinsics = used_cameras(intrinsics, usable)
-    mounted = rig_intrinsics(rigs, usable)
-    if intrinsics is None and len(mounted) == len(usable):
-        intrinsics = mounted
-        if options.refine_intrinsics == "auto":
-            options = dataclasses.replace(options, refine_intrinsics="no")
-    cameras = Cameras(
-        known=intrinsics, sharing=options.cameras, model=options.camera_model, rigs=rigs
-    )
-    cameras.check_fits(usable)
-    if lacking := incomplete_frames(rigs, (image.name for image in usable)):
+    plan = planned_panoramas(usable, config, options)
+    count = len(usable if plan is None else plan.images)
+    options = dataclasses.replace(options, pairs=chosen_pairs(options.pairs, count))
+    inputs = read_inputs(usable, plan, skipped, rigs, config, options)
+    given, pairs, cameras, panoramas = images, inputs.pairs, inputs.cameras, None
+    if plan is not None:
+        panoramas = panorama_views(plan, out, progress=options.progress)
+        images, rigs = panoramas.folder, (*rigs, panoramas.rig)
+        options = dataclasses.replace(options, masks=panoramas.masks)
+        usable, lost = open_images(images, progress=options.progress)
+        skipped |= lost | panoramas.lost
+        if panoramas.masks is not None:
+            usable, _ = with_masks(usable, panoramas.masks)
+        cameras = cameras_of(usable, rigs, options)
+    names = {image.name for image in usable}  # a view of which nothing is used is not there
+    pairs = [pair for pair in pairs if names.issuperset(pair)]
+    if options.intrinsics is None and cameras.known and options.refine_intrinsics == "auto":
+        options = dataclasses.replace(options, refine_intrinsics="no")
+    if lacking := incomplete_frames(rigs, names):
         logger.warning("%s: frames without a photo of each camera of their rig", named(lacking))
-    measured = measured_positions(options.georeference, usable)
-    external = read_external_matches(
-        options.with_database, options.with_hloc, usable, intrinsics, dense=options.with_dense
-    )
-    weights = chosen_weights(options.network, config.backbone)
-    if selection.retrieval:
-        check_retrieval(options.retrieval, weights)
-    relocalizer = weights.chosen_relocalizer(config)
+    selection, weights, relocalizer = inputs.selection, inputs.weights, inputs.relocalizer
     identity = RunIdentity(
         version=importlib.metadata.version("jaxsfm"),
         weights=weights.sha256,
@@ -163,6 +146,7 @@ def reconstruct_folder(
         if selection.retrieval:
             with timed(seconds, "retrieval"):
                 tried = [image for image in usable if image.name not in skipped]
+                apart = {} if plan is None else plan.panorama_of
                 wanted = _Partners(options.retrieval, selection.retrieval, apart)
                 found, lost = _retrieve(job, tried, wanted)
                 pairs, skipped = sorted({*pairs, *found}), skipped | lost
@@ -179,10 +163,10 @@ def reconstruct_folder(
             folder=folder,
             images=good,
             cameras=cameras,
-            external=external,
+            external=inputs.external,
             config=config,
             options=options,
-            measured=measured,
+            measured=inputs.measured,
             seconds=seconds,
         )
         photos = photos.without(lost)
@@ -202,8 +186,7 @@ def reconstruct_folder(
                 models = stages.walk(matched, target, LostMatcher(photos, matched.counts))
             made = models.made if still is None else with_still_models(models.made, still.still)
             moved = stages.write(made, target)
-            if panoramas is not None:
-                panoramas.write_poses(target, made.models)
+            placed = None if panoramas is None else panoramas.write_poses(target, made.models)
             report = run_report(
                 StageResults(
                     folder=images,
@@ -212,12 +195,13 @@ def reconstruct_folder(
                     skipped=skipped,
                     results=matched.counts,
                     handed_on=models.handed_on,
-                    external=external,
+                    external=inputs.external,
                     reconstructed=made,
                     georeference=moved,
                     weights=msgspec.convert(weights.described(config), UsedWeights),
                     low_resolution=low_resolution,
                     same_pixels=still and _in_report(still),
+                    panoramas=placed,
                     seconds=seconds,
                 ),
                 config=config,

@@ -61,6 +61,23 @@ def test_pixels_of_views_look_where_a_tilted_and_turned_camera_looks():
             np.testing.assert_allclose(rays[y, x] @ rotation, wanted, atol=1e-12)
 
 
+def test_a_direction_is_seen_where_the_ray_of_the_pixel_looks():
+    side, rotations = 8, AROUND.rotations()
+    for number, rotation in enumerate(rotations):
+        for x, y in ((0, 7), (3, 4)):
+            found = AROUND.seen_at(AROUND.rays(side)[y, x] @ rotation, side)
+            assert found is not None and found[0] == number
+            np.testing.assert_allclose(found[1], [x, y], atol=1e-9)
+    level = ViewSet((Direction(0, 0), Direction(180, 0)), 90.0)
+    assert level.seen_at(np.asarray([0.1, -2.0, 1.0]), side) is None
+    assert level.seen_at(np.asarray([0.0, -1.0, 0.0]), side) is None
+
+
+def test_some_rows_of_a_view_are_a_part_of_it():
+    whole = AROUND.rays(8, samples=3)
+    np.testing.assert_array_equal(AROUND.rays(8, samples=3, rows=slice(2, 5)), whole[6:15])
+
+
 def test_the_outer_borders_of_a_view_are_its_field_of_view_apart():
     """The border lies half a pixel beyond the centre of the last one."""
     focal = AROUND.focal(100)

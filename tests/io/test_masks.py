@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 from jaxsfm.errors import UserError
 from jaxsfm.io.images import (
@@ -191,3 +192,14 @@ def test_dark_pixels_that_touch_the_border_by_chance_are_used():
     rgb[:, ::4] = 0
     assert (rgb[0] == 0).all() and (rgb == 0).mean() > 0.4
     assert without_blank_border(rgb) is None
+
+
+def test_a_blank_border_is_all_blank_parts_that_touch_the_border():
+    for seed in range(20):
+        coarse = np.random.default_rng(seed).integers(0, 2, (9, 13), np.uint8)
+        blank = coarse.repeat(11, 0).repeat(11, 1) == 1
+        parts, _ = ndimage.label(blank)
+        edges = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+        outer = np.isin(parts, np.setdiff1d(edges, [0]))
+        used = without_blank_border(np.where(blank[..., None], 0, 90).astype(np.uint8).repeat(3, 2))
+        np.testing.assert_array_equal(True if used is None else used, ~outer)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,13 @@ import pytest
 from PIL import Image
 
 from jaxsfm.core.panorama import Direction, ViewSet, panorama_directions
+from jaxsfm.io import panoramas
 from jaxsfm.io.exif_gps import gps_of
-from jaxsfm.io.images import ImageFile, inspect_image
+from jaxsfm.io.images import ImageError, ImageFile, inspect_image
 from jaxsfm.io.panoramas import (
     is_panorama,
     jpeg_with_gps,
+    read_panorama,
     render_masks,
     render_views,
     without_nadir,
@@ -116,6 +119,39 @@ def test_a_view_as_fine_as_the_panorama_keeps_its_detail():
     side = VIEWS.side(512, most=10**6)
     front = next(render_views(fine, VIEWS, side)).astype(float)
     assert front[side // 2].std() > 80
+
+
+@pytest.mark.parametrize("band", [1, 1000])
+def test_views_do_not_depend_on_how_many_samples_are_interpolated_at_once(monkeypatch, band):
+    """At the seam and at the poles, whose bands go all around, too."""
+    rgb = np.random.default_rng(0).integers(0, 256, (128, 256, 3), np.uint8)
+    whole = [*render_views(rgb, VIEWS, 48)]
+    monkeypatch.setattr(panoramas, "BAND", band)
+    for view, again in zip(whole, render_views(rgb, VIEWS, 48), strict=True):
+        np.testing.assert_allclose(view.astype(int), again, atol=1)
+
+
+def test_rendering_a_large_panorama_needs_no_second_one():
+    rgb = np.zeros((4096, 8192, 3), np.uint8)
+    tracemalloc.start()
+    try:
+        next(render_views(rgb, VIEWS, 400))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < rgb.nbytes / 2
+
+
+@pytest.mark.parametrize("height", [256, 257])
+def test_a_panorama_that_is_too_large_is_decoded_smaller(tmp_path, monkeypatch, height):
+    Image.fromarray(panorama(2 * height)).save(tmp_path / "a.jpg", quality=95)
+    Image.fromarray(panorama(2 * height)).save(tmp_path / "a.png")
+    monkeypatch.setattr("jaxsfm.io.images.MAX_DECODED_PIXELS", 2 * height**2 - 1)
+    rgb, _ = read_panorama(inspect_image(tmp_path / "a.jpg"))
+    assert rgb.shape == (height // 2, 2 * (height // 2), 3)
+    np.testing.assert_allclose(rgb, panorama(2 * (height // 2)), atol=12)
+    with pytest.raises(ImageError, match="a.png: .* is more than can be decoded"):
+        read_panorama(inspect_image(tmp_path / "a.png"))
 
 
 def test_a_panorama_of_another_shape_is_an_error():

@@ -54,6 +54,13 @@ def test_a_summary_has_the_counts_of_every_stage():
     assert "none of 3 images" in "\n".join(summary_lines(report(models=[])))
 
 
+def test_panoramas_are_counted_beside_their_views():
+    lines = summary_lines(report(panoramas={"found": 4, "registered": 3}))
+    assert any(line.startswith("panoramas        3 of 4 have a place") for line in lines)
+    assert "panoramas" not in "\n".join(summary_lines(report()))
+    assert "panoramas" not in report().to_json()
+
+
 def test_second_tries_and_refinement_are_said():
     figures = {
         "accepted": True,
