@@ -34,7 +34,8 @@ from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import Json
 from jaxsfm.io.decoders import BRANDS_END, special_format
 from jaxsfm.io.exif_camera import ExifCamera, exif_camera, is_of_a_lens
-from jaxsfm.io.images import ImageFile, exif_data, named, shown_name
+from jaxsfm.io.exif_data import exif_data
+from jaxsfm.io.images import ImageFile, named, shown_name
 from jaxsfm.io.orientation import QUARTERS
 from jaxsfm.io.rig_config import Rig, check_rigs, rig_photos
 from jaxsfm.options import CameraSharing

@@ -12,7 +12,8 @@ from collections.abc import Iterable, Mapping
 from PIL import ExifTags
 
 from jaxsfm.io.exif_camera import number
-from jaxsfm.io.images import ImageError, ImageFile, exif_data, named
+from jaxsfm.io.exif_data import exif_data
+from jaxsfm.io.images import ImageError, ImageFile, named
 from jaxsfm.io.position_tables import Position
 
 METRES_PER_DOP = 5.0

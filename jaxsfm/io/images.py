@@ -5,7 +5,6 @@ that are written are those of the stored pixels. COLMAP 4.2 does the same (measu
 and intrinsics agree with COLMAP's own tools.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import logging
@@ -189,25 +188,6 @@ def image_bytes(image: ImageFile) -> bytes:
     if hashlib.sha256(data).hexdigest() != image.sha256:
         raise ImageError(f"{shown_name(image.name)}: the file has changed since it was first read")
     return data
-
-
-class ExifData(NamedTuple):
-    """The EXIF data of a photo; empty where there are none, or they are damaged."""
-
-    tags: dict[int, object]
-    """The main directory and the directory of the exposure, together."""
-    gps: dict[int, object]
-
-
-def exif_data(image: ImageFile) -> ExifData:
-    """Read the EXIF data of a photo. Raises ImageError if the file is gone or has changed."""
-    data, found = image_bytes(image), ExifData({}, {})
-    with warnings.catch_warnings(), contextlib.suppress(Exception):  # see `inspect_image`
-        warnings.simplefilter("ignore")
-        with decoders.any_size(), decoders.open_header(data, image.path.suffix) as header:
-            found.tags.update(decoders.exif_of(header))
-            found.gps.update(header.getexif().get_ifd(ExifTags.IFD.GPSInfo))
-    return found
 
 
 def reduction(image: ImageFile) -> int:

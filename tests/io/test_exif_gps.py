@@ -8,8 +8,9 @@ import pytest
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from jaxsfm.io import exif_gps
+from jaxsfm.io.exif_data import ExifData
 from jaxsfm.io.exif_gps import METRES_PER_DOP, gps_of, position_of, read_gps
-from jaxsfm.io.images import ExifData, ImageFile, inspect_image
+from jaxsfm.io.images import ImageFile, inspect_image
 
 G = ExifTags.GPS
 GOOD = {

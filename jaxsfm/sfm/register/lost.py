@@ -76,8 +76,8 @@ class MatchLost(Protocol):
 
         Args:
           further: whether a photo is also matched at other scales, turned, and as seen from one
-            place, which takes up to a minute for a pair. Then the matches are those of one photo;
-            none are left if there are none. Otherwise all are matched as they are.
+            place, which takes up to a minute for a pair. Then the matches are those of one photo,
+            or empty if none is left. Otherwise all photos are matched as they are.
         """
         ...
 
@@ -89,8 +89,7 @@ def register_lost(
     kept: StageCache,
     match_lost: MatchLost | None,
 ) -> Reconstructed:
-    """Register the photos that have no place in the refined models. Models without new photos stay
-    as they are.
+    """Register the photos that have no place in the refined models. Other models stay as they are.
 
     Args:
       made: the refined models.
@@ -111,13 +110,12 @@ def register_lost(
             while lost := found.lost():
                 matches = match_lost(lost, found.registered(), false, further=further)
                 if found.register(matches):
-                    # It may be the partner of another one, for which a match as they are may do.
-                    further = False
+                    further = False  # new partners; matches as they are may do now
+                elif further and not matches:
+                    break
                 elif not further:
                     found.adjust()
                     further = True
-                elif not matches:
-                    break
             found.adjust()
         write_refined(folder, found.outcome())
 
@@ -242,9 +240,10 @@ class _Registration:
 
     def _view_of(self, model: Model, image_id: int) -> View:
         """A photo without a pose, with its camera in a model."""
-        name = next(name for name, (number, _) in self._cameras.items() if number == image_id)
+        name, camera = next(
+            (n, c) for n, (number, c) in self._cameras.items() if number == image_id
+        )
         size, scale = self._photos.working_size(name)
-        camera = self._cameras[name][1]
         camera = model.cameras.get(camera.camera_id, camera)
         return View.without_pose(name, image_id, camera, size, Pixels(scale))
 
@@ -279,9 +278,7 @@ class _Registration:
             shared |= camera.camera_id in cameras
             refined = cameras.get(camera.camera_id, camera)
             views.append(View.without_pose(name, image_id, refined, size, Pixels(scale)))
-        ranked = sorted(
-            partners, key=lambda other: (other not in registered, -partners[other], other)
-        )
+        ranked = sorted(partners, key=lambda p: (p not in registered, -partners[p], p))
         own_camera = self._given.options.refine_intrinsics and not shared
         return UnregisteredView(views, own_camera, sorted(ranked[: REGISTER.shortlist]))
 
