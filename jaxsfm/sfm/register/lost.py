@@ -152,8 +152,7 @@ class _Registration:
             if all_rigs is not None:  # it has rigs and frames without a pose as well
                 own = model.rigs.rigs if model.rigs else {}
                 rigs = Rigs({**all_rigs.rigs, **own}, all_rigs.frames)
-                cameras = {camera.camera_id: camera for _, camera in self._cameras.values()}
-                cameras |= dict(model.cameras)
+                cameras = {c.camera_id: c for _, c in self._cameras.values()} | dict(model.cameras)
                 model = dataclasses.replace(model, rigs=rigs, cameras=cameras)
             self._models.append(model)
         self._images = DeviceImages(self._photos.gray)
@@ -173,11 +172,11 @@ class _Registration:
 
     def register(self, matches: Mapping[Pair, PairResult]) -> bool:
         """Register lost photos by these matches, original pixels; says whether any was."""
-        registered = self.registered()
+        placed = self.registered()
         wanted = {
             name: view
             for name in sorted(self.lost())
-            if (view := self._unregistered(name, registered, matches)) is not None
+            if (view := self._unregistered(name, placed, matches)) is not None
         }
         own = {name for each in wanted.values() for name in each.shortlist} | wanted.keys()
         pairs = [p for p in matches if wanted.keys() & set(p) and own >= set(p)]
@@ -196,10 +195,9 @@ class _Registration:
         ]
         self._outcomes |= grown.located
         self._grown |= {*grown.registered.values()}
-        before = self.registered()
         for k, model in zip(self._refined, self._models, strict=True):
             # A photo that is in a frame with one that was registered has a place, too.
-            self._registered |= {view.name: k for view in model.views if view.name not in before}
+            self._registered |= {view.name: k for view in model.views if view.name not in placed}
         return bool(grown.registered)
 
     def adjust(self) -> None:
