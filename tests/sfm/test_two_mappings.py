@@ -195,7 +195,7 @@ def contested(names: list[str], false: Pair) -> dict[Pair, TwoView]:
     If it is joined before them, it leads the first photo astray.
     """
     a, b, c, d, _, f = names
-    row = {**dict.fromkeys(chain(names), 700), (d, f): 700, (a, b): 500, (a, c): 500}
+    row = {**dict.fromkeys(chain(names), 700), (d, f): 700, (a, b): 600, (a, c): 600}
     return views({**row, false: 800}, turned=[false])
 
 
