@@ -12,7 +12,7 @@ from jaxsfm.colmap.database import camera_sensor
 from jaxsfm.colmap.given_model import has_rigs
 from jaxsfm.colmap.model import Model, stored_sizes
 from jaxsfm.colmap.native import native
-from jaxsfm.colmap.poses import CameraPose
+from jaxsfm.colmap.poses import CameraPose, nearest_rotation
 from jaxsfm.colmap.reconstruction import forget_behind, move_model
 from jaxsfm.colmap.rigs import gives_scale
 from jaxsfm.colmap.view import View
@@ -29,6 +29,9 @@ FARTHEST_CENTRE = 0.1
 """A principal point that moves farther than this from the centre of the photo, in units of the
 longer side, is not believed."""
 CENTRE = frozenset({"cx", "cy"})
+UNREFINED_LOSS_PX = 2.0
+"""Scale of the loss where keypoints are not refined, working pixels. They are one or two pixels
+off, and false matches of a former model much further."""
 POSSIBLE = (0.1, 10.0, 1.0)
 """What COLMAP's mapper takes for a lens: the least and the largest focal length, in units of the
 longer side, and the largest distortion. One photo of *statue* with a camera of its own ended with a
@@ -157,8 +160,7 @@ def _back(
     direction as a whole that they had (`metric`: the scale is 1). The rotation is the one nearest
     to the sum of those of the cameras."""
     both = zip(views, before, strict=True)
-    u, _, vt = np.linalg.svd(sum(old.rotation.T @ new.rotation for new, old in both))
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turn = nearest_rotation(np.sum([old.rotation.T @ new.rotation for new, old in both], axis=0))
     middle, size = _place(np.stack([view.centre for view in views]) @ turn.T)
     old_middle, old_size = _place(np.stack([view.centre for view in before]))
     scale = old_size / size if size > 0 and old_size > 0 and not metric else 1.0

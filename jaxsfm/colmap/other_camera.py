@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from jaxsfm.colmap.bundle_adjustment import VIEWS_FOR_CENTRE, bundle_adjust
+from jaxsfm.colmap.poses import nearest_rotation
 
 OTHER = 1 / 500
 """A camera is another one if it moves pixels by so much, in units of the longer side of a photo.
@@ -104,8 +105,7 @@ def camera_distance(first: pycolmap.Camera, second: pycolmap.Camera) -> float:
     a, b = (_directions(camera, pixels) for camera in (first, second))
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         return math.inf
-    u, _, vt = np.linalg.svd(b.T @ a)
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turn = nearest_rotation(b.T @ a)
     seen = np.asarray(second.img_from_cam(a @ turn.T))
     apart = float(np.sqrt(np.square(seen - pixels).sum(axis=1).mean()))
     return apart if math.isfinite(apart) else math.inf

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.poses import CameraPose, Poses
+from jaxsfm.colmap.poses import CameraPose, Poses, nearest_rotation
 from jaxsfm.core.panorama import ViewSet
 from jaxsfm.errors import UserError
 from jaxsfm.io.atomic import write_atomic
@@ -46,9 +46,8 @@ def panorama_poses(
 
 def _mean(poses: Sequence[CameraPose]) -> CameraPose:
     """The mean centre, and the rotation that is nearest to the mean of the matrices."""
-    left, _, right = np.linalg.svd(np.mean([pose.rotation for pose in poses], axis=0))
-    turn = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
-    return CameraPose(left @ turn @ right, np.mean([pose.centre for pose in poses], axis=0))
+    turn = nearest_rotation(np.mean([pose.rotation for pose in poses], axis=0))
+    return CameraPose(turn, np.mean([pose.centre for pose in poses], axis=0))
 
 
 def write_panorama_table(path: Path, models: Sequence[Mapping[str, CameraPose]]) -> None:

@@ -42,6 +42,12 @@ def model_poses(model: pycolmap.Reconstruction) -> Poses:
     return poses
 
 
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) that is nearest to a matrix: of a sum of rotations, their mean."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
 def _read_strecha(path: Path) -> CameraPose:
     """Read a file with K (3 rows), a row of zeros, R camera-to-world (3 rows), centre, size."""
     try:

@@ -24,12 +24,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.bundle_adjustment import UNREFINED_LOSS_PX, bundle_adjust
 from jaxsfm.colmap.database import camera_sensor, read_images
 from jaxsfm.colmap.given_model import has_rigs
 from jaxsfm.colmap.map_options import MapOptions, incremental_options
 from jaxsfm.colmap.model import MIN_TRI_ANGLE_DEG, Model, stored_sizes
-from jaxsfm.colmap.poses import CameraPose
+from jaxsfm.colmap.poses import CameraPose, nearest_rotation
 from jaxsfm.colmap.reconstruction import ordered
 from jaxsfm.colmap.rigs import Rigs, rigs_of_database
 from jaxsfm.colmap.view import View
@@ -38,9 +38,6 @@ from jaxsfm.io.photos import Pixels
 
 logger = logging.getLogger("jaxsfm")
 
-LOSS_PX = 2.0
-"""Scale of the loss of the adjustment, working pixels, as of other models whose keypoints are not
-refined (`jaxsfm.sfm.selected_stage`)."""
 FITTING_SHARE = 0.25
 """The photos speak against a rig on which less of a camera's observations stay: a pass of the
 refinement is taken back if it keeps less of the points."""
@@ -105,7 +102,7 @@ def _rigid(
     for _ in range(2):
         bundle_adjust(
             made,
-            loss_px=LOSS_PX * options.scale,
+            loss_px=UNREFINED_LOSS_PX * options.scale,
             refine_intrinsics=options.refine_intrinsics,
             threads=options.threads,
             held=options.held,
@@ -201,9 +198,7 @@ def with_estimated_places(
             break
         (rig_id, camera_id), each = max(found.items(), key=lambda item: len(item[1]))
         turns, shifts = (np.median(np.stack(part), axis=0) for part in zip(*each, strict=True))
-        u, _, vt = np.linalg.svd(turns)
-        turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), shifts)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(nearest_rotation(turns)), shifts)
         rigs.rigs[rig_id].set_sensor_from_rig(camera_sensor(camera_id), pose)
     used = {rig_id for rig_id, _ in frames}
     for rig_id, rig in rigs.rigs.items():

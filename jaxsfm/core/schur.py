@@ -1,8 +1,10 @@
 """The linear system of bundle adjustment, solved without points (the Schur complement).
 
-Rows of one point meet in the reduced system, which has the size of the photos. Up to some hundred
-photos it is a dense matrix with a Cholesky factor. Above, it is never formed: conjugate gradients
-multiply with it row by row, and the blocks of its diagonal are the preconditioner.
+Rows of one point meet in the reduced system, which has the size of the photos. For a long row of
+photos it is a band (`jaxsfm.core.band`), and otherwise a dense matrix with a Cholesky factor. The
+few numbers of shared cameras are its border (`jaxsfm.core.border`). With more photos than
+`MOST_PHOTOS` of the layout that are no row, it is never formed: conjugate gradients multiply with
+it row by row, and the blocks of its diagonal are the preconditioner.
 
 Source: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6; Agarwal et al. 2010,
 "Bundle adjustment in the large".

@@ -6,16 +6,16 @@ Source of the XMP fields: Google's Photo Sphere XMP metadata (namespace GPano).
 import contextlib
 import io
 import re
-import warnings
 from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from jaxsfm.core.panorama import ViewSet, panorama_pixels, rows_per_pixel
 from jaxsfm.io import decoders
-from jaxsfm.io.images import ImageFile, image_bytes, read_image, reduction
+from jaxsfm.io.exif_data import exif_data, xmp_data
+from jaxsfm.io.images import ImageFile, read_image, reduction
 
 CAMERAS = re.compile(
     r"RICOH THETA|Insta360|GoPro MAX|GoPro, Max|Gear 360|SM-R210|SM-C200|KeyMission 360|LG-R105"
@@ -49,23 +49,11 @@ def is_panorama(image: ImageFile) -> bool:
     raw = decoders.SUFFIXES.get(image.path.suffix.lower()) == "raw"
     if CAMERAS.search(image.taken_with) and not raw:
         return True
-    xmp = _xmp_of(image)
+    xmp = xmp_data(image)
     if not _PROJECTION.search(xmp):
         return False
     full, cropped = _FULL.search(xmp), _CROPPED.search(xmp)
     return full is None or cropped is None or int(full[1]) == int(cropped[1])
-
-
-def _xmp_of(image: ImageFile) -> bytes:
-    """The XMP data of a photo; empty if there are none. ImageError if the file has changed."""
-    data = image_bytes(image)
-    with warnings.catch_warnings(), contextlib.suppress(Exception):  # see `inspect_image`
-        warnings.simplefilter("ignore")
-        with decoders.any_size(), decoders.open_header(data, image.path.suffix) as header:
-            info = getattr(header, "info", {})
-            found = info.get("xmp") or info.get("XML:com.adobe.xmp") or b""
-            return found.encode() if isinstance(found, str) else bytes(found)
-    return b""
 
 
 def render_views(rgb: np.ndarray, views: ViewSet, side: int) -> Iterator[np.ndarray]:
@@ -182,20 +170,22 @@ def read_panorama(image: ImageFile) -> tuple[np.ndarray, np.ndarray | None]:
     return found.rgb, None if image.mask is None else found.used
 
 
-def jpeg_with_gps(rgb: np.ndarray, image: ImageFile, quality: int) -> bytes:
-    """A view as JPEG, with the GPS position of its panorama, if it has one.
+def gps_as_exif(image: ImageFile) -> bytes:
+    """EXIF data for the views of a panorama: its GPS position, if it has one, and nothing else.
 
     Raises:
       ImageError: the panorama's file is gone or has changed.
     """
-    exif = Image.Exif()
-    with contextlib.suppress(Exception):  # odd metadata are not worth a failure
-        data = image_bytes(image)
-        with decoders.any_size(), decoders.open_header(data, image.path.suffix) as header:
-            gps = header.getexif().get_ifd(0x8825)
-            if gps:
-                exif.get_ifd(0x8825).update(gps)
-                exif.tobytes()
+    gps, exif = exif_data(image).gps, Image.Exif()
+    with contextlib.suppress(Exception):  # fields that cannot be written are not worth a failure
+        if gps:
+            exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
+        return exif.tobytes()
+    return Image.Exif().tobytes()
+
+
+def view_as_jpeg(rgb: np.ndarray, exif: bytes, quality: int) -> bytes:
+    """A view as JPEG."""
     out = io.BytesIO()
     Image.fromarray(rgb).save(out, "JPEG", quality=quality, subsampling=0, exif=exif)
     return out.getvalue()

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import logging
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from pathlib import Path
 
 from jaxsfm.errors import UserError
@@ -24,15 +24,7 @@ VIDEOS = frozenset(".mp4 .mov .m4v .avi .mkv .webm .mts .m2ts .mpg .mpeg .wmv .3
 
 def find_videos(folder: Path) -> list[str]:
     """The names of the video files in a folder and its sub-folders, sorted, without hidden ones."""
-    names = []
-    for root, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        names += [
-            (Path(root) / name).relative_to(folder).as_posix()
-            for name in files
-            if Path(name).suffix.lower() in VIDEOS and not name.startswith(".")
-        ]
-    return sorted(names)
+    return _files(folder, VIDEOS)
 
 
 def find_images(folder: Path) -> list[str]:
@@ -57,18 +49,30 @@ def find_images(folder: Path) -> list[str]:
     def unreadable(error: OSError) -> None:
         logger.warning("%s: skipped, cannot be read (%s)", error.filename, error.strerror)
 
+    names = _files(folder, SUFFIXES, unreadable)
+    if not names:
+        suffixes = ", ".join(sorted(SUFFIXES))
+        raise UserError(f"{folder}: there are no images in this folder (looked for {suffixes})")
+    return _without_doubles(names)
+
+
+def _files(
+    folder: Path, suffixes: Set[str], onerror: Callable[[OSError], None] | None = None
+) -> list[str]:
+    """The names of the files with such suffixes, sorted, without hidden ones.
+
+    Args:
+      onerror: is told of each sub-folder that cannot be read.
+    """
     names = []
-    for root, folders, files in os.walk(folder, onerror=unreadable):
+    for root, folders, files in os.walk(folder, onerror=onerror):
         folders[:] = [name for name in folders if not name.startswith(".")]
         names += [
             (Path(root) / name).relative_to(folder).as_posix()
             for name in files
-            if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
+            if Path(name).suffix.lower() in suffixes and not name.startswith(".")
         ]
-    if not names:
-        suffixes = ", ".join(sorted(SUFFIXES))
-        raise UserError(f"{folder}: there are no images in this folder (looked for {suffixes})")
-    return _without_doubles(sorted(names))
+    return sorted(names)
 
 
 def _without_doubles(names: list[str]) -> list[str]:

@@ -21,10 +21,11 @@ from jaxsfm.io.entries import RECORD, VIEW_MASKS, VIEWS, VIEWS_RECORD, entry
 from jaxsfm.io.images import ImageError, ImageFile, image_bytes, named
 from jaxsfm.io.masks import mask_path
 from jaxsfm.io.panoramas import (
-    jpeg_with_gps,
+    gps_as_exif,
     read_panorama,
     render_masks,
     render_views,
+    view_as_jpeg,
     without_nadir,
 )
 from jaxsfm.io.typed_files import read_json
@@ -235,7 +236,7 @@ def _write_views(
         upper = without_nadir((width, height), plan.nadir_deg)
         used = upper if used is None else used & upper
     shown = None if used is None else [*render_masks(used, VIEW_SET, plan.side)]
-    written = {}
+    written, exif = {}, gps_as_exif(image)
     for number, view in enumerate(render_views(rgb, VIEW_SET, plan.side)):
         name = view_name(image.name, number)
         if shown is not None:
@@ -243,7 +244,7 @@ def _write_views(
                 continue
             png = cv2.imencode(".png", 255 * shown[number].astype(np.uint8))[1]
             _put(mask_path(places.masks, name), png.tobytes())
-        _put(places.views / name, jpeg_with_gps(view, image, JPEG_QUALITY))
+        _put(places.views / name, view_as_jpeg(view, exif, JPEG_QUALITY))
         written[name] = (image.name, number)
     return written
 

@@ -9,7 +9,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsfm.colmap.bundle_adjustment import bundle_adjust
+from jaxsfm.colmap.bundle_adjustment import UNREFINED_LOSS_PX, bundle_adjust
 from jaxsfm.colmap.map_options import MapOptions
 from jaxsfm.colmap.mapper import attempt_of
 from jaxsfm.colmap.model_files import read_models, write_models
@@ -39,10 +39,6 @@ from jaxsfm.sfm.mapping import MappedModels, Mapper, MappingFigures
 
 if TYPE_CHECKING:
     import pycolmap
-
-LOSS_PX = 2.0
-"""Scale of the loss of the bundle adjustment, working pixels. Keypoints that are not refined are
-one or two pixels off, and false matches of the former model much further."""
 
 
 class SelectedModels(NamedTuple):
@@ -264,7 +260,7 @@ def _components(
         names: list[list[str]] = []
         if len(part) >= MIN_VIEWS:
             alone = adjusted_component(
-                model, part, loss_px=LOSS_PX * options.scale, options=options
+                model, part, loss_px=UNREFINED_LOSS_PX * options.scale, options=options
             )
             (again,) = checker.check([alone])
             if again is not None:

@@ -30,6 +30,7 @@ from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
+from jaxsfm.colmap.poses import nearest_rotation
 from jaxsfm.colmap.two_views import PairGeometry
 from jaxsfm.io.pairs import Pair, make_pair
 from jaxsfm.sfm.limits import TRUST
@@ -230,8 +231,7 @@ def _join(between: list[dict[int, list[int]]], a: int, b: int) -> None:
 
 def mean_rotation(rotations: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The chordal L2 mean of rotations (n, 3, 3): the rotation nearest to their weighted mean."""
-    u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, rotations))
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return nearest_rotation(np.einsum("n,nij->ij", weights, rotations))
 
 
 def _average(

@@ -11,14 +11,16 @@ from PIL import Image
 
 from jaxsfm.core.panorama import Direction, ViewSet, panorama_directions
 from jaxsfm.io import panoramas
+from jaxsfm.io.exif_data import ExifData
 from jaxsfm.io.exif_gps import gps_of
 from jaxsfm.io.images import ImageError, ImageFile, inspect_image
 from jaxsfm.io.panoramas import (
+    gps_as_exif,
     is_panorama,
-    jpeg_with_gps,
     read_panorama,
     render_masks,
     render_views,
+    view_as_jpeg,
     without_nadir,
 )
 
@@ -176,9 +178,16 @@ def test_views_have_the_gps_position_of_their_panorama(tmp_path):
         {1: "N", 2: (50.0, 30.0, 0.0), 3: "E", 4: (4.0, 0.0, 0.0), 5: b"\0", 6: 120.0}
     )
     whole = photo(tmp_path, exif=exif)
-    data = jpeg_with_gps(np.full((64, 64, 3), 128, np.uint8), whole, 95)
+    data = view_as_jpeg(np.full((64, 64, 3), 128, np.uint8), gps_as_exif(whole), 95)
     assert Image.open(io.BytesIO(data)).size == (64, 64)
     (tmp_path / "view.jpg").write_bytes(data)
     found = gps_of(inspect_image(tmp_path / "view.jpg"))
     assert found is not None and found == gps_of(whole)
     assert (found.x, found.y, found.z) == (4.0, 50.5, 120.0)
+
+
+def test_gps_that_cannot_be_written_is_left_out_of_views(tmp_path, monkeypatch):
+    whole = photo(tmp_path)
+    monkeypatch.setattr(panoramas, "exif_data", lambda _: ExifData({}, {2: object()}))
+    data = view_as_jpeg(np.full((64, 64, 3), 128, np.uint8), gps_as_exif(whole), 95)
+    assert not Image.open(io.BytesIO(data)).getexif().get_ifd(0x8825)

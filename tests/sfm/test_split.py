@@ -65,7 +65,7 @@ def test_large_errors_count_for_less_in_pixels_of_the_described_photos(rendered,
     parts = outcome(NAMES[:3], NAMES[3:])
     options = MapOptions(refine_intrinsics=False, threads=1, scale=4.0)
     split_inconsistent([noisy_model(rendered, 0.0)], [parts], FakeChecker(), options)
-    assert asked == [4.0 * module.LOSS_PX]
+    assert asked == [4.0 * module.UNREFINED_LOSS_PX]
 
 
 def test_models_without_contradictions_stay_as_they_are_and_are_not_checked_again(rendered):
